@@ -32,30 +32,16 @@ _BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """Rig and poses at the maximum.
-
-    Attributes
-    ----------
-    rig : Rig
-    poses : (K, 4, 4) float64
-    noise : (L,) float64
-        Standard deviation of a detection's coordinate by sensor.
-    covariance : (G, G) float64
-        Of the free parameters, in the gauge.
-    unknown : (G, u) float64
-        Directions that are not determined, in the parameters' sizes.
-    weighted : tuple
-        Pairs of each sensor with residuals and weights, 1 for what agrees.
-    inflation : float
-        By which variances are larger than independent errors of detections would make them.
-    """
+    """Rig and poses at the maximum."""
 
     rig: Rig
-    poses: Floats
-    noise: Floats
-    covariance: Floats
-    unknown: Floats
+    poses: Floats  # (K, 4, 4)
+    noise: Floats  # (L,): standard deviation of a detection's coordinate by sensor
+    covariance: Floats  # (G, G): of the free parameters, in the gauge
+    unknown: Floats  # (G, u): directions that are not determined, in the parameters' sizes
+    # pairs of each sensor with residuals and weights, 1 for what agrees
     weighted: tuple[tuple[Pairs, Floats, Floats], ...]
+    # by which variances are larger than independent errors of detections would make them
     inflation: float
 
     @property
@@ -99,14 +85,11 @@ def adjust(
 
     Parameters
     ----------
-    bundle : Bundle
-    rig : Rig
     poses : (K, 4, 4) array
     gauge_of : callable
         Rows of the gauge at a rig.
     sigmas : (L,) array
         σ_ε by sensor.
-    rules : CalibrationRules
     blurs : (L,) array or None
         To begin with; None: as the start needs.
     noise : (L,) array or None

@@ -21,18 +21,10 @@ _LEAST = 4  # detections: three leave four poses of any triangle
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Poses that explain what one sensor saw.
+    """Poses that explain what one sensor saw."""
 
-    Attributes
-    ----------
-    poses : (H, 4, 4) float64
-        T_sensor_object, most evident first; none where nothing convinces.
-    evidence : (H,) float64
-        Log-odds against clutter.
-    """
-
-    poses: Floats
-    evidence: Floats
+    poses: Floats  # (H, 4, 4): T_sensor_object, most evident first; none where nothing convinces
+    evidence: Floats  # (H,): log-odds against clutter
 
 
 NOTHING = Hypotheses(np.zeros((0, 4, 4)), np.zeros(0))
@@ -45,15 +37,12 @@ def hypotheses(
 
     Parameters
     ----------
-    name : str
     sensor : Sensor
         A camera.
     points : (M, 2) array
         Its detections.
     sigma : float
         σ_ε.
-    body : Body
-    rules : CalibrationRules
     """
     if len(points) < _LEAST:
         return NOTHING

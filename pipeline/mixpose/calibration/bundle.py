@@ -27,27 +27,16 @@ from mixpose.sensors import CalibrationError, by_calibration, doubted
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """What stays the same while a rig is adjusted.
-
-    Attributes
-    ----------
-    frames : tuple of SeenFrame
-    clock : Clock
-    blocks : tuple of Block
-        Free parameters of the rig.
-    pose_free : (6,) bool
-        World directions of the poses that are free; none where poses are known.
-    undetermined : float
-        Standard deviation by a parameter's size above which a direction stays as it is.
-    errors : mapping of int to CalibrationError
-        By sensor, how far what is held of it may be off.
-    """
+    """What stays the same while a rig is adjusted."""
 
     frames: tuple[SeenFrame, ...]
     clock: Clock
-    blocks: tuple[Block, ...]
+    blocks: tuple[Block, ...]  # free parameters of the rig
+    # (6,): world directions of the poses that are free; none where poses are known
     pose_free: NDArray[np.bool_]
+    # standard deviation by a parameter's size above which a direction stays as it is
     undetermined: float
+    # by sensor, how far what is held of it may be off
     errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
     @property
@@ -64,34 +53,16 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residuals of one sensor's pairs with their Jacobians.
+    """Residuals of one sensor's pairs with their Jacobians."""
 
-    Attributes
-    ----------
-    residual : (n, m) float64
-        Detected minus predicted.
-    by_pose : (n, m, 6) float64
-        By the pose at the moment of the sensor.
-    shares : (n, 4) float64
-        By how much that pose follows its neighbours'.
-    nodes : (n, 4) int
-    by_rig : list of (Block, (n, m, k) float64)
-    by_point : (n, m, 3) float64 or None
-        By the feature's coordinates, where the body is free.
-    by_held : (n, m, c) float64
-        By what is held, of a standard deviation each.
-    known : (n,) bool
-        Whether the moment of the sensor is known.
-    """
-
-    residual: Floats
-    by_pose: Floats
-    shares: Floats
-    nodes: NDArray[np.intp]
-    by_rig: list[tuple[Block, Floats]]
-    by_point: Floats | None
-    by_held: Floats
-    known: NDArray[np.bool_]
+    residual: Floats  # (n, m): detected minus predicted
+    by_pose: Floats  # (n, m, 6): by the pose at the moment of the sensor
+    shares: Floats  # (n, 4): by how much that pose follows its neighbours'
+    nodes: NDArray[np.intp]  # (n, 4)
+    by_rig: list[tuple[Block, Floats]]  # (n, m, k) each
+    by_point: Floats | None  # (n, m, 3): by the feature's coordinates, where the body is free
+    by_held: Floats  # (n, m, c): by what is held, of a standard deviation each
+    known: NDArray[np.bool_]  # (n,): whether the moment of the sensor is known
 
 
 def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) -> Rows:
@@ -132,23 +103,12 @@ def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) 
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """The normal equations H δ = b, poses eliminated.
+    """The normal equations H δ = b, poses eliminated."""
 
-    Attributes
-    ----------
-    S : (G, G) float64
-        Information on the rig, the poses being unknown.
-    held : (G, C) float64
-        The same between the rig and what is held.
-    b : (G,) float64
-    pose_b, pose_solve, W
-        What gives the poses' step from the rig's.
-    """
-
-    S: Floats
-    held: Floats
-    b: Floats
-    pose_b: Floats
+    S: Floats  # (G, G): information on the rig, the poses being unknown
+    held: Floats  # (G, C): the same between the rig and what is held
+    b: Floats  # (G,)
+    pose_b: Floats  # what gives the poses' step from the rig's
     pose_solve: object = field(repr=False)
     W: Floats = field(repr=False)  # H_pg
 
@@ -169,7 +129,6 @@ def normal_equations(
 
     Parameters
     ----------
-    bundle : Bundle
     poses : int
         K.
     rows : sequence of (sensor, pairs, rows, weights)
@@ -237,25 +196,14 @@ def _pose_columns(rows: Rows, root: Floats, free: NDArray[np.intp], P: int) -> s
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step of rig and poses.
+    """A step of rig and poses."""
 
-    Attributes
-    ----------
-    rig : (G,) float64
-    poses : (K, 6) float64
-    covariance : (G, G) float64
-        Of the rig, in the gauge; directions that are not determined left out.
-    of_held : (G, G) float64
-        What errors of the held parameters add to it.
-    unknown : (G, u) float64
-        Directions that are not determined, in units of the parameters' sizes.
-    """
-
-    rig: Floats
-    poses: Floats
+    rig: Floats  # (G,)
+    poses: Floats  # (K, 6)
+    # (G, G): of the rig, in the gauge; directions that are not determined left out
     covariance: Floats
-    of_held: Floats
-    unknown: Floats
+    of_held: Floats  # (G, G): what errors of the held parameters add to it
+    unknown: Floats  # (G, u): directions that are not determined, in units of the parameters' sizes
 
 
 def solved(bundle: Bundle, normal: Normal, gauge: Floats, poses: int) -> Step:
@@ -263,8 +211,6 @@ def solved(bundle: Bundle, normal: Normal, gauge: Floats, poses: int) -> Step:
 
     Parameters
     ----------
-    bundle : Bundle
-    normal : Normal
     gauge : (r, G) array
         Rows of the conditions on the step, in the parameters' sizes.
     poses : int

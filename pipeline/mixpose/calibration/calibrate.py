@@ -49,9 +49,6 @@ def calibrate(
 
     Parameters
     ----------
-    task : Task
-    rules : CalibrationRules
-    progress : callable
     found : dict or None
         Hypotheses of single cameras that are known from before; new ones are added.
 

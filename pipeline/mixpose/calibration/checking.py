@@ -21,25 +21,14 @@ from mixpose.rigid import from_parts, inverse
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far one sensor is from where the old calibration has it.
-
-    Attributes
-    ----------
-    name : str
-    turn_deg, shift : float
-        Against the consensus of the sensors.
-    turn_deviation_deg, shift_deviation : float
-        One standard deviation of each.
-    residual_before, residual_after : float
-        Sensor units; after, of frames that are held back where there are enough.
-    moved : bool
-    """
+    """How far one sensor is from where the old calibration has it."""
 
     name: str
-    turn_deg: float
+    turn_deg: float  # against the consensus of the sensors
     shift: float
-    turn_deviation_deg: float
+    turn_deviation_deg: float  # one standard deviation of each
     shift_deviation: float
+    # sensor units; after, of frames that are held back where there are enough
     residual_before: float
     residual_after: float
     moved: bool

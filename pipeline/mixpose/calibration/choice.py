@@ -43,8 +43,6 @@ def informative(
 
     Parameters
     ----------
-    frames : sequence of SeenFrame
-    sensors : int
     most : int
         Frames that are taken.
     runs : bool

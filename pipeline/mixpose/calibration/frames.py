@@ -10,20 +10,9 @@ from mixpose.records import Floats
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """Detections of one frame.
-
-    Attributes
-    ----------
-    number : int
-    time_s : float or None
-        Common time of the frame.
-    points : mapping of int to (M, m) float64
-        Detections by sensor.
-    times : mapping of int to float
-        When each sensor says that it took the frame.
-    """
+    """Detections of one frame."""
 
     number: int
-    time_s: float | None
-    points: Mapping[int, Floats]
-    times: Mapping[int, float]
+    time_s: float | None  # common time of the frame
+    points: Mapping[int, Floats]  # (M, m) each: detections by sensor
+    times: Mapping[int, float]  # when each sensor says that it took the frame

@@ -20,11 +20,9 @@ def free_parameters(
 
     Parameters
     ----------
-    rig : Rig
     words : sequence of str
         None of them: where all cameras but the first stand, or all where poses are known, and
         positions of range sensors.
-    poses_known : bool
 
     Returns
     -------

@@ -24,16 +24,10 @@ _MOST_POSES = 40
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """What is free beside the parameters of the rig.
+    """What is free beside the parameters of the rig."""
 
-    Attributes
-    ----------
-    pose_free : (6,) bool
-    poses : (K, 4, 4) float64
-    """
-
-    pose_free: NDArray[np.bool_]
-    poses: Floats
+    pose_free: NDArray[np.bool_]  # (6,)
+    poses: Floats  # (K, 4, 4)
 
 
 def gauge_rows(
@@ -43,9 +37,6 @@ def gauge_rows(
 
     Parameters
     ----------
-    rig : Rig
-    blocks : sequence of Block
-    freedom : Freedom
     length : (int, int) or None
         Sensors whose distance is known.
 

@@ -19,18 +19,10 @@ _NODES = 4
 
 
 class Neighbours(NamedTuple):
-    """Frames that a frame's motion is interpolated through.
+    """Frames that a frame's motion is interpolated through."""
 
-    Attributes
-    ----------
-    nodes : (K, 4) int
-        The frame itself first; where there are fewer, itself again.
-    away : (K, 4) float64
-        Seconds from the frame to each; NaN where there are fewer.
-    """
-
-    nodes: NDArray[np.intp]
-    away: Floats
+    nodes: NDArray[np.intp]  # (K, 4): the frame itself first; where there are fewer, itself again
+    away: Floats  # (K, 4): seconds from the frame to each; NaN where there are fewer
 
 
 def neighbours(times: Sequence[float | None], gap: float) -> Neighbours:
@@ -54,24 +46,12 @@ def neighbours(times: Sequence[float | None], gap: float) -> Neighbours:
 
 
 class Interpolated(NamedTuple):
-    """Poses at offsets in time.
+    """Poses at offsets in time."""
 
-    Attributes
-    ----------
-    twist : (n, 6) float64
-        From the frame's pose to that at the offset.
-    rate : (n, 6) float64
-        Twist per second there.
-    shares : (n, 4) float64
-        By how much it follows each of the neighbours.
-    known : (n,) bool
-        Whether there are frames to interpolate between.
-    """
-
-    twist: Floats
-    rate: Floats
-    shares: Floats
-    known: NDArray[np.bool_]
+    twist: Floats  # (n, 6): from the frame's pose to that at the offset
+    rate: Floats  # (n, 6): twist per second there
+    shares: Floats  # (n, 4): by how much it follows each of the neighbours
+    known: NDArray[np.bool_]  # (n,): whether there are frames to interpolate between
 
 
 def interpolate(
@@ -81,7 +61,6 @@ def interpolate(
 
     Parameters
     ----------
-    near : Neighbours
     poses : (K, 4, 4) array
     frame : (n,) int
     tau : (n,) array

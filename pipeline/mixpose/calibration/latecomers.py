@@ -45,16 +45,12 @@ def placed(
 
     Parameters
     ----------
-    task : Task
     rig : Rig
         With the linked sensors where they are by now.
-    sensor : int
-    linked : sequence of int
     frames : sequence of SeenFrame
         With what the camera saw.
     poses : (K, 4, 4) array
     noise : (L,) array
-    rules : CalibrationRules
     """
     own = [
         replace(frame, points={s: y for s, y in frame.points.items() if s == sensor})

@@ -27,17 +27,10 @@ Seen: TypeAlias = Sequence[Mapping[int, Hypotheses]]
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """The relative pose of two sensors.
+    """The relative pose of two sensors."""
 
-    Attributes
-    ----------
-    T_a_b : (4, 4) float64
-    frames : int
-        That agree on it.
-    """
-
-    T_a_b: Floats
-    frames: int
+    T_a_b: Floats  # (4, 4)
+    frames: int  # that agree on it
 
 
 def agreed(
@@ -54,7 +47,6 @@ def agreed(
         Length by which a vote's translation may err at most.
     T_expected : (4, 4) array
         Decides between motions with as many frames.
-    rules : CalibrationRules
     """
     if not len(votes):
         return None
@@ -140,7 +132,6 @@ def link_all(
 
     Parameters
     ----------
-    seen : by frame, by sensor
     placed : mapping of int to (4, 4) array
         T_sensor_world of sensors that stay where they are.
     wanted : sequence of int
@@ -148,7 +139,6 @@ def link_all(
     expected : mapping of int to (4, 4) array
         T_sensor_world as the session has it.
     symmetries : (S, 4, 4) array
-    rules : CalibrationRules
 
     Returns
     -------

@@ -27,43 +27,23 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of detections and features of one sensor, over all frames.
+    """Pairs of detections and features of one sensor, over all frames."""
 
-    Attributes
-    ----------
-    frame, feature, detection : (n,) int
-    y : (n, m) float64
-        Detected place.
-    share : (n,) float64
-        1 where nothing competes.
-    nearest : (n,) bool
-        Whether each of the two is the nearest that the other has.
-    """
-
-    frame: Ints
-    feature: Ints
-    detection: Ints
-    y: Floats
-    share: Floats
-    nearest: NDArray[np.bool_]
+    frame: Ints  # (n,)
+    feature: Ints  # (n,)
+    detection: Ints  # (n,)
+    y: Floats  # (n, m): detected place
+    share: Floats  # (n,): 1 where nothing competes
+    nearest: NDArray[np.bool_]  # (n,): whether each of the two is the nearest that the other has
 
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """When sensors look.
-
-    Attributes
-    ----------
-    near : Neighbours
-    late : (L, K) float64
-        Seconds from a frame's common time to a sensor's; 0 where not known.
-    since : (L, K) float64
-        Seconds from the middle of the recording.
-    """
+    """When sensors look."""
 
     near: Neighbours
-    late: Floats
-    since: Floats
+    late: Floats  # (L, K): seconds from a frame's common time to a sensor's; 0 where not known
+    since: Floats  # (L, K): seconds from the middle of the recording
 
     def tau(self, rig: Rig, sensor: int, frame: Ints) -> Floats:
         """Seconds from the common time of frames (n,) to when a sensor took them."""
@@ -106,11 +86,7 @@ def match(
 
     Parameters
     ----------
-    rig : Rig
     poses : (K, 4, 4) array
-    frames : sequence of SeenFrame
-    clock : Clock
-    sensor : int
     blur : float
         In sensor units.
     faintest : float

@@ -51,11 +51,8 @@ def read_frames(
 
     Parameters
     ----------
-    session : Session
     sources : mapping of str to str
         Recordings in place of the session's.
-    rules : CalibrationRules
-    progress : callable
     runs : bool
         Whether frames next to each other are needed, as motion between them counts.
     known : collection of int or None

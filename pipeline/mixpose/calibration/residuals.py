@@ -29,7 +29,6 @@ def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floa
     ----------
     bundle : Bundle
         Without parameters of the rig.
-    rig : Rig
     adjusted : Adjusted
         Where poses begin, and which detection is which feature.
     """

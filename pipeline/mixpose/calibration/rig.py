@@ -43,30 +43,15 @@ _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Sensors and body as they are believed to be.
-
-    Attributes
-    ----------
-    names : tuple of str
-    sensors : tuple of Sensor
-    points : (N, 3) float64
-        Features of the body, in its frame.
-    normals : (N, 3) float64 or None
-    delays : (L,) float64
-        Seconds by which a sensor's frames are taken later than their times say.
-    drifts : (L,) float64
-        Seconds per second by which that grows.
-    labels : tuple of str
-        What the features are called in messages.
-    """
+    """Sensors and body as they are believed to be."""
 
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
-    points: Floats
-    normals: Floats | None
-    delays: Floats
-    drifts: Floats
-    labels: tuple[str, ...]
+    points: Floats  # (N, 3): features of the body, in its frame
+    normals: Floats | None  # (N, 3)
+    delays: Floats  # (L,): seconds by which a sensor's frames are taken later than their times say
+    drifts: Floats  # (L,): seconds per second by which that grows
+    labels: tuple[str, ...]  # what the features are called in messages
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:
@@ -88,26 +73,14 @@ class Rig:
 
 @dataclass(frozen=True)
 class Block:
-    """Parameters of one kind, of one sensor or of the body.
-
-    Attributes
-    ----------
-    kind : str
-    sensor : int or None
-        None for the body.
-    start : int
-        Of the block among all parameters.
-    names : tuple of str
-    units : tuple of {"length", "rad", "px", "s", ""}
-    scales : tuple of float
-        Size of what is sought, in `units`: by it a standard deviation is large or small.
-    """
+    """Parameters of one kind, of one sensor or of the body."""
 
     kind: Kind
-    sensor: int | None
-    start: int
+    sensor: int | None  # none for the body
+    start: int  # of the block among all parameters
     names: tuple[str, ...]
-    units: tuple[str, ...]
+    units: tuple[str, ...]  # tuple of {"length", "rad", "px", "s", ""}
+    # size of what is sought, in `units`: by it a standard deviation is large or small
     scales: tuple[float, ...]
 
     @property
@@ -148,7 +121,6 @@ def blocks_of(
 
     Parameters
     ----------
-    rig : Rig
     free : mapping of int to sequence of kinds
         By sensor.
     body : bool
@@ -267,8 +239,6 @@ def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> F
 
     Parameters
     ----------
-    sensor : Sensor
-    kind : str
     world : (n, 3) array
     by_world : (n, m, 3) array
         Jacobian by the points.

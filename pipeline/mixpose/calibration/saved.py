@@ -18,7 +18,6 @@ class Saved(Found):
 
     Parameters
     ----------
-    path : Path
     key : str
         Names session, recording and version; what another one left is not taken.
     """

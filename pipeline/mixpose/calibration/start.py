@@ -24,25 +24,14 @@ _LINK_BLUR = 6.0  # σ_ε by which a linked sensor may be off before all are adj
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a calibration begins.
-
-    Attributes
-    ----------
-    rig : Rig
-    frames : tuple of SeenFrame
-        Those with a pose.
-    poses : (K, 4, 4) float64
-    through : mapping of int to (int or None, int)
-        Through which sensor each was linked (None: through known poses), and frames that agree.
-    unlinked : tuple of int
-        Sensors that share no view with the others.
-    """
+    """Where a calibration begins."""
 
     rig: Rig
-    frames: tuple[SeenFrame, ...]
-    poses: Floats
+    frames: tuple[SeenFrame, ...]  # those with a pose
+    poses: Floats  # (K, 4, 4)
+    # through which sensor each was linked (None: through known poses), and frames that agree
     through: Mapping[int, tuple[int | None, int]]
-    unlinked: tuple[int, ...]
+    unlinked: tuple[int, ...]  # sensors that share no view with the others
 
 
 def searched(

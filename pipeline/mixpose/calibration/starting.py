@@ -21,11 +21,8 @@ def start_poses(
 
     Parameters
     ----------
-    rig : Rig
-    frames : sequence of SeenFrame
     seen : by frame, by sensor
         Hypotheses of single sensors.
-    linked : sequence of int
     blurs : (L,) array
         By which a linked sensor may be off.
 

@@ -25,48 +25,27 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A calibration to be made.
+    """A calibration to be made."""
 
-    Attributes
-    ----------
-    rig : Rig
-        As it is believed to be.
-    body : Body
-    frames : tuple of SeenFrame
-    sigmas : (L,) float64
-        σ_ε by sensor.
-    free : mapping of int to tuple of kinds
-        Free parameters by sensor.
-    body_free : bool
-        Whether marker coordinates are free.
-    pose_free : (6,) bool
-        World directions of the body's poses that are not known.
-    T_held : (4, 4) float64 or None
-        Where the other directions stay.
-    around : (float or None, float or None)
-        Half-widths in degrees and length of where the body is about `T_held`.
-    fuse : bool
-        Whether a frame's pose tells of the next one's where sensors alone tell little.
-    known : mapping of int to (4, 4) float64, or None
-        Poses of the body by frame number, where they are known.
-    length : (int, int) or None
-        Sensors whose distance is known, and right in `rig`.
-    errors : mapping of int to CalibrationError
-        By sensor, how far what is held of it may be off.
-    """
-
-    rig: Rig
+    rig: Rig  # as it is believed to be
     body: Body
     frames: tuple[SeenFrame, ...]
-    sigmas: Floats
-    free: Mapping[int, tuple[Kind, ...]]
-    body_free: bool = False
+    sigmas: Floats  # (L,): σ_ε by sensor
+    free: Mapping[int, tuple[Kind, ...]]  # free parameters by sensor
+    body_free: bool = False  # whether marker coordinates are free
+    # (6,): world directions of the body's poses that are not known
     pose_free: NDArray[np.bool_] = field(default_factory=lambda: np.ones(6, dtype=np.bool_))
-    T_held: Floats | None = None
+    T_held: Floats | None = None  # (4, 4): where the other directions stay
+    # (float or None, float or None): half-widths in degrees and length of where the body is about
+    # `T_held`
     around: tuple[float | None, float | None] = (None, None)
+    # whether a frame's pose tells of the next one's where sensors alone tell little
     fuse: bool = True
+    # (4, 4) each: poses of the body by frame number, where they are known
     known: Mapping[int, Floats] | None = None
+    # (int, int): sensors whose distance is known, and right in `rig`
     length: tuple[int, int] | None = None
+    # by sensor, how far what is held of it may be off
     errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
     @property

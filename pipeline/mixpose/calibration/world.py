@@ -20,7 +20,6 @@ def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
 
     Parameters
     ----------
-    rig : Rig
     words : str
         ``SENSOR:SENSOR=LENGTH``.
 
@@ -63,7 +62,6 @@ def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
 
     Parameters
     ----------
-    rig : Rig
     words : str
         A sensor, or ``body@FRAME``.
     numbers : collection of int

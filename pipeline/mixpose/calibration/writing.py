@@ -23,8 +23,6 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
 
     Parameters
     ----------
-    session : Session
-    found : Calibration
     target : Path
         Where it will stand.
     version : str

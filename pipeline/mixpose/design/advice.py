@@ -22,39 +22,20 @@ _PLACES = 60  # for one more sensor, all around
 
 @dataclass(frozen=True)
 class MarkerMove:
-    """A marker that is moved.
+    """A marker that is moved."""
 
-    Attributes
-    ----------
-    marker : int
-        From 0.
-    shift : (3,) float64
-        In the object's frame.
-    error : float
-        What is left then.
-    """
-
-    marker: int
-    shift: Floats
-    error: float
+    marker: int  # from 0
+    shift: Floats  # (3,): in the object's frame
+    error: float  # what is left then
 
 
 @dataclass(frozen=True)
 class NewSensor:
-    """One more sensor, of a kind that is there.
+    """One more sensor, of a kind that is there."""
 
-    Attributes
-    ----------
-    like : str
-        The sensor that it is a copy of.
-    sensor : Sensor
-    error : float
-        What is left then.
-    """
-
-    like: str
+    like: str  # the sensor that it is a copy of
     sensor: Sensor
-    error: float
+    error: float  # what is left then
 
 
 def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
@@ -80,8 +61,6 @@ def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor 
 
     Parameters
     ----------
-    plan : Plan
-    error_of : callable
     middle : (3,) array
         Of the volume, in the world: what the sensor looks at.
 

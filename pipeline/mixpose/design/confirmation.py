@@ -27,30 +27,17 @@ _MOST_POSES = 8
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Errors of simulated frames beside those that were predicted.
+    """Errors of simulated frames beside those that were predicted."""
 
-    Attributes
-    ----------
-    frames : int
-        Estimated, lost ones included.
-    statuses : dict of str to int
-    ratios : (6,) float64
-        Root mean square error over the predicted one, per direction; NaN where held or open.
-    overall : float
-        The same over all directions at once: of errors in units of their covariance.
-    chance : float
-        What `overall` is off 1 by through chance alone, one standard deviation.
-    predicted, found : (3,) float64
-        Position, rotation (radians) and tip: root mean squares over the frames.
-    """
-
-    frames: int
+    frames: int  # estimated, lost ones included
     statuses: dict[str, int]
+    # (6,): root mean square error over the predicted one, per direction; NaN where held or open
     ratios: Floats
-    overall: float
-    chance: float
+    overall: float  # the same over all directions at once: of errors in units of their covariance
+    chance: float  # what `overall` is off 1 by through chance alone, one standard deviation
+    # (3,): position, rotation (radians) and tip: root mean squares over the frames
     predicted: Floats
-    found: Floats
+    found: Floats  # (3,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +65,6 @@ def confirm(
 
     Parameters
     ----------
-    session : Session
     plan : Plan
         Its system, perhaps with other noises.
     poses : (P, 4, 4) array
@@ -86,7 +72,6 @@ def confirm(
     runs : int
         Frames in all.
     tip : (3,) array
-    seed : int
     executor : Executor, optional
         Does the poses; one after the other if left out.
     """

@@ -18,7 +18,6 @@ def noise_to_equal(plan: Plan, wanted: float, error_of: Callable[[Plan], float])
 
     Parameters
     ----------
-    plan : Plan
     wanted : float
         The error of the other system.
     error_of : callable

@@ -39,7 +39,6 @@ def spread_poses(
     turn_deg : float, optional
         Largest angle from the orientation of the middle, up to 180; left out, 20 around a
         ``[start]`` and else 180.
-    seed : int
 
     Returns
     -------

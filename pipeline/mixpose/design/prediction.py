@@ -32,29 +32,16 @@ from mixpose.session import Session
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A system: sensors with what each of their features errs by, and a body.
+    """A system: sensors with what each of their features errs by, and a body."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the sensors.
-    sensors : tuple of Sensor
-    noises : tuple of float
-        Standard deviation of a measured feature along each coordinate, px or length units.
-    sigmas : tuple of float
-        σ_ε of the sensors, by which a run weighs them against each other at first.
-    body : Body
-        Spreads of its features are errors of markers.
-    free : (6,) bool
-        Directions that are estimated.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the sensors
     sensors: tuple[Sensor, ...]
+    # standard deviation of a measured feature along each coordinate, px or length units
     noises: tuple[float, ...]
+    # σ_ε of the sensors, by which a run weighs them against each other at first
     sigmas: tuple[float, ...]
-    body: Body
-    free: Mask
+    body: Body  # spreads of its features are errors of markers
+    free: Mask  # (6,): directions that are estimated
 
     def weighed(self) -> Floats:
         """Variances s_l² (L,) by which a run weighs sensors once frames have shown their noise.
@@ -71,22 +58,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is expected at P poses.
+    """What is expected at P poses."""
 
-    Attributes
-    ----------
-    poses : (P, 4, 4) float64
-        T_world_object.
-    covariances : (P, 6, 6) float64
-        In the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a direction
-        open, zero where it is not free.
-    seen : (P, L, N) bool
-        Features that are in view of a sensor and face it.
-    """
-
-    poses: Floats
+    poses: Floats  # (P, 4, 4): T_world_object
+    # (P, 6, 6): in the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a
+    # direction open, zero where it is not free
     covariances: Floats
-    seen: Mask
+    seen: Mask  # (P, L, N): features that are in view of a sensor and face it
 
 
 def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
@@ -94,7 +72,6 @@ def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
 
     Parameters
     ----------
-    session : Session
     noises : dict of str to float, optional
         Standard deviations by sensor in place of those that its `sigma` stands for.
     """

@@ -26,50 +26,26 @@ a motion capture recording that are taken for each other, rigid to 2 to 5 mm, ha
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study.
+    """What is asked of a study."""
 
-    Attributes
-    ----------
-    poses : (P, 4, 4) float64
-    tip : (3,) float64 or None
-        In the object's frame; None for its origin.
-    noises : mapping of (int or None, str) to float
-        Standard deviations by system (None: all) and sensor.
-    runs : int
-        Frames to simulate for each system; 0 for none.
-    seed : int
-    tolerance : float or None
-        Within which markers of bodies lie alike; None for a share of the radius.
-    """
-
-    poses: Floats
-    tip: Floats | None = None
+    poses: Floats  # (P, 4, 4)
+    tip: Floats | None = None  # (3,): in the object's frame; None for its origin
+    # standard deviations by system (None: all) and sensor
     noises: Mapping[tuple[int | None, str], float] = field(default_factory=dict)
-    runs: int = 0
+    runs: int = 0  # frames to simulate for each system; 0 for none
     seed: int = 0
+    # within which markers of bodies lie alike; None for a share of the radius
     tolerance: float | None = None
 
 
 @dataclass(frozen=True)
 class Equal:
-    """What a system's detections must err by to be as accurate as the first system.
+    """What a system's detections must err by to be as accurate as the first system."""
 
-    Attributes
-    ----------
-    factor : float or None
-        On all its noises; None where nothing makes it so.
-    noises : tuple of float
-        The noises with that factor.
-    wanted : float
-        Error of the first system.
-    confirmation : Confirmation or None
-        Of the system with these noises.
-    """
-
-    factor: float | None
-    noises: tuple[float, ...]
-    wanted: float
-    confirmation: Confirmation | None = None
+    factor: float | None  # on all its noises; None where nothing makes it so
+    noises: tuple[float, ...]  # the noises with that factor
+    wanted: float  # error of the first system
+    confirmation: Confirmation | None = None  # of the system with these noises
 
 
 @dataclass(frozen=True)
@@ -110,7 +86,6 @@ def study(
     ----------
     named : sequence of (str, Session)
         Of one unit; cameras with resolutions.
-    request : Request
     say : callable
         Told what is being done.
     executor : Executor, optional

@@ -18,68 +18,36 @@ _NEAR = 4.0  # standard deviations between features whose labels are then mixed 
 
 @dataclass(frozen=True)
 class Weakness:
-    """Where a system is weakest, and in which direction.
+    """Where a system is weakest, and in which direction."""
 
-    Attributes
-    ----------
-    pose : int
-        Number of the pose, from 0.
-    deviation : float
-        Along the worst direction.
-    direction : (3,) float64
-        In world axes: of the position, or the axis of the turn.
-    ratio : float
-        To the deviation along the best direction there.
-    """
-
-    pose: int
-    deviation: float
-    direction: Floats
-    ratio: float
+    pose: int  # number of the pose, from 0
+    deviation: float  # along the worst direction
+    direction: Floats  # (3,): in world axes: of the position, or the axis of the turn
+    ratio: float  # to the deviation along the best direction there
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a system achieves over P poses.
+    """What a system achieves over P poses."""
 
-    Attributes
-    ----------
-    deviations : (P, 6) float64
-        x y z rx ry rz, lengths and radians; infinite where not determined.
-    position, rotation, tip : (P,) float64
-        Root mean square errors: of the origin, of the turn (radians), and of the tip.
-    weakest_position, weakest_rotation : Weakness or None
-        None where a direction is not determined at any pose.
-    seen : (L,) float64
-        Share of the features that each sensor sees, on average.
-    fewest : (L,) int
-        Features that each sensor sees at its worst pose.
-    undetermined : tuple of int
-        Poses at which a free direction is open.
-    narrow : (L,) float64
-        What a sensor's features err by, markers included, over its `sigma`.  From a third on some
-        of them are given up as false, and errors are larger than predicted.
-    crowded : (L,) float64
-        Share of the features with another nearer than four standard deviations in a sensor: there
-        detections are mixed up, and errors larger than predicted.
-    symmetries : int
-        Orientations that look the same.
-    alike : tuple of LookAlike
-        Poses that look nearly the same as one of the first, the most alike first.
-    """
-
-    deviations: Floats
+    deviations: Floats  # (P, 6): x y z rx ry rz, lengths and radians; infinite where not determined
+    # (P,): root mean square errors: of the origin, of the turn (radians), and of the tip
     position: Floats
-    rotation: Floats
-    tip: Floats
-    weakest_position: Weakness | None
+    rotation: Floats  # (P,)
+    tip: Floats  # (P,)
+    weakest_position: Weakness | None  # none where a direction is not determined at any pose
     weakest_rotation: Weakness | None
-    seen: Floats
-    fewest: Floats
-    undetermined: tuple[int, ...]
+    seen: Floats  # (L,): share of the features that each sensor sees, on average
+    fewest: Floats  # (L,): features that each sensor sees at its worst pose
+    undetermined: tuple[int, ...]  # poses at which a free direction is open
+    # (L,): what a sensor's features err by, markers included, over its `sigma`.  From a third on
+    # some of them are given up as false, and errors are larger than predicted.
     narrow: Floats
+    # (L,): share of the features with another nearer than four standard deviations in a sensor:
+    # there detections are mixed up, and errors larger than predicted
     crowded: Floats
-    symmetries: int
+    symmetries: int  # orientations that look the same
+    # poses that look nearly the same as one of the first, the most alike first
     alike: tuple[LookAlike, ...]
 
 
@@ -90,10 +58,8 @@ def summarise(
 
     Parameters
     ----------
-    plan : Plan
     setups : tuple of SensorSetup
         Those of the plan's sensors.
-    prediction : Prediction
     tip : (3,) array
         In the object's frame.
     """

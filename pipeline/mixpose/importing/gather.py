@@ -21,29 +21,14 @@ _TABLES = (".csv", *READERS)
 
 @dataclass(frozen=True)
 class Imported:
-    """What was read, in the unit of the session.
+    """What was read, in the unit of the session."""
 
-    Attributes
-    ----------
-    unit : {"m", "cm", "mm", "um"}
-    cameras : tuple of CalibratedCamera
-        Names are unique; translations are in `unit`.
-    bodies : tuple of Path
-        Files of markers.
-    files : tuple of Path
-        All that was read.
-    remarks : tuple of str
-        What is known of units and worlds, for the head of the session file.
-    warnings : tuple of str
-        What a person should look at.
-    """
-
-    unit: Unit
-    cameras: tuple[CalibratedCamera, ...]
-    bodies: tuple[Path, ...]
-    files: tuple[Path, ...]
-    remarks: tuple[str, ...]
-    warnings: tuple[str, ...]
+    unit: Unit  # {"m", "cm", "mm", "um"}
+    cameras: tuple[CalibratedCamera, ...]  # names are unique; translations are in `unit`
+    bodies: tuple[Path, ...]  # files of markers
+    files: tuple[Path, ...]  # all that was read
+    remarks: tuple[str, ...]  # what is known of units and worlds, for the head of the session file
+    warnings: tuple[str, ...]  # what a person should look at
 
 
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:

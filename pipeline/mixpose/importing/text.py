@@ -20,7 +20,6 @@ def session_text(imported: Imported, output: Path) -> str:
 
     Parameters
     ----------
-    imported : Imported
     output : Path
         Where the text will be: paths of bodies are relative to it.
     """

@@ -28,55 +28,28 @@ _MET = 0.2  # weight of a pair that counts as seen: within 2.5 deviations
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
-    """The sensors of a recording.
-
-    Attributes
-    ----------
-    names : tuple of str
-    sensors : tuple of Sensor
-    sigmas : (L,) float64
-        σ_ε of each.
-    """
+    """The sensors of a recording."""
 
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
-    sigmas: Floats
+    sigmas: Floats  # (L,): σ_ε of each
 
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A body as its recording shows it.
+    """A body as its recording shows it."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the markers.
-    points : (N, 3) float64
-    covariances : (N, 3, 3) float64
-        Of each marker, the body's frame being where its markers are on average.
-    frames : (N,) int
-        Frames in which two sensors or more saw it.
-    poses : (K, 4, 4) float64
-        T_world_object in the frames that were adjusted.
-    numbers : (K,) int
-        Of these frames; of congruent bodies each has its own pose.
-    count : int
-        Congruent bodies that were seen at a time.
-    residual : float
-        Deviation of detections, as a share of σ_ε.
-    spread : float
-        Standard deviation of markers about their places on the body, along an axis, beyond what
-        errors of detections explain; 0 of a rigid body.
-    """
-
-    names: tuple[str, ...]
-    points: Floats
+    names: tuple[str, ...]  # of the markers
+    points: Floats  # (N, 3)
+    # (N, 3, 3): of each marker, the body's frame being where its markers are on average
     covariances: Floats
-    frames: Indices
-    poses: Floats
-    numbers: Indices
-    count: int
-    residual: float
+    frames: Indices  # (N,): frames in which two sensors or more saw it
+    poses: Floats  # (K, 4, 4): T_world_object in the frames that were adjusted
+    numbers: Indices  # (K,): of these frames; of congruent bodies each has its own pose
+    count: int  # congruent bodies that were seen at a time
+    residual: float  # deviation of detections, as a share of σ_ε
+    # standard deviation of markers about their places on the body, along an axis, beyond what
+    # errors of detections explain; 0 of a rigid body
     spread: float
 
     @property

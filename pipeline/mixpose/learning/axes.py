@@ -56,7 +56,6 @@ def by_markers(learnt: Learnt, words: str) -> Learnt:
 
     Parameters
     ----------
-    learnt : Learnt
     words : str
         ``O,X,Y``: three markers by name.
 
@@ -95,7 +94,6 @@ def like(learnt: Learnt, points: Floats, names: Sequence[str]) -> Likeness | Non
 
     Parameters
     ----------
-    learnt : Learnt
     points : (M, 3) array
         Of the older body.
     names : sequence of str

@@ -27,13 +27,6 @@ def find_bodies(
 ) -> list[Found]:
     """Find what moves rigidly in clouds without what stands still; most points seen first.
 
-    Parameters
-    ----------
-    clouds : sequence of Cloud
-    rules : LearningRules
-    rng : Generator
-    progress : callable
-
     Returns
     -------
     list of Found

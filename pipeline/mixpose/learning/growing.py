@@ -34,27 +34,15 @@ _SURER = 0.15  # of a point's reach: errors that many frames have in common
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A body, and where it is in which frames.
+    """A body, and where it is in which frames."""
 
-    Attributes
-    ----------
-    shape : Shape
-        In a frame of its own.
-    places : tuple of (int, Placement)
-        With the index of the cloud; of congruent bodies several of one.
-    apart : (K,) int
-        Numbers of the placements' poses, the same where the body is at the same place.
-    count : int
-        Congruent bodies that are seen at a time.
-    loose : float
-        Times the error of triangulation that its points may be off.
-    """
-
-    shape: Shape
+    shape: Shape  # in a frame of its own
+    # with the index of the cloud; of congruent bodies several of one
     places: tuple[tuple[int, Placement], ...]
+    # (K,): numbers of the placements' poses, the same where the body is at the same place
     apart: Indices
-    count: int = 1
-    loose: float = 1.0
+    count: int = 1  # congruent bodies that are seen at a time
+    loose: float = 1.0  # times the error of triangulation that its points may be off
 
     @property
     def met(self) -> int:
@@ -101,8 +89,6 @@ def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found 
     ----------
     shape : Shape
         Three points or more.
-    clouds : sequence of Cloud
-    rules : LearningRules
     """
     for turn in range(rules.rounds):
         places = placed(shape, clouds, rules)

@@ -24,24 +24,12 @@ from mixpose.threads import one_blas_thread
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """What a recording told.
+    """What a recording told."""
 
-    Attributes
-    ----------
-    bodies : tuple of Learnt
-        In their principal axes, those of which most was seen first.
-    still : int
-        Other things that were seen and stood still all the time.
-    frames : int
-        That were read.
-    noise : float
-        Deviation of detections as a share of σ_ε, by how closely lines of sight meet.
-    """
-
-    bodies: tuple[Learnt, ...]
-    still: int
-    frames: int
-    noise: float
+    bodies: tuple[Learnt, ...]  # in their principal axes, those of which most was seen first
+    still: int  # other things that were seen and stood still all the time
+    frames: int  # that were read
+    noise: float  # deviation of detections as a share of σ_ε, by how closely lines of sight meet
 
 
 def eyes_of(session: Session) -> Eyes:
@@ -81,8 +69,6 @@ def learn(
         Its own bodies are not looked at.
     sources : dict of str to str or None
         Recordings in place of the session's, by sensor.
-    rules : LearningRules
-    progress : callable
 
     Raises
     ------
@@ -112,10 +98,6 @@ def learn_from(
 
     Parameters
     ----------
-    frames : sequence of SeenFrame
-    eyes : Eyes
-    rules : LearningRules
-    progress : callable
     name : str
         What messages call the recording.
 

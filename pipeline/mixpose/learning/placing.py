@@ -22,17 +22,10 @@ _REFINED = 3  # fits to all that is met, of which later ones reach farther from 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Points of a body, as far as it is known.
+    """Points of a body, as far as it is known."""
 
-    Attributes
-    ----------
-    points : (N, 3) float64
-    reach : (N,) float64
-        Standard deviation of each, as of `Cloud`.
-    """
-
-    points: Floats
-    reach: Floats
+    points: Floats  # (N, 3)
+    reach: Floats  # (N,): standard deviation of each, as of `Cloud`
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,20 +37,11 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a shape is in a frame.
+    """Where a shape is in a frame."""
 
-    Attributes
-    ----------
-    T_world_shape : (4, 4) float64
-    met : (N,) int
-        The point of the cloud that each point of the shape is; -1 for none.
-    off : float
-        Root mean square distance of the two, by what they may be off.
-    """
-
-    T_world_shape: Floats
-    met: Indices
-    off: float
+    T_world_shape: Floats  # (4, 4)
+    met: Indices  # (N,): the point of the cloud that each point of the shape is; -1 for none
+    off: float  # root mean square distance of the two, by what they may be off
 
     @property
     def count(self) -> int:
@@ -102,11 +86,8 @@ def placements(
 
     Parameters
     ----------
-    shape : Shape
     bases : (B, 3) int
         Triples of it that are looked for.
-    cloud : Cloud
-    rules : LearningRules
     most : int
         Placements that are wanted.
     least : int

@@ -22,30 +22,14 @@ _SHARES = np.logspace(-2.5, 0.3, 60)  # deviations that are tried, by the gate
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points in space that one frame shows, some of which are ghosts: rays that meet by chance.
+    """Points in space that one frame shows, some of which are ghosts: rays that meet by chance."""
 
-    Attributes
-    ----------
-    number : int
-        Of the frame.
-    points : (P, 3) float64
-        In the world.
-    reach : (P,) float64
-        Standard deviation of a point along the axis in which it is known worst.
-    detections : (P, L) int
-        Of each sensor the detection that it is seen as, or -1.
-    rows : (P,) int
-        Which points these are of all that the frame shows.
-    seen : SeenFrame
-        All detections of the frame.
-    """
-
-    number: int
-    points: Floats
-    reach: Floats
-    detections: Indices
-    rows: Indices
-    seen: SeenFrame
+    number: int  # of the frame
+    points: Floats  # (P, 3): in the world
+    reach: Floats  # (P,): standard deviation of a point along the axis in which it is known worst
+    detections: Indices  # (P, L): of each sensor the detection that it is seen as, or -1
+    rows: Indices  # (P,): which points these are of all that the frame shows
+    seen: SeenFrame  # all detections of the frame
 
     def __len__(self) -> int:
         return len(self.points)
@@ -81,15 +65,11 @@ def clouds_of(
 
     Parameters
     ----------
-    frames : sequence of SeenFrame
-    sensors : sequence of Sensor
     sigmas : (L,) array
         Largest error σ_ε of detections by sensor.
-    rules : LearningRules
 
     Returns
     -------
-    list of Cloud
     float
         Standard deviation of detections, as a share of σ_ε.
     """

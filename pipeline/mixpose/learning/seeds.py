@@ -20,20 +20,11 @@ _OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those
 
 @dataclass(frozen=True, eq=False)
 class Seed:
-    """A shape taken from one frame.
-
-    Attributes
-    ----------
-    shape : Shape
-    score : int
-        Points beyond two that other frames show alike, all frames together.
-    frames : int
-        In which it was found, of those compared.
-    """
+    """A shape taken from one frame."""
 
     shape: Shape
-    score: int
-    frames: int
+    score: int  # points beyond two that other frames show alike, all frames together
+    frames: int  # in which it was found, of those compared
 
 
 def seeds(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Seed]:
@@ -41,8 +32,6 @@ def seeds(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generato
 
     Parameters
     ----------
-    clouds : sequence of Cloud
-    rules : LearningRules
     rng : Generator
         By which triples are drawn where there are too many.
     """

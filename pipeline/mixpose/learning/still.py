@@ -26,7 +26,6 @@ def gathered_places(
         That a point is of; of frames that tell the same, one number.
     least : float
         Frames below which a place is none.
-    rules : LearningRules
 
     Returns
     -------

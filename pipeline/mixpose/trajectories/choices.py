@@ -23,36 +23,19 @@ NONE = -1
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What a frame may show.
+    """What a frame may show."""
 
-    Attributes
-    ----------
-    poses : (n, 4, 4) float64
-    weights : (n,) float64
-        Sum of at most 1.
-    may_be_none : bool
-        Whether it may be none of them.
-    """
-
-    poses: Floats
-    weights: Floats
-    may_be_none: bool
+    poses: Floats  # (n, 4, 4)
+    weights: Floats  # (n,): sum of at most 1
+    may_be_none: bool  # whether it may be none of them
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a frame shows, most likely.
+    """What a frame shows, most likely."""
 
-    Attributes
-    ----------
-    which : int
-        Of its alternatives, or `NONE`.
-    probabilities : (n,) float64
-        Of each of them.
-    """
-
-    which: int
-    probabilities: Floats
+    which: int  # of its alternatives, or `NONE`
+    probabilities: Floats  # (n,): of each of them
 
 
 def choices(

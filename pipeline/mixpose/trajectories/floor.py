@@ -21,20 +21,11 @@ _FLAT = 1e-6  # of the largest distance: points on a line span no plane
 
 @dataclass(frozen=True)
 class Floor:
-    """A frame for the world.
+    """A frame for the world."""
 
-    Attributes
-    ----------
-    T_old_new : (4, 4) float64
-        Maps coordinates of the new world to those of the old one.
-    by : str
-        What it was found by.
-    off : float or None
-        Root mean square distance of the points from the floor; None where any would fit.
-    """
-
-    T_old_new: Floats
-    by: str
+    T_old_new: Floats  # (4, 4): maps coordinates of the new world to those of the old one
+    by: str  # what it was found by
+    # root mean square distance of the points from the floor; None where any would fit
     off: float | None = None
 
 

@@ -64,7 +64,6 @@ def fitted_model(track: Track, rules: SmoothingRules, motion: str | None = None)
     ----------
     track : Track
         Times without a pose are left out.
-    rules : SmoothingRules
     motion : str or None
         Of `ORDERS`; else the likeliest.
     """

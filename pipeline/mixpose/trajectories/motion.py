@@ -43,19 +43,13 @@ _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 @dataclass(frozen=True)
 class States:
-    """States of a body at one time, as G filters that run side by side know them.
+    """States of a body at one time, as G filters that run side by side know them."""
 
-    Attributes
-    ----------
-    poses : (G, 4, 4) float64
-    rates : (G, p - 1, 6) float64
-        Derivatives of the pose, lengths and radians per second to the power of 1 to p - 1.
-    covariances : (G, 6 p, 6 p) float64
-        Of the pose and of its derivatives, in this order, six numbers of each.
-    """
-
-    poses: Floats
+    poses: Floats  # (G, 4, 4)
+    # (G, p - 1, 6): derivatives of the pose, lengths and radians per second to the power of 1 to p
+    # - 1
     rates: Floats
+    # (G, 6 p, 6 p): of the pose and of its derivatives, in this order, six numbers of each
     covariances: Floats
 
     @property
@@ -93,7 +87,6 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
 
     Parameters
     ----------
-    states : States
     elapsed : float
         s.
     noise : (G, 6) array
@@ -118,13 +111,11 @@ def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, F
 
     Parameters
     ----------
-    states : States
     pose : (4, 4) or (G, 4, 4) array
     covariance : (6, 6) or (G, 6, 6) array
 
     Returns
     -------
-    states : States
     squared : (G,) float64
         Mahalanobis distance squared of the pose from what was foretold.
     log_likelihood : (G,) float64
@@ -160,17 +151,12 @@ def _solved(S: Floats, cross: Floats, rest: Floats) -> tuple[Floats, Floats, Flo
 
 @dataclass(frozen=True)
 class Passage:
-    """What all poses say of the time between two of them.
+    """What all poses say of the time between two of them."""
 
-    Attributes
-    ----------
-    squared, degrees : (2,) float64
-        bᵀQb and tr NQ, of lengths and of turns: how large the noise was, in standard deviations,
-        and how many numbers of it are known.  In the mean they are equal.
-    """
-
+    # (2,): bᵀQb and tr NQ, of lengths and of turns: how large the noise was, in standard
+    # deviations, and how many numbers of it are known.  In the mean they are equal.
     squared: Floats
-    degrees: Floats
+    degrees: Floats  # (2,)
 
 
 def smoothed(

@@ -40,20 +40,14 @@ class PivotRules:
 
 @dataclass(frozen=True)
 class Pivoting:
-    """Poses of a body whose tip stays where it is.
+    """Poses of a body whose tip stays where it is."""
 
-    Attributes
-    ----------
-    poses, covariances : (N, 4, 4) and (N, 6, 6) float64
-        Of the body.
-    references, reference_covariances : (N, 4, 4) and (N, 6, 6) float64
-        Of the body that the point is fixed in; identity and zero: of the world.
-    """
-
-    poses: Floats
-    covariances: Floats
+    poses: Floats  # (N, 4, 4) and (N, 6, 6): of the body
+    covariances: Floats  # (N, 4, 4) and (N, 6, 6)
+    # (N, 4, 4) and (N, 6, 6): of the body that the point is fixed in; identity and zero: of the
+    # world
     references: Floats
-    reference_covariances: Floats
+    reference_covariances: Floats  # (N, 4, 4) and (N, 6, 6)
 
     def part(self, some: Mask) -> Pivoting:
         """Some of the poses."""
@@ -67,39 +61,22 @@ class Pivoting:
 
 @dataclass(frozen=True)
 class Tip:
-    """A tip.
+    """A tip."""
 
-    Attributes
-    ----------
-    place : (3,) float64
-        In the coordinates of the body.
-    covariance : (3, 3) float64
-    pivot : (3,) float64
-        The point that it stays at, in the world or in the reference body.
-    residual, expected, held_out : float
-        Root mean square distances of tip and point: of these poses, by their covariances, and of
-        poses that were held out.
-    scale : float
-        Squared residuals by their covariances; what is above 1 is in the covariance of the tip.
-    frames, left_out : int
-        Poses that count, and that lie too far off.
-    turns_deg : (3,) float64
-        Root mean square turns across the three directions, least first.
-    directions : (3, 3) float64
-        Of the body, a row each.
-    """
-
-    place: Floats
-    covariance: Floats
-    pivot: Floats
+    place: Floats  # (3,): in the coordinates of the body
+    covariance: Floats  # (3, 3)
+    pivot: Floats  # (3,): the point that it stays at, in the world or in the reference body
+    # root mean square distances of tip and point: of these poses, by their covariances, and of
+    # poses that were held out
     residual: float
     expected: float
     held_out: float
+    # squared residuals by their covariances; what is above 1 is in the covariance of the tip
     scale: float
-    frames: int
+    frames: int  # poses that count, and that lie too far off
     left_out: int
-    turns_deg: Floats
-    directions: Floats
+    turns_deg: Floats  # (3,): root mean square turns across the three directions, least first
+    directions: Floats  # (3, 3): of the body, a row each
 
 
 def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:

@@ -37,31 +37,16 @@ _ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide anoth
 
 @dataclass(frozen=True)
 class SmoothedBody:
-    """The poses of a body, smoothed.
+    """The poses of a body, smoothed."""
 
-    Attributes
-    ----------
-    estimates : tuple of Estimate
-        One per line, and one per frame that was filled, by frame number.
-    model : MotionModel or None
-        None where there were too few poses.
-    smoothed, filled : int
-        How many poses there are that were smoothed and filled in.
-    decided : int
-        Ambiguous frames that are ok now.
-    refused : tuple of int
-        Frames whose poses were ok and lie far off those around them.
-    timed : bool
-        Whether the model goes by seconds; else by numbers of frames.
-    """
-
+    # one per line, and one per frame that was filled, by frame number
     estimates: tuple[Estimate, ...]
-    model: MotionModel | None
-    smoothed: int
+    model: MotionModel | None  # none where there were too few poses
+    smoothed: int  # how many poses there are that were smoothed and filled in
     filled: int
-    decided: int
-    refused: tuple[int, ...]
-    timed: bool
+    decided: int  # ambiguous frames that are ok now
+    refused: tuple[int, ...]  # frames whose poses were ok and lie far off those around them
+    timed: bool  # whether the model goes by seconds; else by numbers of frames
 
 
 @dataclass(frozen=True)
@@ -93,7 +78,6 @@ def smooth_body(
         Gaps of at most so many seconds from pose to pose are filled.
     motion : str or None
         What takes white noise, of `mixpose.trajectories.motion.ORDERS`; else the likeliest.
-    rules : SmoothingRules or None
 
     Raises
     ------

@@ -17,26 +17,14 @@ _FLOOR = 1e-9  # of the largest variance: what float64 can tell apart
 
 @dataclass(frozen=True)
 class Track:
-    """Poses of one body at ascending times.
+    """Poses of one body at ascending times."""
 
-    Attributes
-    ----------
-    times : (N,) float64
-        s, or numbers of frames.
-    poses : (N, 4, 4) float64
-    covariances : (N, 6, 6) float64
-        As `mixpose.rigid` has them; of directions that are held, any.
-    measured : (N,) bool
-        Whether there is a pose at that time; what stands in `poses` does not count where not.
-    free : (6,) bool
-        Directions of the world in which the body is estimated.
-    """
-
-    times: Floats
-    poses: Floats
-    covariances: Floats
+    times: Floats  # (N,): s, or numbers of frames
+    poses: Floats  # (N, 4, 4)
+    covariances: Floats  # (N, 6, 6): as `mixpose.rigid` has them; of directions that are held, any
+    # (N,): whether there is a pose at that time; what stands in `poses` does not count where not
     measured: Mask
-    free: Mask
+    free: Mask  # (6,): directions of the world in which the body is estimated
 
     def __len__(self) -> int:
         return len(self.times)
@@ -89,21 +77,12 @@ def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """How a body moves, and how far its poses are off.
+    """How a body moves, and how far its poses are off."""
 
-    Attributes
-    ----------
-    order : int
-        p, of the derivative that takes white noise.
-    intensities : (2,) float64
-        q, of lengths and of turns.
-    white : float
-        Share of the covariances that is independent from frame to frame; above 1 where poses
-        scatter more than their covariances say.
-    """
-
-    order: int
-    intensities: Floats
+    order: int  # p, of the derivative that takes white noise
+    intensities: Floats  # (2,): q, of lengths and of turns
+    # share of the covariances that is independent from frame to frame; above 1 where poses scatter
+    # more than their covariances say
     white: float = 1.0
 
 
@@ -141,19 +120,11 @@ def begun(track: Track, first: int, order: int, white: Floats, moved: Floats) ->
 
 @dataclass(frozen=True)
 class SmoothedTrack:
-    """A track with all that all its poses say.
+    """A track with all that all its poses say."""
 
-    Attributes
-    ----------
-    poses : (N, 4, 4) float64
-    covariances : (N, 6, 6) float64
-    passages : tuple of Passage
-        What happened between each two times.
-    """
-
-    poses: Floats
-    covariances: Floats
-    passages: tuple[Passage, ...]
+    poses: Floats  # (N, 4, 4)
+    covariances: Floats  # (N, 6, 6)
+    passages: tuple[Passage, ...]  # what happened between each two times
 
 
 def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
@@ -161,8 +132,6 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
 
     Parameters
     ----------
-    track : Track
-    model : MotionModel
     scales : (N - 1, 2) array or None
         By how much more noise there is between each two times than the model says.
     """

@@ -17,7 +17,6 @@ def unfolded(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseL
 
     Parameters
     ----------
-    lines : sequence of PoseLine
     symmetries : (n, 4, 4) array or None
         Motions T_object_object, identity included.
     """
