@@ -24,13 +24,12 @@ class Displacement:
     """How far one sensor is from where the old calibration has it."""
 
     name: str
-    turn_deg: float  # against the consensus of the sensors
+    turn_deg: float  # against the consensus of the sensors, like the shift
     shift: float
-    turn_deviation_deg: float  # one standard deviation of each
+    turn_deviation_deg: float
     shift_deviation: float
-    # sensor units; after, of frames that are held back where there are enough
-    residual_before: float
-    residual_after: float
+    residual_before: float  # sensor units
+    residual_after: float  # of frames that are held back where there are enough
     moved: bool
 
 
@@ -52,8 +51,10 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
     return tuple(told)
 
 
-def _pose(rig: Rig, index: int) -> Floats | None:
-    return getattr(rig.sensors[index], "T_sensor_world", None)
+def _poses(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
+    """T_sensor_world of a sensor before and after; None of a range sensor."""
+    old, new = (getattr(rig.sensors[index], "T_sensor_world", None) for rig in (before, after))
+    return None if old is None or new is None else (old, new)
 
 
 def _consensus(before: Rig, after: Rig) -> Floats:
@@ -62,8 +63,8 @@ def _consensus(before: Rig, after: Rig) -> Floats:
     That of the sensor from which the others differ least: the bumped ones are outvoted.
     """
     count = len(before.names)
-    poses = [(_pose(before, k), _pose(after, k)) for k in range(count)]
-    motions = [inverse(old) @ new for old, new in poses if old is not None and new is not None]
+    poses = [_poses(before, after, k) for k in range(count)]
+    motions = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
     if len(motions) < 3:  # of two, none is outvoted: the first is believed
         return motions[0] if motions else _from_places(before, after)
     worth = []
@@ -86,11 +87,11 @@ def _from_places(before: Rig, after: Rig) -> Floats:
 
 def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
     """Turn in degrees and shift of a sensor, the new world moved into the old one by G."""
-    old, new = _pose(before, index), _pose(after, index)
-    if old is None or new is None:
+    poses = _poses(before, after, index)
+    if poses is None:
         place = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
         return 0.0, float(np.linalg.norm(place - centre_of(before.sensors[index])))
-    moved = new @ inverse(G)
+    old, moved = poses[0], poses[1] @ inverse(G)
     turn = Rotation.from_matrix(moved[:3, :3] @ old[:3, :3].T).magnitude()
     shift = np.linalg.norm(inverse(moved)[:3, 3] - inverse(old)[:3, 3])
     return float(np.degrees(turn)), float(shift)

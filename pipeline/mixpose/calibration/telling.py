@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from mixpose.calibration.checking import Displacement, displacements
 from mixpose.calibration.result import Calibration
-from mixpose.calibration.rig import Block, centre_of
+from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
 from mixpose.rigid import rotation_angle_deg
@@ -37,9 +35,15 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
         )
     lines += _held_lines(found, unit)
     lines += [f"{'doubt':<10}{text}" for text in doubts_of(found, unit)]
-    for direction in found.refused:
-        lines.append(f"{'refused':<10}not determined: {direction}")
-    return lines
+    return lines + [f"{'refused':<10}not determined: {text}" for text in found.refused]
+
+
+def _unit_of(found: Calibration, sensor: int, unit: str) -> str:
+    return "px" if found.after.sensors[sensor].unit == "px" else unit
+
+
+def _plus_minus(deviation: float, unit: str) -> str:
+    return f"± {deviation:.2g} {unit}" if np.isfinite(deviation) else "not determined"
 
 
 def _held_lines(found: Calibration, unit: str) -> list[str]:
@@ -72,7 +76,7 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
         )
     for sensor, each in found.residuals.items():
         if each.held > rules.rising * each.after:
-            of = "px" if found.after.sensors[sensor].unit == "px" else unit
+            of = _unit_of(found, sensor, unit)
             told.append(
                 f"{found.after.names[sensor]}: the residual rises from {each.after:.3g} to "
                 f"{each.held:.3g} {of} in the frames held back: the others are too few or "
@@ -95,17 +99,16 @@ def _frames_line(found: Calibration) -> str:
 
 def _block_lines(found: Calibration, block: Block, unit: str) -> list[str]:
     assert block.sensor is not None, "the body has lines of its own"
-    name = found.after.names[block.sensor]
-    before, after = values_of(found, block)
-    lines = []
     if block.kind == "pose":
-        lines.append(_moved_line(found, block, unit))
-        return lines
+        return [_moved_line(found, block, unit)]
+    name = found.after.names[block.sensor]
+    before, after = values_of(found.before, block), values_of(found.after, block)
+    lines = []
     for k, part in enumerate(block.names):
         of = unit if block.units[k] == "length" else block.units[k]
         scale, of = (1e3, "ms") if of == "s" else (1.0, of)
         deviation = found.deviations[block.start + k] * scale
-        said = f"± {deviation:.2g} {of}" if np.isfinite(deviation) else "not determined"
+        said = _plus_minus(deviation, of)
         title = f"{name} {block.kind}" + (f" {part}" if len(block.names) > 1 else "")
         lines.append(f"{title:<28}{before[k] * scale:>14.6g} -> {after[k] * scale:<14.6g}{said}")
     return lines
@@ -131,51 +134,21 @@ def _moved_line(found: Calibration, block: Block, unit: str) -> str:
     return f"{title:<28}turned by {turn:.4g} ± {words[1]}, moved by {shift:.5g} ± {words[0]}{link}"
 
 
-def values_of(found: Calibration, block: Block) -> tuple[Floats, Floats]:
-    """Values of a block before and after."""
-    both = []
-    for rig in (found.before, found.after):
-        sensor = rig.sensors[block.sensor or 0]
-        value: Floats
-        if block.kind == "position":
-            value = sensor.position  # type: ignore[attr-defined]
-        elif block.kind == "range_bias":
-            value = np.array([sensor.range_bias])  # type: ignore[attr-defined]
-        elif block.kind == "focal":
-            K = sensor.camera_matrix  # type: ignore[attr-defined]
-            value = np.array([K[0, 0], K[1, 1]])[: len(block.names)]
-        elif block.kind == "principal_point":
-            K = getattr(sensor, "camera_matrix", None)
-            value = sensor.principal_point if K is None else K[:2, 2]  # type: ignore[attr-defined]
-        elif block.kind == "distortion":
-            value = np.zeros(len(block.names))
-            given = sensor.distortion[: len(value)]  # type: ignore[attr-defined]
-            value[: len(given)] = given
-        else:
-            source = rig.delays if block.kind == "delay" else rig.drifts
-            value = source[[block.sensor or 0]]
-        both.append(np.asarray(value, dtype=np.float64))
-    return both[0], both[1]
-
-
 def _body_lines(found: Calibration, unit: str) -> list[str]:
     block = next(b for b in found.blocks if b.kind == "body")
     deviation = found.deviations[block.place].reshape(-1, 3)
     shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
     lines = []
     for label, moved, each in zip(found.after.labels, shift, deviation, strict=True):
-        total = np.sqrt((each**2).sum())
-        said = f"± {total:.2g} {unit}" if np.isfinite(total) else "not determined"
+        said = _plus_minus(np.sqrt((each**2).sum()), unit)
         lines.append(f"{f'body feature {label}':<28}moved by {moved:.4g} {said}")
     return lines
 
 
 def _residual_lines(found: Calibration, unit: str) -> list[str]:
-    lines = [
-        f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>12}",
-    ]
+    lines = [f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>12}"]
     for sensor, each in found.residuals.items():
-        of = "px" if found.after.sensors[sensor].unit == "px" else unit
+        of = _unit_of(found, sensor, unit)
         numbers = "".join(
             f"{value:>{width}.3g}" if np.isfinite(value) else f"{'–':>{width}}"
             for value, width in ((each.before, 10), (each.after, 10), (each.held, 12))
@@ -224,7 +197,7 @@ def _coverage_lines(found: Calibration) -> list[str]:
         counts = coverage(found, sensor)
         if counts is None:
             continue
-        empty = Counter(counts.ravel() == 0)[True]
+        empty = np.count_nonzero(counts == 0)
         said = f"{counts.size - empty} of {counts.size} parts of the image seen"
         if empty:
             said += f"; none at {_where(counts)}"
@@ -234,14 +207,9 @@ def _coverage_lines(found: Calibration) -> list[str]:
 
 def _where(counts: Floats) -> str:
     """Which sides of the image are empty, in words."""
-    sides = {
-        "top": counts[0],
-        "bottom": counts[-1],
-        "left": counts[:, 0],
-        "right": counts[:, -1],
-    }
+    sides = {"top": counts[0], "bottom": counts[-1], "left": counts[:, 0], "right": counts[:, -1]}
     empty = [name for name, row in sides.items() if not row.any()]
-    return ", ".join(empty) if empty else "some corners or gaps"
+    return ", ".join(empty) or "some corners or gaps"
 
 
 def check_lines(found: Calibration, unit: str) -> list[str]:
@@ -250,7 +218,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     bumped = [one.name for one in told if one.moved]
     lines = [_frames_line(found)]
     for index, one in enumerate(told):
-        of = "px" if found.after.sensors[index].unit == "px" else unit
+        of = _unit_of(found, index, unit)
         lines.append(
             f"{one.name:<20}{_displaced(one, unit)}; residual "
             f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"

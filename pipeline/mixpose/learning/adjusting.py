@@ -10,11 +10,9 @@ import numpy as np
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame
 from mixpose.calibration.adjust import Adjusted, adjust
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.choice import informative
 from mixpose.calibration.gauge import Freedom, gauge_rows
-from mixpose.calibration.interpolation import neighbours
-from mixpose.calibration.matching import clock_of
-from mixpose.calibration.rig import blocks_of
+from mixpose.calibration.recorded import informative
+from mixpose.calibration.rig import State, blocks_of
 from mixpose.learning.growing import Found, only_once
 from mixpose.learning.placing import FEWEST
 from mixpose.learning.points import Cloud
@@ -90,7 +88,7 @@ def adjusted(
             found = _adjusted(points, frames, poses, eyes)
             seen = _seen(found, len(points), len(frames))
             kept = seen >= max(rules.least_frames, rules.least_share * len(frames))
-            kept &= _are_single(found.rig.points, seen, body, clouds, rules)
+            kept &= _are_single(found.state.rig.points, seen, body, clouds, rules)
             if kept.all():
                 learnt.append(_learnt(body, found, frames, seen, clouds, eyes))
                 break
@@ -146,24 +144,22 @@ def _left(seen: SeenFrame, others: Sequence[Indices]) -> SeenFrame:
 
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
-    rules, sensors = CalibrationRules(), len(eyes.sensors)
-    none = np.zeros(sensors)
+    rules, none = CalibrationRules(), np.zeros(len(eyes.sensors))
     labels = tuple(str(k + 1) for k in range(len(points)))
     rig = Rig(eyes.names, eyes.sensors, points, None, none, none, labels)
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
-    clock = clock_of(frames, neighbours([None] * len(frames), rules.gap), sensors)
     free = np.ones(6, dtype=np.bool_)
-    bundle = Bundle(frames, clock, blocks, free, rules.undetermined)
     gauge, _ = gauge_rows(rig, blocks, Freedom(free, poses))
-    return adjust(bundle, rig, poses, lambda _: gauge, eyes.sigmas, rules)
+    bundle = Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules)
+    return adjust(bundle, State(rig, poses))
 
 
 def _seen(found: Adjusted, markers: int, frames: int) -> Indices:
     """Frames (N,) in which two sensors or more met a marker."""
     met = np.zeros((frames, markers), dtype=np.intp)
-    for pairs, _, weight in found.weighted:
-        good = pairs.nearest & (weight > _MET)
-        np.add.at(met, (pairs.frame[good], pairs.feature[good]), 1)
+    for rows, weight in found.weighted:
+        good = rows.pairs.nearest & (weight > _MET)
+        np.add.at(met, (rows.pairs.frame[good], rows.pairs.feature[good]), 1)
     return np.asarray((met >= 2).sum(axis=0))
 
 
@@ -175,15 +171,15 @@ def _learnt(
     clouds: Sequence[Cloud],
     eyes: Eyes,
 ) -> Learnt:
-    count = len(found.rig.points)
+    count = len(found.state.rig.points)
     blocks = found.covariance.reshape(count, 3, count, 3)
     residual = float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2)))
     return Learnt(
-        names=found.rig.labels,
-        points=found.rig.points,
+        names=found.state.rig.labels,
+        points=found.state.rig.points,
         covariances=np.array([blocks[k, :, k] for k in range(count)]),
         frames=seen,
-        poses=found.poses,
+        poses=found.state.poses,
         numbers=np.array([frame.number for frame in frames]),
         count=body.count,
         residual=residual,

@@ -7,32 +7,55 @@ from the nearest frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.records import Floats
+from mixpose.calibration.rig import Rig
+from mixpose.calibration.task import SeenFrame
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import twist_between
 
 _NODES = 4
 
 
-class Neighbours(NamedTuple):
-    """Frames that a frame's motion is interpolated through."""
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When sensors look, and the frames that a frame's motion is interpolated through."""
 
-    nodes: NDArray[np.intp]  # (K, 4): the frame itself first; where there are fewer, itself again
+    nodes: Indices  # (K, 4): the frame itself first; where there are fewer, itself again
     away: Floats  # (K, 4): seconds from the frame to each; NaN where there are fewer
+    late: Floats  # (L, K): seconds from a frame's common time to a sensor's; 0 where not known
+    since: Floats  # (L, K): seconds from the middle of the recording
+
+    def tau(self, rig: Rig, sensor: int, frame: Indices) -> Floats:
+        """Seconds from the common time of frames (n,) to when a sensor took them."""
+        late = self.late[sensor, frame] + rig.delays[sensor]
+        return np.asarray(late + rig.drifts[sensor] * self.since[sensor, frame])
 
 
-def neighbours(times: Sequence[float | None], gap: float) -> Neighbours:
-    """Find the frames nearest in time, within `gap` median intervals each."""
+def clock_of(frames: Sequence[SeenFrame], sensors: int, gap: float) -> Clock:
+    """When sensors say that they look; frames are neighbours within `gap` median intervals each."""
+    late, since = np.zeros((sensors, len(frames))), np.zeros((sensors, len(frames)))
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    middle = (min(times) + max(times)) / 2 if times else 0.0
+    for k, frame in enumerate(frames):
+        for sensor, time in frame.times.items():
+            if frame.time_s is not None:
+                late[sensor, k] = time - frame.time_s
+                since[sensor, k] = time - middle
+    return Clock(*_neighbours([frame.time_s for frame in frames], gap), late, since)
+
+
+def _neighbours(times: Sequence[float | None], gap: float) -> tuple[Indices, Floats]:
+    """Nodes and how far they are away, as of `Clock`."""
     count = len(times)
     index = np.repeat(np.arange(count)[:, None], _NODES, axis=1)
     away = np.full((count, _NODES), np.nan)
     away[:, 0] = 0.0
     if count < 2 or any(t is None for t in times):
-        return Neighbours(index, away)
+        return index, away
     stamps = np.array(times, dtype=np.float64)
     order = np.argsort(stamps, kind="stable")
     reach = gap * float(np.median(np.diff(stamps[order])))
@@ -42,7 +65,7 @@ def neighbours(times: Sequence[float | None], gap: float) -> Neighbours:
         near.sort(key=lambda p: abs(stamps[order[p]] - stamps[k]))
         for node, p in enumerate(near[: _NODES - 1], start=1):
             index[k, node], away[k, node] = order[p], stamps[order[p]] - stamps[k]
-    return Neighbours(index, away)
+    return index, away
 
 
 class Interpolated(NamedTuple):
@@ -51,30 +74,20 @@ class Interpolated(NamedTuple):
     twist: Floats  # (n, 6): from the frame's pose to that at the offset
     rate: Floats  # (n, 6): twist per second there
     shares: Floats  # (n, 4): by how much it follows each of the neighbours
-    known: NDArray[np.bool_]  # (n,): whether there are frames to interpolate between
+    known: Mask  # (n,): whether there are frames to interpolate between
 
 
-def interpolate(
-    near: Neighbours, poses: Floats, frame: NDArray[np.intp], tau: Floats
-) -> Interpolated:
-    """Twists from frames (n,) to the poses tau (n,) seconds later.
-
-    Parameters
-    ----------
-    poses : (K, 4, 4) array
-    frame : (n,) int
-    tau : (n,) array
-    """
-    nodes, away = near.nodes[frame], near.away[frame]
+def interpolate(clock: Clock, poses: Floats, frame: Indices, tau: Floats) -> Interpolated:
+    """Twists from frames (n,), of poses (K, 4, 4), to the poses tau (n,) seconds later."""
+    nodes, away = clock.nodes[frame], clock.away[frame]
     shares, slopes = _lagrange(away, tau)
     T_here = np.repeat(poses[frame][:, None], _NODES, axis=1)
     twists = twist_between(T_here, poses[nodes])
-    known = np.isfinite(away[:, 1])
     return Interpolated(
         np.einsum("nj,njk->nk", shares, twists),
         np.einsum("nj,njk->nk", slopes, twists),
         shares,
-        known,
+        np.isfinite(away[:, 1]),
     )
 
 
