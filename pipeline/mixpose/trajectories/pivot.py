@@ -11,7 +11,8 @@ equation is weighed by the covariance of its poses at the tip.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -38,25 +39,19 @@ class PivotRules:
     )
 
 
-@dataclass(frozen=True)
-class Pivoting:
+class Pivoting(NamedTuple):
     """Poses of a body whose tip stays where it is."""
 
-    poses: Floats  # (N, 4, 4) and (N, 6, 6): of the body
-    covariances: Floats  # (N, 4, 4) and (N, 6, 6)
-    # (N, 4, 4) and (N, 6, 6): of the body that the point is fixed in; identity and zero: of the
-    # world
+    poses: Floats  # (N, 4, 4): of the body
+    covariances: Floats  # (N, 6, 6)
+    # (N, 4, 4): of the body that the point is fixed in; of the world these are the identity, and
+    # their covariances zero
     references: Floats
-    reference_covariances: Floats  # (N, 4, 4) and (N, 6, 6)
+    reference_covariances: Floats  # (N, 6, 6)
 
     def part(self, some: Mask) -> Pivoting:
         """Some of the poses."""
-        return Pivoting(
-            self.poses[some],
-            self.covariances[some],
-            self.references[some],
-            self.reference_covariances[some],
-        )
+        return Pivoting(*(each[some] for each in self))
 
 
 @dataclass(frozen=True)
@@ -66,15 +61,13 @@ class Tip:
     place: Floats  # (3,): in the coordinates of the body
     covariance: Floats  # (3, 3)
     pivot: Floats  # (3,): the point that it stays at, in the world or in the reference body
-    # root mean square distances of tip and point: of these poses, by their covariances, and of
-    # poses that were held out
-    residual: float
-    expected: float
-    held_out: float
+    residual: float  # root mean square distance of tip and point
+    expected: float  # the same by the covariances of the poses
+    held_out: float  # and of poses that were held out
     # squared residuals by their covariances; what is above 1 is in the covariance of the tip
     scale: float
-    frames: int  # poses that count, and that lie too far off
-    left_out: int
+    frames: int  # poses that count
+    left_out: int  # those that lie too far off
     turns_deg: Floats  # (3,): root mean square turns across the three directions, least first
     directions: Floats  # (3, 3): of the body, a row each
 
@@ -82,10 +75,7 @@ class Tip:
 def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
     """Find the tip of a body that turns about it.
 
-    Raises
-    ------
-    RecordingError
-        If there are too few poses, or turns are missing; it says which.
+    Raises a RecordingError if there are too few poses, or says which turns are missing.
     """
     rules = rules or PivotRules()
     if len(pivoting.poses) < rules.fewest:
@@ -215,4 +205,4 @@ def fixed_in_world(poses: Floats, covariances: Floats) -> Pivoting:
 
 def fixed_in(pivoting: Pivoting, references: Floats, covariances: Floats) -> Pivoting:
     """The same, of which the point is fixed in another body with these poses."""
-    return replace(pivoting, references=references, reference_covariances=covariances)
+    return pivoting._replace(references=references, reference_covariances=covariances)

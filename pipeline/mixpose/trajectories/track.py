@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,13 +30,8 @@ class Track:
 
     def part(self, some: slice | Mask) -> Track:
         """A part of the track."""
-        return Track(
-            self.times[some],
-            self.poses[some],
-            self.covariances[some],
-            self.measured[some],
-            self.free,
-        )
+        poses, covariances = self.poses[some], self.covariances[some]
+        return Track(self.times[some], poses, covariances, self.measured[some], self.free)
 
     @property
     def interval(self) -> float:
@@ -53,6 +47,11 @@ class Track:
         return np.asarray(np.sqrt((twists**2).mean(axis=(0, 2))).repeat(3))
 
 
+def of_free(covariances: Floats, free: Mask) -> Floats:
+    """Covariances (N, 6, 6) with zero for directions that are held."""
+    return np.where(free[:, None] & free, covariances, 0.0)
+
+
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
     """A track whose covariances can be inverted; directions without variance are held.
 
@@ -63,9 +62,7 @@ def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) 
     variances = np.diagonal(seen, axis1=1, axis2=2).max(axis=0)
     kinds = variances.reshape(2, 3).max(axis=1).repeat(3)
     free = variances > 1e-12 * np.where(kinds > 0, kinds, np.inf)
-    covariances = covariances.copy()
-    covariances[:, ~free] = 0.0
-    covariances[:, :, ~free] = 0.0
+    covariances = of_free(covariances, free)
     typical = np.diagonal(seen, axis1=1, axis2=2).mean(axis=0)
     for kind in (slice(0, 3), slice(3, 6)):
         own = free[kind]
@@ -88,7 +85,7 @@ class MotionModel:
 
 def noise_of(track: Track, intensities: Floats) -> Floats:
     """Intensities (G, 6) of each coordinate, from those (G, 2) of lengths and turns."""
-    held = _held_intensity(track, 2)
+    held = np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** 3
     return np.where(track.free, intensities.repeat(3, axis=1), held)
 
 
@@ -98,23 +95,17 @@ def white_part(track: Track, k: int, white: Floats) -> Floats:
     return np.asarray(track.covariances[k] * scale[:, :, None] * scale[:, None])
 
 
-def _held_intensity(track: Track, order: int) -> Floats:
-    return np.asarray(
-        np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** (2 * order - 1)
-    )
-
-
-def begun(track: Track, first: int, order: int, white: Floats, moved: Floats) -> States:
+def begun(track: Track, order: int, white: Floats) -> States:
     """G states at the first pose, of whose rates nothing is known."""
-    covariances = white_part(track, first, white)
+    covariances = white_part(track, 0, white)
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    widths = _DIFFUSE * (moved + deviation)
+    widths = _DIFFUSE * (track.moved + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
     G = len(white)
     P = np.zeros((G, 6 * order, 6 * order))
     P[:, range(6 * order), range(6 * order)] = np.concatenate([deviation, *rates], axis=1) ** 2
     P[:, :6, :6] = covariances
-    poses = np.broadcast_to(track.poses[first], (G, 4, 4))
+    poses = np.broadcast_to(track.poses[0], (G, 4, 4))
     return States(poses, np.zeros((G, order - 1, 6)), P)
 
 
@@ -130,16 +121,13 @@ class SmoothedTrack:
 def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
     """Smooth a track whose first time has a pose.
 
-    Parameters
-    ----------
-    scales : (N - 1, 2) array or None
-        By how much more noise there is between each two times than the model says.
+    `scales` (N - 1, 2) is how much more noise there is between each two times than the model says.
     """
     white = np.array([model.white])
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
     noises = [noise_of(track, (model.intensities * scale)[None]) for scale in scales]
-    states = [begun(track, 0, model.order, white, track.moved)]
+    states = [begun(track, model.order, white)]
     ahead: list[tuple[States, Floats]] = []
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
         ahead.append(foretold(states[-1], elapsed, noise))
@@ -149,24 +137,15 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
         states.append(state)
     passages: list[Passage] = []
     for k in range(len(steps) - 1, -1, -1):
-        states[k], passage = smoothed(
-            states[k], *_after(ahead[k], states[k + 1]), steps[k], noises[k]
-        )
+        foreseen, F = ahead[k]
+        states[k], passage = smoothed(states[k], foreseen, states[k + 1], F, steps[k], noises[k])
         passages.append(passage)
-    return _without_held(track, states, tuple(reversed(passages)))
-
-
-def _after(ahead: tuple[States, Floats], later: States) -> tuple[States, States, Floats]:
-    return ahead[0], later, ahead[1]
-
-
-def _without_held(
-    track: Track, states: Sequence[States], passages: tuple[Passage, ...]
-) -> SmoothedTrack:
     covariances = np.stack([one.covariances[0][:6, :6] for one in states])
-    covariances[:, ~track.free] = 0.0
-    covariances[:, :, ~track.free] = 0.0
-    return SmoothedTrack(np.concatenate([one.poses for one in states]), covariances, passages)
+    return SmoothedTrack(
+        np.concatenate([one.poses for one in states]),
+        of_free(covariances, track.free),
+        tuple(reversed(passages)),
+    )
 
 
 def without(track: Track, bad: Mask) -> Track:
