@@ -26,11 +26,10 @@ from simulated_rigs import (
 )
 
 from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
-from mixpose.calibration.checking import displacements
-from mixpose.calibration.clock import clock_of, interpolate
-from mixpose.calibration.gauge import Freedom, gauge_rows
-from mixpose.calibration.matching import match
+from mixpose.calibration.gauge import gauge_rows
+from mixpose.calibration.matching import clock_of, interpolate, match
 from mixpose.calibration.recorded import held_back_with
+from mixpose.calibration.result import displacements
 from mixpose.calibration.rig import State, blocks_of
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Hypotheses
@@ -207,9 +206,9 @@ def test_as_many_conditions_as_freedoms(free: tuple[int, ...], body: bool, count
     rig = Rig.of(("a", "b"), cameras(2), BODY)
     poses = np.array([motion(time) for time in (0.1, 0.7, 1.6, 2.3)])
     blocks = blocks_of(rig, dict.fromkeys(free, ("pose",)), body=body, length=800.0, interval=1.0)
-    rows, _ = gauge_rows(rig, blocks, Freedom(ALL, poses))
+    rows, _ = gauge_rows(State(rig, poses), blocks, ALL)
     assert len(rows) == count
-    known, _ = gauge_rows(rig, blocks, Freedom(~ALL, poses))
+    known, _ = gauge_rows(State(rig, poses), blocks, ~ALL)
     assert len(known) == 0
 
 

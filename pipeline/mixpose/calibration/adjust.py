@@ -67,12 +67,8 @@ def adjust(
 ) -> Adjusted:
     """Climb from a start to the maximum.
 
-    Parameters
-    ----------
-    blurs : (L,) array or None
-        To begin with; None: as the start needs.
-    noise : (L,) array or None
-        Known noise, of which none is learnt.
+    The blurs (L,) to begin with are as the start needs if left out.  Noise (L,) that is given is
+    known, and none is learnt.
     """
     rules = bundle.rules
     blur = _first_blurs(bundle, state) if blurs is None else blurs

@@ -16,8 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from mixpose.calibration.clock import Clock, clock_of, interpolate
-from mixpose.calibration.matching import Pairs
+from mixpose.calibration.matching import Clock, Pairs, clock_of, interpolate
 from mixpose.calibration.rig import Block, Rig, State, by_parameters, moved
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame
@@ -110,20 +109,14 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
     return Rows(pairs, pairs.y - y, by_pose, shares, by_rig, by_held, known & visible)
 
 
-@dataclass(frozen=True, eq=False)
-class _Normal:
-    """The normal equations H δ = b, poses eliminated."""
+def _normal_equations(
+    bundle: Bundle, weighted: Sequence[Weighted], damping: float
+) -> tuple[Floats, Floats, Floats, Callable[[Floats], Floats]]:
+    """The normal equations S δ = b of the rig (G, G), poses eliminated.
 
-    S: Floats  # (G, G): information on the rig, the poses being unknown
-    held: Floats  # (G, C): the same between the rig and what is held
-    b: Floats  # (G,)
-    poses: Callable[[Floats], Floats]  # the poses' step that belongs to one of the rig
-
-
-def _normal_equations(bundle: Bundle, weighted: Sequence[Weighted], damping: float) -> _Normal:
-    """Assemble and eliminate; a share of the diagonal is added to the poses' part.
-
-    Weights include the inverse variance.
+    Beside S there is the information (G, C) between the rig and what is held, beside b the poses'
+    step that belongs to one of the rig.  Weights include the inverse variance; a share of the
+    diagonal is added to the poses' part.
     """
     G, free = bundle.count, np.flatnonzero(bundle.pose_free)
     P = len(free) * len(bundle.frames)
@@ -143,16 +136,14 @@ def _normal_equations(bundle: Bundle, weighted: Sequence[Weighted], damping: flo
             B = _pose_columns(rows, bundle.clock, root, free, P)
             H_pp, W, b_p = H_pp + B.T @ B, W + B.T @ A, b_p + B.T @ r
     if not P:
-        return _Normal(H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: b_p)
+        return H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: b_p
     diagonal = H_pp.diagonal()
     floor = 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
     factor = splu((H_pp + sp.diags(damping * diagonal + floor)).tocsc())
     X = factor.solve(np.column_stack([W[:, :G], b_p]))
     S = H_gg[:, :G] - W.T @ X[:, :-1]
     b = b_g[:G] - W[:, :G].T @ X[:, -1]
-    return _Normal(
-        (S[:G] + S[:G].T) / 2, S[G:].T, b, lambda step: factor.solve(b_p - W[:, :G] @ step)
-    )
+    return (S[:G] + S[:G].T) / 2, S[G:].T, b, lambda step: factor.solve(b_p - W[:, :G] @ step)
 
 
 def _pose_columns(rows: Rows, clock: Clock, root: Floats, free: Indices, P: int) -> Any:
@@ -188,21 +179,21 @@ def solved(
     bundle: Bundle, state: State, weighted: Sequence[Weighted], damping: float = 0.0
 ) -> Step:
     """Solve within the gauge, leaving alone what the data do not determine."""
-    normal = _normal_equations(bundle, weighted, damping)
+    S, held, b, poses_step = _normal_equations(bundle, weighted, damping)
     scales = bundle.scales
-    S = normal.S * np.outer(scales, scales)
+    S = S * np.outer(scales, scales)
     basis = _complement(bundle.gauge(state.rig), len(scales))
     inner = basis.T @ S @ basis
-    pulls = scales[:, None] * normal.held  # of held parameters that are a standard deviation off
+    pulls = scales[:, None] * held  # of held parameters that are a standard deviation off
     told = _told(inner, basis.T @ pulls)
     values, vectors = np.linalg.eigh((told + told.T) / 2)
     known = values > 1.0 / bundle.rules.undetermined**2
     V = basis @ vectors[:, known]
     covariance = V @ np.linalg.inv(V.T @ S @ V) @ V.T
-    step = scales * (covariance @ (scales * normal.b))
+    step = scales * (covariance @ (scales * b))
     by_held = scales[:, None] * (covariance @ pulls)
     pose_steps = np.zeros((len(state.poses), 6))
-    pose_steps[:, bundle.pose_free] = normal.poses(step).reshape(len(pose_steps), -1)
+    pose_steps[:, bundle.pose_free] = poses_step(step).reshape(len(pose_steps), -1)
     return Step(
         step,
         pose_steps,

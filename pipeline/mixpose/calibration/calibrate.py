@@ -9,7 +9,7 @@ import numpy as np
 
 from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.gauge import Freedom, gauge_rows
+from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.recorded import held_back_with
 from mixpose.calibration.result import (
@@ -21,7 +21,7 @@ from mixpose.calibration.result import (
     sights_of,
     squared_residuals,
 )
-from mixpose.calibration.rig import Block, State, blocks_of, centre_of
+from mixpose.calibration.rig import Block, Rig, State, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import searched
 from mixpose.calibration.start import Start, start_from_cameras, starts_together
@@ -44,15 +44,8 @@ def calibrate(
 ) -> Calibration:
     """Calibrate sensors and body from what the sensors saw.
 
-    Parameters
-    ----------
-    found : dict or None
-        Hypotheses of single cameras that are known from before; new ones are added.
-
-    Raises
-    ------
-    RecordingError
-        If the body is not found in enough frames.
+    `found` are hypotheses of single cameras that are known from before; new ones are added.
+    Raises a RecordingError if the body is not found in enough frames.
     """
     if task.cameras:
         known = searched(task, rules, progress, {} if found is None else found)
@@ -137,13 +130,7 @@ class _Part:
 
 
 class _Run:
-    """One calibration from a start.
-
-    Attributes
-    ----------
-    found : Calibration
-        Without residuals.
-    """
+    """One calibration from a start; what it `found` is without residuals."""
 
     def __init__(
         self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
@@ -162,13 +149,8 @@ class _Run:
         free = {s: kinds for s, kinds in self._asked.free.items() if s not in unlinked}
         self._task = replace(self._asked, free=free)
         start = self._start.state
-        self._blocks = blocks_of(
-            start.rig,
-            free,
-            body=self._task.body_free,
-            length=_size_of(start),
-            interval=self._interval,
-        )
+        body, length = self._task.body_free, _size_of(start)
+        self._blocks = blocks_of(start.rig, free, body=body, length=length, interval=self._interval)
 
     def _result(self) -> Calibration:
         """The calibration, but for its residuals."""
@@ -234,11 +216,10 @@ class _Run:
     def _with_latecomers(self, part: _Part, late: dict[int, Floats]) -> _Part:
         """Frames with what the cameras that came late saw, and the rig with them."""
         self._lay_out([s for s in self._unlinked if s not in late])
-        linked = [s for s in range(len(self._task.rig.sensors)) if s not in self._unlinked]
         rig = part.state.rig
         for sensor, T in late.items():
             rig = rig.placed(sensor, T)
-        frames = tuple(frame.only(linked) for frame in self._whole(part))
+        frames = tuple(frame.without(self._unlinked) for frame in self._whole(part))
         return _Part(frames, part.state._replace(rig=rig))
 
     def _whole(self, part: _Part) -> tuple[SeenFrame, ...]:
@@ -247,16 +228,17 @@ class _Run:
         return tuple(numbers[frame.number] for frame in part.frames)
 
     def _bundle(self, part: _Part) -> Bundle:
-        task, freedom = self._task, Freedom(self._pose_free, part.state.poses)
+        task = self._task
+
+        def gauge(rig: Rig) -> Floats:
+            return self._gauge(part.state._replace(rig=rig))[0]
+
         return Bundle(
-            part.frames,
-            self._blocks,
-            self._pose_free,
-            lambda rig: gauge_rows(rig, self._blocks, freedom, task.length)[0],
-            task.sigmas,
-            self._rules,
-            task.errors,
+            part.frames, self._blocks, self._pose_free, gauge, task.sigmas, self._rules, task.errors
         )
+
+    def _gauge(self, state: State) -> tuple[Floats, tuple[str, ...]]:
+        return gauge_rows(state, self._blocks, self._pose_free, self._task.length)
 
     def _adjusted(self, part: _Part, noise: Floats | None = None) -> Adjusted:
         """A part adjusted, from narrow blurs where the noise is known from before."""
@@ -278,8 +260,6 @@ class _Run:
 
     def _told(self, part: _Part, adjusted: Adjusted, bad: list[int]) -> Calibration:
         task, rig = self._task, adjusted.state.rig
-        freedom = Freedom(self._pose_free, part.state.poses)
-        _, gauge = gauge_rows(rig, self._blocks, freedom, task.length)
         deviations, refused = _determined(self._blocks, adjusted, task.rig.names)
         numbers = [f.number for f in part.frames]
         return Calibration(
@@ -289,7 +269,7 @@ class _Run:
             deviations=deviations,
             covariance=adjusted.covariance,
             refused=refused,
-            gauge=gauge,
+            gauge=self._gauge(part.state)[1],
             through=self._start.through,
             unlinked=self._unlinked,
             used=tuple(numbers),
@@ -303,7 +283,6 @@ class _Run:
             explained=explained_share(adjusted, part.frames, task),
             sights=sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.state.poses, strict=True)),
-            frames=part.frames,
         )
 
 

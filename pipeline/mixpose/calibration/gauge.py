@@ -7,13 +7,12 @@ each step of the parameters, which change no residual either.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
 
-from mixpose.calibration.rig import Block, Kind, Rig, centre_of
+from mixpose.calibration.rig import Block, Kind, Rig, State, centre_of
 from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.sensors import RangeSensor
@@ -22,32 +21,17 @@ _GENERATORS = 13  # six motions of the world, six of the body in its frame, one 
 _MOST_POSES = 40
 
 
-@dataclass(frozen=True, eq=False)
-class Freedom:
-    """What is free beside the parameters of the rig."""
-
-    pose_free: Mask  # (6,)
-    poses: Floats  # (K, 4, 4)
-
-
 def gauge_rows(
-    rig: Rig, blocks: Sequence[Block], freedom: Freedom, length: tuple[int, int] | None = None
+    state: State, blocks: Sequence[Block], pose_free: Mask, length: tuple[int, int] | None = None
 ) -> tuple[Floats, tuple[str, ...]]:
-    """Conditions on a step of the parameters, in the parameters' sizes, and what they say.
+    """Conditions (r, G) on a step of the parameters, in the parameters' sizes, and what they say.
 
-    Parameters
-    ----------
-    length : (int, int) or None
-        Sensors whose distance is known.
-
-    Returns
-    -------
-    (r, G) array
-    tuple of str
-        A sentence for each freedom that was removed.
+    There is a sentence for each freedom that was removed.  `length` are two sensors whose distance
+    is known.
     """
+    rig = state.rig
     scales = np.array([scale for block in blocks for scale in block.scales])
-    moves, held = _generators(rig, blocks, freedom, len(scales))
+    moves, held = _generators(state, blocks, pose_free, len(scales))
     idle = null_space(held, rcond=1e-9) if len(held) else np.eye(_GENERATORS)
     Z = (moves @ idle) / scales[:, None]
     rows: list[Floats] = []
@@ -62,7 +46,7 @@ def gauge_rows(
 
 
 def _generators(
-    rig: Rig, blocks: Sequence[Block], freedom: Freedom, count: int
+    state: State, blocks: Sequence[Block], pose_free: Mask, count: int
 ) -> tuple[Floats, Floats]:
     """Each generator's change of the free parameters (G, 13), and of all that is held (h, 13)."""
     moves, held = np.zeros((count, _GENERATORS)), [np.zeros((0, _GENERATORS))]
@@ -74,15 +58,15 @@ def _generators(
         else:
             moves[of] = change
 
-    for index, sensor in enumerate(rig.sensors):
+    for index, sensor in enumerate(state.rig.sensors):
         kind: Kind = "position" if isinstance(sensor, RangeSensor) else "pose"
         told(place.get((index, kind)), _sensor_change(sensor))
         if not hasattr(sensor, "camera_matrix"):
             held.append(np.eye(_GENERATORS)[12:])  # it measures lengths
-    told(place.get((None, "body")), _body_change(rig.points))
-    fixed = ~freedom.pose_free
+    told(place.get((None, "body")), _body_change(state.rig.points))
+    fixed = ~pose_free
     if fixed.any():
-        poses = freedom.poses[:: max(len(freedom.poses) // _MOST_POSES, 1)]
+        poses = state.poses[:: max(len(state.poses) // _MOST_POSES, 1)]
         held += [_pose_change(T)[fixed] for T in poses]
     return moves, np.concatenate(held)
 

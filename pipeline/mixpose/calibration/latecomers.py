@@ -37,17 +37,11 @@ def placed(
 ) -> Floats | None:
     """T_sensor_world of a camera from known poses of the body; None where they do not tell.
 
-    It is believed to stand to one of the linked sensors about as the session has it.
-
-    Parameters
-    ----------
-    state : State
-        With the linked sensors where they are by now.
-    frames : sequence of SeenFrame
-        With what the camera saw.
-    noise : (L,) array
+    It is believed to stand to one of the linked sensors about as the session has it; in the state
+    these are where they are by now.
     """
-    own = tuple(frame.only((sensor,)) for frame in frames)
+    others = [s for s in range(len(task.rig.sensors)) if s != sensor]
+    own = tuple(frame.without(others) for frame in frames)
     total = sum(len(frame.points.get(sensor, ())) for frame in own)
     if total < rules.least_detections:
         return None

@@ -27,12 +27,7 @@ _MEANS = 1e-3  # information before the first frame, of a descriptor's spread
 
 
 def require_points(body: Body) -> None:
-    """Refuse bodies whose detections are not points.
-
-    Raises
-    ------
-    SessionError
-    """
+    """Refuse, by a SessionError, bodies whose detections are not points."""
     if not is_pointlike(body):
         raise SessionError(
             "calibrate: object: found segments or spread features; allowed: points, which leave "
@@ -73,8 +68,9 @@ def read_frames(
         )
     found: list[SeenFrame] = []
     index = {setup.name: k for k, setup in enumerate(session.sensors)}
-    total = min(_length(opened), rules.most_read)
-    for start, stop, step in _stretches(opened, rules, runs=runs):
+    length = max((source.length or 0 for source in opened.values()), default=0)
+    total = min(length, rules.most_read)
+    for start, stop, step in _stretches(opened, length, rules, runs=runs):
         with closing(pair(opened, start, stop, step)) as sets:
             for frame_set in sets:
                 progress("reading frames", len(found), total)
@@ -89,15 +85,10 @@ def read_frames(
     return informative(found, len(index), rules.most_candidates, runs=runs)
 
 
-def _length(opened: Mapping[str, Source]) -> int:
-    return max((source.length or 0 for source in opened.values()), default=0)
-
-
 def _stretches(
-    opened: Mapping[str, Source], rules: CalibrationRules, *, runs: bool
+    opened: Mapping[str, Source], length: int, rules: CalibrationRules, *, runs: bool
 ) -> list[tuple[int | None, int | None, int]]:
     """Which numbers are read: all, every n-th, or runs of neighbours spread evenly."""
-    length = _length(opened)
     if length <= rules.most_read:
         return [(None, None, 1)]
     if not runs:
@@ -157,19 +148,13 @@ def held_back_with(count: int, rules: CalibrationRules, *, runs: bool) -> Indice
 def informative(
     frames: Sequence[SeenFrame], sensors: int, most: int, *, runs: bool
 ) -> tuple[SeenFrame, ...]:
-    """The frames that add most information, in their order.
+    """The frames, at most so many, that add most information, in their order.
 
     Poses are not known yet.  What a frame tells goes by where, how large and how turned the body is
     in each sensor's view, which its detections' means and second moments say; one after the other,
     the frame is taken that adds most to the information on a model that is linear in these
     (D-optimal design).  So a body that lies still for most of a recording is taken but a few times.
-
-    Parameters
-    ----------
-    most : int
-        Frames that are taken.
-    runs : bool
-        Whether motion counts: then frames are taken in runs of neighbours.
+    Where motion counts, frames are taken in runs of neighbours.
     """
     if len(frames) <= most:
         return tuple(frames)

@@ -80,10 +80,10 @@ class Block:
     """Parameters of one kind, of one sensor or of the body."""
 
     kind: Kind
-    sensor: int | None  # none for the body
+    sensor: int | None  # None for the body
     start: int  # of the block among all parameters
     names: tuple[str, ...]
-    units: tuple[str, ...]  # tuple of {"length", "rad", "px", "s", ""}
+    units: tuple[str, ...]  # of "length", "rad", "px", "s" and ""
     # size of what is sought, in `units`: by it a standard deviation is large or small
     scales: tuple[float, ...]
 
@@ -118,14 +118,7 @@ def blocks_of(
 ) -> tuple[Block, ...]:
     """Lay out the free parameters, one after the other.
 
-    Parameters
-    ----------
-    body : bool
-        Whether the features of the body are free.
-    length : float
-        Size of the rig.
-    interval : float
-        Seconds from frame to frame.
+    Their sizes go by that of the rig, `length`, and the seconds from frame to frame, `interval`.
     """
     blocks: list[Block] = []
     wanted = [(s, kind) for s in sorted(free) for kind in KINDS if kind in free[s]]
@@ -240,10 +233,7 @@ _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}
 def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
     """Jacobian (n, m, k) of what a sensor sees of points (n, 3) by its own parameters.
 
-    Parameters
-    ----------
-    by_world : (n, m, 3) array
-        Jacobian by the points.
+    `by_world` is that by the points (n, m, 3).
     """
     if kind == "pose":
         T = sensor.T_sensor_world

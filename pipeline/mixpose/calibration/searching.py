@@ -95,12 +95,8 @@ def _view(task: Task, sensor: int, points: Floats, factor: float) -> View:
 class Saved(Known):
     """Hypotheses that are written to a file as they are found, a line of JSON each.
 
-    What a calibration that was interrupted had found is taken from the file.
-
-    Parameters
-    ----------
-    key : str
-        Names session, recording and version; what another one left is not taken.
+    What a calibration that was interrupted had found is taken from the file, if it has the same
+    key, which names session, recording and version.
     """
 
     def __init__(self, path: Path, key: str) -> None:

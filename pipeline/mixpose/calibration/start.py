@@ -1,24 +1,34 @@
-"""The start of a calibration: which sensors are linked, and where the body is in each frame."""
+"""The start of a calibration: which sensors are linked, and where the body is in each frame.
+
+Where sensors stand to each other is told by where each of them sees the body.  Every frame that two
+sensors see gives votes for their relative pose, one for each combination of their hypotheses and of
+the body's symmetries; only the right ones agree over frames.  Sensors are then linked along the
+pairs with most frames in agreement.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mixpose.calibration.linking import Seen, Votes, agreed, link_all
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import joint_poses
-from mixpose.calibration.task import Known, Progress, SeenFrame, Task
-from mixpose.records import Floats
-from mixpose.rigid import inverse, transform
+from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
 _LINK_BLUR = 6.0  # σ_ε by which a linked sensor may be off before all are adjusted together
 _BIAS_STEPS = 4  # of the search for a bias in a σ_ε
 _FARTHEST = 0.5  # of the median distance: no bias is larger
+
+_Seen: TypeAlias = Sequence[Mapping[int, Hypotheses]]
+"""By frame, then by sensor; only those that have a pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,39 +42,21 @@ class Start:
     unlinked: tuple[int, ...]  # sensors that share no view with the others
 
 
-def _started(
-    task: Task,
-    state: State,
-    kept: Sequence[int],
-    through: Mapping[int, tuple[int | None, int]],
-    unlinked: Sequence[int],
-) -> Start:
-    """A start with some of the frames, without what sensors saw that are not linked."""
-    linked = [s for s in range(len(task.rig.sensors)) if s not in unlinked]
-    frames = tuple(task.frames[k].only(linked) for k in kept)
-    return Start(state, frames, through, tuple(unlinked))
-
-
 def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Start:
     """Link cameras by what each sees alone, and choose a pose for every frame."""
-    seen: Seen = [
-        {
-            s: known[f.number, s]
-            for s in task.cameras
-            if (f.number, s) in known and len(known[f.number, s].poses)
-        }
-        for f in task.frames
-    ]
+    seen: list[dict[int, Hypotheses]] = [{} for _ in task.frames]
+    for frame, each in zip(task.frames, seen, strict=True):
+        for s in task.cameras:
+            if len(known.get((frame.number, s), NOTHING).poses):
+                each[s] = known[frame.number, s]
     if task.known is not None:
         return _from_known_poses(task, task.known, seen, rules)
     rig = task.rig
     movable = [s for s in task.cameras if "pose" in task.free.get(s, ())]
-    expected = {s: rig.sensors[s].T_sensor_world for s in task.cameras}  # type: ignore[attr-defined]
-    placed = {s: expected[s] for s in task.cameras if s not in movable}
+    placed = [s for s in task.cameras if s not in movable]
     if not placed:  # all are free: one stays, and the rig is moved back in the end
-        first = next((s for s in movable if any(s in each for each in seen)), movable[0])
-        placed = {first: expected[first]}
-    T, through = link_all(seen, placed, movable, expected, task.body.symmetries, rules)
+        placed = [next((s for s in movable if any(s in each for each in seen)), movable[0])]
+    T, through = _link_all(task, seen, placed, movable, rules)
     for sensor in through:
         rig = rig.placed(sensor, T[sensor])
     poses, worth = _likeliest_poses(rig, task, seen, sorted(T))
@@ -72,11 +64,12 @@ def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Sta
     unlinked = [s for s in task.cameras if s not in T]
     if len(placed) > 1:  # those that stay and see nothing with the others are no matter
         unlinked = [s for s in unlinked if s in movable]
-    return _started(task, State(rig, poses[kept]), kept.tolist(), {**through}, unlinked)
+    frames = tuple(task.frames[k].without(unlinked) for k in kept)
+    return Start(State(rig, poses[kept]), frames, {**through}, tuple(unlinked))
 
 
 def _from_known_poses(
-    task: Task, known: Mapping[int, Floats], seen: Seen, rules: CalibrationRules
+    task: Task, known: Mapping[int, Floats], seen: _Seen, rules: CalibrationRules
 ) -> Start:
     """Place each camera by itself, as poses are known."""
     rig, through = task.rig, dict[int, tuple[int | None, int]]()
@@ -91,15 +84,15 @@ def _from_known_poses(
             if sensor in seen[k]:
                 own = seen[k][sensor].poses
                 motions = own[:, None] @ task.body.symmetries[None] @ inverse(T_world_object)
-                told.append(Votes(motions, float(np.linalg.norm(own[0][:3, 3]))))
-        expected = task.rig.sensors[sensor].T_sensor_world  # type: ignore[attr-defined]
-        link = agreed(told, expected, rules)
+                told.append(_Votes(motions, float(np.linalg.norm(own[0][:3, 3]))))
+        link = _agreed(told, _pose_of(task, sensor), rules)
         if link is None or link.frames < 1:
             unlinked.append(sensor)
             continue
         rig = rig.placed(sensor, link.T_a_b)
         through[sensor] = (None, link.frames)
-    return _started(task, State(rig, poses), kept, through, unlinked)
+    frames = tuple(task.frames[k].without(unlinked) for k in kept)
+    return Start(State(rig, poses), frames, through, tuple(unlinked))
 
 
 def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
@@ -114,7 +107,7 @@ def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> 
 
 
 def _likeliest_poses(
-    rig: Rig, task: Task, seen: Seen, linked: Sequence[int]
+    rig: Rig, task: Task, seen: _Seen, linked: Sequence[int]
 ) -> tuple[Floats, Floats]:
     """The pose of each frame (K, 4, 4) that most detections of all linked sensors agree with.
 
@@ -186,3 +179,110 @@ def _agreed_bias(shifts: Floats, farthest: float, sigma: float) -> float:
     width = 4 * _BIAS_STEPS
     kernel = np.exp(-0.25 * (np.arange(-width, width + 1) / _BIAS_STEPS) ** 2)
     return float(places[np.argmax(np.convolve(counts, kernel, mode="same"))])
+
+
+class _Votes(NamedTuple):
+    """What one frame says of a relative pose."""
+
+    motions: Floats  # (..., 4, 4)
+    distance: float  # to the body: translations err by a share of it
+
+
+class _Link(NamedTuple):
+    """The relative pose of two sensors."""
+
+    T_a_b: Floats  # (4, 4)
+    frames: int  # that agree on it
+
+
+def _agreed(told: Sequence[_Votes], T_expected: Floats, rules: CalibrationRules) -> _Link | None:
+    """The motion that votes of most frames agree on; the expected one decides between equals."""
+    if not told:
+        return None
+    parts = [each.motions.reshape(-1, 4, 4) for each in told]
+    votes, counts = np.concatenate(parts), [len(part) for part in parts]
+    frame = np.repeat(np.arange(len(told)), counts)
+    away = np.repeat([rules.shift * each.distance for each in told], counts)
+    near = np.argsort(rotation_angle_deg(T_expected, votes), kind="stable")
+    half = rules.seeds // 2
+    spread = np.linspace(0, len(votes) - 1, min(half, len(votes))).astype(int)
+    best, best_score = 0, (-1.0, 0.0)
+    for seed in np.unique(np.concatenate([near[:half], spread])):
+        inside, distance = _inside(votes[seed], votes, away, rules)
+        # the mean distance decides between middles of one cluster
+        score = (float(len(np.unique(frame[inside]))), -float(distance[inside].mean()))
+        if score > best_score:
+            best, best_score = int(seed), score
+    T = votes[best]
+    for _ in range(3):
+        inside, distance = _inside(T, votes, away, rules)
+        chosen = _nearest_of_each(frame, distance, inside)
+        # the mean rotation and the median shift
+        R = Rotation.from_matrix(votes[chosen, :3, :3]).mean().as_matrix()
+        T = from_parts(R, np.median(votes[chosen, :3, 3], axis=0))
+    return _Link(T, len(chosen))
+
+
+def _inside(T: Floats, votes: Floats, away: Floats, rules: CalibrationRules) -> tuple[Mask, Floats]:
+    turn = rotation_angle_deg(T, votes) / rules.turn_deg
+    shift = np.linalg.norm(votes[:, :3, 3] - T[:3, 3], axis=1) / away
+    distance = np.maximum(turn, shift)
+    return distance < 1, distance
+
+
+def _nearest_of_each(frame: Indices, distance: Floats, inside: Mask) -> Indices:
+    """Of each frame the vote that is nearest, among those inside."""
+    order = np.flatnonzero(inside)
+    order = order[np.argsort(distance[order], kind="stable")]
+    _, first = np.unique(frame[order], return_index=True)
+    return np.asarray(order[first])
+
+
+def _pair_link(task: Task, seen: _Seen, a: int, b: int, rules: CalibrationRules) -> _Link | None:
+    """Where sensor b stands to sensor a, by frames in which both know a pose."""
+    told = []
+    for each in seen:
+        if a in each and b in each:
+            T_a, T_b = each[a].poses, each[b].poses
+            S = task.body.symmetries[None, None]
+            motions = T_a[:, None, None] @ S @ inverse(T_b)[None, :, None]
+            reach = float(np.linalg.norm(T_a[0][:3, 3]) + np.linalg.norm(T_b[0][:3, 3])) / 2
+            told.append(_Votes(motions, reach))
+    link = _agreed(told, _pose_of(task, a) @ inverse(_pose_of(task, b)), rules)
+    # fewer frames must agree only where hardly any are there
+    least = max(min(rules.least_link, len(told)), 1)
+    return link if link is not None and link.frames >= least else None
+
+
+def _link_all(
+    task: Task, seen: _Seen, placed: Collection[int], wanted: Sequence[int], rules: CalibrationRules
+) -> tuple[dict[int, Floats], dict[int, tuple[int, int]]]:
+    """Place sensors one after the other, along the strongest links to those that stay.
+
+    Of all that are linked T_sensor_world (4, 4); and through which sensor each was linked, and in
+    how many frames the two agree.
+    """
+    T, through = {s: _pose_of(task, s) for s in placed}, {}
+    left = [one for one in wanted if one not in T]
+    links: dict[tuple[int, int], _Link | None] = {}
+    while left:
+        best: tuple[_Link, int, int] | None = None
+        for b in left:
+            for a in sorted(T):
+                if (b, a) not in links:
+                    links[b, a] = _pair_link(task, seen, b, a, rules)
+                link = links[b, a]
+                if link is not None and (best is None or link.frames > best[0].frames):
+                    best = (link, b, a)
+        if best is None:
+            break
+        link, b, a = best
+        T[b] = link.T_a_b @ T[a]
+        through[b] = (a, link.frames)
+        left.remove(b)
+    return T, through
+
+
+def _pose_of(task: Task, sensor: int) -> Floats:
+    """T_sensor_world as the session has it."""
+    return task.rig.sensors[sensor].T_sensor_world  # type: ignore[attr-defined, no-any-return]

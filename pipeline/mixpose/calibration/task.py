@@ -29,9 +29,9 @@ class SeenFrame:
     points: Mapping[int, Floats]  # detections (M, m) by sensor
     times: Mapping[int, float]  # when each sensor says that it took the frame
 
-    def only(self, sensors: Collection[int]) -> SeenFrame:
-        """The frame with what some sensors saw."""
-        return replace(self, points={s: y for s, y in self.points.items() if s in sensors})
+    def without(self, sensors: Collection[int]) -> SeenFrame:
+        """The frame without what some sensors saw."""
+        return replace(self, points={s: y for s, y in self.points.items() if s not in sensors})
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.calibration.checking import Displacement, displacements
-from mixpose.calibration.result import Calibration
+from mixpose.calibration.result import Calibration, Displacement, displacements
 from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
@@ -26,7 +25,7 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
             lines += _block_lines(found, block, unit)
     if any(block.kind == "body" for block in found.blocks):
         lines += _body_lines(found, unit)
-    lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found, unit)]
+    lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found)]
     lines += _coverage_lines(found)
     if found.inflation > 1:
         lines.append(
@@ -48,8 +47,8 @@ def _plus_minus(deviation: float, unit: str) -> str:
 
 def _held_lines(found: Calibration, unit: str) -> list[str]:
     """What biases of ranges that are taken as exact would do."""
-    lengths = np.concatenate([[u == "length" for u in b.units] for b in found.blocks] or [[]])
-    moved = np.where(np.isfinite(found.deviations) & (lengths > 0), found.moved_by_biases, 0.0)
+    lengths = np.array([unit == "length" for block in found.blocks for unit in block.units], bool)
+    moved = np.where(np.isfinite(found.deviations) & lengths, found.moved_by_biases, 0.0)
     if not moved.any():
         return []
     worst = int(np.argmax(moved))
@@ -157,26 +156,20 @@ def _residual_lines(found: Calibration, unit: str) -> list[str]:
     return lines
 
 
-def _worst_lines(found: Calibration, unit: str) -> list[str]:
+def _worst_lines(found: Calibration) -> list[str]:
     """Frames and features that fit worst, by name."""
+    squared = [(s.offset**2).sum(axis=1) / found.noise[k] ** 2 for k, s in found.sights.items()]
+    numbers = [sights.frame for sights in found.sights.values()]
+    features = [sights.feature for sights in found.sights.values()]
     lines = []
-    frames: dict[int, list[float]] = {}
-    features: dict[int, list[float]] = {}
-    for sensor, sights in found.sights.items():
-        squared = (sights.offset**2).sum(axis=1) / found.noise[sensor] ** 2
-        for number, feature, value in zip(sights.frame, sights.feature, squared, strict=True):
-            frames.setdefault(int(number), []).append(float(value))
-            features.setdefault(int(feature), []).append(float(value))
-    called = found.after.labels
-    for title, groups in (("frames", frames), ("features", features)):
-        rms = {key: float(np.sqrt(np.mean(values))) for key, values in groups.items()}
-        worst = sorted(rms, key=lambda key: (-rms[key], key))[:_WORST]
-        typical = float(np.median(list(rms.values()))) if rms else 1.0
-        names = [called[key] if groups is features else str(key) for key in worst]
-        parts = ", ".join(
-            f"{name} ({rms[key] / typical:.2g})" for name, key in zip(names, worst, strict=True)
-        )
-        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {parts}")
+    for title, parts in (("frames", numbers), ("features", features)):
+        keys, which = np.unique(np.concatenate(parts), return_inverse=True)
+        rms = np.sqrt(np.bincount(which, np.concatenate(squared)) / np.bincount(which))
+        called = found.after.labels if title == "features" else dict(zip(keys, keys.astype(str)))
+        typical = np.median(rms) if len(rms) else 1.0
+        worst = np.lexsort((keys, -rms))[:_WORST]
+        told = ", ".join(f"{called[keys[k]]} ({rms[k] / typical:.2g})" for k in worst)
+        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {told}")
     return lines
 
 

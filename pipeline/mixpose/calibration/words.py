@@ -32,25 +32,11 @@ _FREES: dict[Kind, tuple[str, ...]] = {
 def free_parameters(
     rig: Rig, words: Sequence[str], *, poses_known: bool
 ) -> tuple[dict[int, tuple[Kind, ...]], bool]:
-    """Read what is free.
+    """Kinds that are free, by sensor, and whether the body is.
 
-    Parameters
-    ----------
-    words : sequence of str
-        None of them: where all cameras but the first stand, or all where poses are known, and
-        positions of range sensors.
-
-    Returns
-    -------
-    dict of int to tuple of kinds
-        By sensor.
-    bool
-        Whether the body is free.
-
-    Raises
-    ------
-    SessionError
-        If a word names no sensor, or nothing that the sensor has.
+    Without words: where all cameras but the first stand, or all where poses are known, and
+    positions of range sensors.  Raises a SessionError if a word names no sensor, or nothing that
+    the sensor has.
     """
     if not words:
         return _default(rig, poses_known=poses_known), False
@@ -72,21 +58,18 @@ def free_parameters(
 
 def _default(rig: Rig, *, poses_known: bool) -> dict[int, tuple[Kind, ...]]:
     free: dict[int, tuple[Kind, ...]] = {}
-    held = False
+    posed = [k for k, sensor in enumerate(rig.sensors) if "pose" in kinds_of(sensor)]
     for index, sensor in enumerate(rig.sensors):
         if isinstance(sensor, RangeSensor):
             free[index] = ("position",)
-        elif "pose" in kinds_of(sensor):
-            if held or poses_known:
-                free[index] = ("pose",)
-            held = True
+        elif index in (posed if poses_known else posed[1:]):
+            free[index] = ("pose",)
     return free
 
 
 def _kind(word: str, what: str) -> Kind:
-    for kind in KINDS:
-        if kind == what:
-            return kind
+    if what in KINDS:
+        return what
     near = difflib.get_close_matches(what, KINDS, 1)
     hint = f"; did you mean {near[0]}?" if near else ""
     raise SessionError(f"--free {word}: found {what!r}; allowed: {ALLOWED}, or body{hint}")
@@ -122,17 +105,9 @@ def words_of(names: Sequence[str], free: Mapping[int, Sequence[Kind]], body: boo
 
 
 def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
-    """The rig and body scaled so that two sensors are a known length apart.
+    """Scale rig and body so that two sensors are as far apart as ``SENSOR:SENSOR=LENGTH`` says.
 
-    Parameters
-    ----------
-    words : str
-        ``SENSOR:SENSOR=LENGTH``.
-
-    Raises
-    ------
-    SessionError
-        If the words are no two sensors and a length.
+    Raises a SessionError if the words are no two sensors and a length.
     """
     names, _, value = words.partition("=")
     first, _, second = names.partition(":")
@@ -164,19 +139,9 @@ def _scaled(sensor: Any, factor: float) -> Any:
 
 
 def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
-    """See, before anything is searched, that there is such a frame.
+    """Refuse words that name no frame: a sensor's, or ``body@FRAME`` of a frame of the recording.
 
-    Parameters
-    ----------
-    words : str
-        A sensor, or ``body@FRAME``.
-    numbers : collection of int
-        Frames of the recording.
-
-    Raises
-    ------
-    SessionError
-        If there is none.
+    So that nothing is searched in vain.  Raises a SessionError.
     """
     if _frame_number(words, numbers) is None and words not in _with_a_frame(rig):
         frames = ", ".join(f"body@{n}" for n in sorted(numbers)[:3])
@@ -187,13 +152,7 @@ def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
 
 
 def in_world(found: Calibration, words: str) -> Calibration:
-    """The calibration in another frame: that of a sensor, or of the body in a frame.
-
-    Raises
-    ------
-    SessionError
-        If there is no such frame.
-    """
+    """The calibration in another frame, named as for `check_world`."""
     check_world(found.after, words, found.poses)
     number = _frame_number(words, found.poses)
     if number is None:
