@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, Task
-from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.task import Hypotheses
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
 from mixpose.sensors import PinholeCamera, RangeSensor
 

@@ -26,14 +26,13 @@ from simulated_rigs import (
 )
 
 from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
-from mixpose.calibration.alone import Hypotheses
-from mixpose.calibration.checking import displacements
-from mixpose.calibration.choice import held_back_with
-from mixpose.calibration.gauge import Freedom, gauge_rows
-from mixpose.calibration.interpolation import interpolate, neighbours
-from mixpose.calibration.matching import clock_of, match
-from mixpose.calibration.rig import blocks_of
-from mixpose.calibration.saved import Saved
+from mixpose.calibration.gauge import gauge_rows
+from mixpose.calibration.matching import clock_of, interpolate, match
+from mixpose.calibration.recorded import held_back_with
+from mixpose.calibration.result import displacements
+from mixpose.calibration.rig import State, blocks_of
+from mixpose.calibration.searching import Saved
+from mixpose.calibration.task import Hypotheses
 from mixpose.calibration.telling import doubts_of
 from mixpose.errors import RecordingError
 from mixpose.rigid import (
@@ -134,8 +133,8 @@ def test_of_pairs_that_compete_only_mutual_neighbours_are_nearest(blur: float) -
     rig = Rig.of(("s0",), [sensor], BODY)
     rig = replace(rig, points=np.array([[0, 0, 0], [0, 0, 2.0], [0, 0, 3.5]]))
     frame = SeenFrame(0, None, {0: np.array([[1000.1], [1003.4]])}, {})
-    near = neighbours([None], 2.5)
-    pairs = match(rig, np.eye(4)[None], [frame], clock_of([frame], near, 1), 0, blur, 0.02)
+    state = State(rig, np.eye(4)[None])
+    pairs = match(state, [frame], clock_of([frame], 1, 2.5), 0, blur, 0.02)
     found = zip(pairs.feature[pairs.nearest], pairs.detection[pairs.nearest], strict=True)
     assert [(int(i), int(d)) for i, d in found] == [(0, 0), (2, 1)]
 
@@ -207,17 +206,17 @@ def test_as_many_conditions_as_freedoms(free: tuple[int, ...], body: bool, count
     rig = Rig.of(("a", "b"), cameras(2), BODY)
     poses = np.array([motion(time) for time in (0.1, 0.7, 1.6, 2.3)])
     blocks = blocks_of(rig, dict.fromkeys(free, ("pose",)), body=body, length=800.0, interval=1.0)
-    rows, _ = gauge_rows(rig, blocks, Freedom(ALL, poses))
+    rows, _ = gauge_rows(State(rig, poses), blocks, ALL)
     assert len(rows) == count
-    known, _ = gauge_rows(rig, blocks, Freedom(~ALL, poses))
+    known, _ = gauge_rows(State(rig, poses), blocks, ~ALL)
     assert len(known) == 0
 
 
 def test_motion_between_frames_is_cubic() -> None:
     times = [k / FPS for k in range(8)]
     poses = np.array([motion(t) for t in times])
-    near = neighbours(times, 2.5)
-    there = interpolate(near, poses, np.arange(8), np.full(8, 0.007))
+    clock = clock_of([SeenFrame(k, t, {}, {}) for k, t in enumerate(times)], 1, 2.5)
+    there = interpolate(clock, poses, np.arange(8), np.full(8, 0.007))
     for k in range(1, 6):
         error = twist_between(perturb(poses[k], there.twist[k]), motion(times[k] + 0.007))
         # h^4/4! times the fourth derivative, 4.9^4 * 40 mm

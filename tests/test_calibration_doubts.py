@@ -10,9 +10,9 @@ import pytest
 from simulated_rigs import FPS, PLACES, alone, bumped, cameras, motion, recording, task_of
 
 from mixpose.calibration import calibrate
-from mixpose.calibration.alone import NOTHING, Hypotheses
-from mixpose.calibration.free import error_of_held
+from mixpose.calibration.task import NOTHING, Hypotheses
 from mixpose.calibration.telling import doubts_of, lines_of
+from mixpose.calibration.words import error_of_held
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.sensors import CalibrationError, RangeSensor
 

@@ -11,9 +11,9 @@ from simulated_rigs import FPS, POINTS, alone, bumped, cameras, motion, recordin
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, calibrate
-from mixpose.calibration.choice import informative
+from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
-from mixpose.calibration.world import in_world, with_length
+from mixpose.calibration.words import in_world, with_length
 from mixpose.errors import SessionError
 from mixpose.rigid import inverse, rotation_angle_deg, transform
 

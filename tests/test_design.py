@@ -20,7 +20,7 @@ from mixpose.design import (
     predict,
     spread_poses,
 )
-from mixpose.design.equality import scaled
+from mixpose.design.advice import scaled
 from mixpose.design.prediction import at_tip
 from mixpose.design.study import SHARE_OF_RADIUS
 from mixpose.executing import in_processes

@@ -82,12 +82,12 @@ def test_poses_that_are_wrong_are_left_out_and_a_tip_that_slips_is_told() -> Non
     pivoting = run_of(3)
     poses = pivoting.poses.copy()
     poses[[10, 60]] = rigid.perturb(poses[[10, 60]], np.array([0, 30.0, 0, 0.2, 0, 0]))
-    tip = find_tip(replace(pivoting, poses=poses))
+    tip = find_tip(pivoting._replace(poses=poses))
     assert tip.left_out == 2
     assert np.linalg.norm(tip.place - TIP) < 0.5
     slid = pivoting.poses.copy()
     slid[50:, 0, 3] += 5.0
-    tip = find_tip(replace(pivoting, poses=slid))
+    tip = find_tip(pivoting._replace(poses=slid))
     assert tip.scale > 4  # by which it is told; of tips that stay it is 1 ± 0.08
 
 

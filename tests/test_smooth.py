@@ -98,9 +98,8 @@ def test_a_body_without_noise_goes_on_as_its_rates_say(order: int) -> None:
     for i in range(6, 6 * order):
         moved = rates.copy().reshape(-1)
         moved[i - 6] += 1e-4
-        other, _ = foretold(
-            replace(states, rates=moved.reshape(rates.shape)), elapsed, np.zeros((1, 6))
-        )
+        shifted = states._replace(rates=moved.reshape(rates.shape))
+        other, _ = foretold(shifted, elapsed, np.zeros((1, 6)))
         slope = other.minus(found)[0] / 1e-4
         np.testing.assert_allclose(F[0, :, i], slope, atol=0.2**2 / 2 * elapsed)
 
@@ -239,6 +238,7 @@ def test_gaps_are_filled_on_request_marked_and_covered_by_their_covariance() -> 
     filled = smooth_body(lines, rules=QUICK, fill_s=0.2)  # the gap of 20 frames is 0.84 s
     marked = [one for one in filled.estimates if one.filled]
     assert [one.frame for one in marked] == [12, 13]
+    assert (filled.smoothed, filled.filled, filled.decided) == (38, 2, 0)
     assert {one.status for one in marked} == {"ambiguous"}
     assert [one.time_s for one in marked] == pytest.approx([0.48, 0.52])
     assert squared_errors(truth[12:14], marked).max() < 3

@@ -28,8 +28,8 @@ from mixpose.design import (
     predict,
     spread_poses,
 )
-from mixpose.design.equality import scaled
-from mixpose.design.summary import pooled
+from mixpose.design.advice import scaled
+from mixpose.design.prediction import pooled
 from mixpose.executing import Executor, executor
 from mixpose.records import Floats
 from mixpose.session import Session, load_session

@@ -8,12 +8,11 @@ detections  →  each camera alone (hypotheses)  →  links between sensors  →
 from __future__ import annotations
 
 from mixpose.calibration.calibrate import calibrate
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.free import free_parameters
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Rig
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.task import Task
+from mixpose.calibration.task import SeenFrame, Task
+from mixpose.calibration.words import free_parameters
 
 __all__ = [
     "Calibration",

@@ -13,130 +13,80 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.calibration.bundle import Bundle, Rows, normal_equations, rows_of, solved, stepped
-from mixpose.calibration.matching import Pairs, feature_spacing, match, nearest_distance
-from mixpose.calibration.rig import Rig
-from mixpose.calibration.rules import CalibrationRules
-from mixpose.records import Floats
-
-GaugeOf = Callable[[Rig], Floats]
-Weighted = tuple[int, Pairs, Rows, Floats]
+from mixpose.calibration.bundle import Bundle, Step, Weighted, rows_of, solved, stepped
+from mixpose.calibration.matching import feature_spacing, match, nearest_distance
+from mixpose.calibration.rig import Rig, State
+from mixpose.records import Floats, Mask
 
 _MOST_BLURS = 40
 _UNKNOWN = 0.1  # of a parameter's squared length along directions that are not determined
 _SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
 _BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
+_FARTHEST = 0.3  # rad: the linear model reaches no farther
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """Rig and poses at the maximum.
+    """Rig and poses at the maximum."""
 
-    Attributes
-    ----------
-    rig : Rig
-    poses : (K, 4, 4) float64
-    noise : (L,) float64
-        Standard deviation of a detection's coordinate by sensor.
-    covariance : (G, G) float64
-        Of the free parameters, in the gauge.
-    unknown : (G, u) float64
-        Directions that are not determined, in the parameters' sizes.
-    weighted : tuple
-        Pairs of each sensor with residuals and weights, 1 for what agrees.
-    inflation : float
-        By which variances are larger than independent errors of detections would make them.
-    """
-
-    rig: Rig
-    poses: Floats
-    noise: Floats
-    covariance: Floats
-    unknown: Floats
-    weighted: tuple[tuple[Pairs, Floats, Floats], ...]
+    state: State
+    noise: Floats  # (L,): standard deviation of a detection's coordinate by sensor
+    covariance: Floats  # (G, G): of the free parameters, in the gauge
+    unknown: Floats  # (G, u): directions that are not determined, in the parameters' sizes
+    weighted: tuple[Weighted, ...]  # of each sensor; weights are 1 for what agrees
+    # by which variances are larger than independent errors of detections would make them
     inflation: float
 
     @property
-    def undetermined(self) -> NDArray[np.bool_]:
+    def undetermined(self) -> Mask:
         """Parameters (G,) of which data tell nothing."""
         return np.asarray((self.unknown**2).sum(axis=1) > _UNKNOWN)
 
     @property
     def certainty(self) -> float:
         """Share of the weight of pairs of which each is the nearest that the other has."""
-        nearest = sum(float(weight @ pairs.nearest) for pairs, _, weight in self.weighted)
-        return nearest / max(sum(float(weight.sum()) for _, _, weight in self.weighted), 1e-9)
+        nearest = sum(float(weight @ rows.pairs.nearest) for rows, weight in self.weighted)
+        return nearest / max(sum(float(weight.sum()) for _, weight in self.weighted), 1e-9)
 
 
-def first_blurs(
-    bundle: Bundle, rig: Rig, poses: Floats, sigmas: Floats, rules: CalibrationRules
-) -> Floats:
+def _first_blurs(bundle: Bundle, state: State) -> Floats:
     """Blurs (L,) to begin with: wide enough for what the start is off, not for neighbours."""
-    blurs = np.array(sigmas, dtype=np.float64)
-    for sensor in range(len(rig.sensors)):
-        off = nearest_distance(rig, poses, bundle.frames, bundle.clock, sensor)
+    rules, blurs = bundle.rules, np.array(bundle.sigmas, dtype=np.float64)
+    for sensor, sigma in enumerate(bundle.sigmas):
+        off = nearest_distance(state, bundle.frames, bundle.clock, sensor)
         if len(off):
-            widest = rules.widest * feature_spacing(rig, poses, sensor)
+            widest = rules.widest * feature_spacing(state, sensor)
             wanted = rules.first_blur * float(np.median(off))
-            blurs[sensor] = max(min(wanted, widest), _SHARPEST * sigmas[sensor])
+            blurs[sensor] = max(min(wanted, widest), _SHARPEST * sigma)
     return blurs
 
 
 def adjust(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    gauge_of: GaugeOf,
-    sigmas: Floats,
-    rules: CalibrationRules,
-    *,
-    blurs: Floats | None = None,
-    noise: Floats | None = None,
+    bundle: Bundle, state: State, *, blurs: Floats | None = None, noise: Floats | None = None
 ) -> Adjusted:
     """Climb from a start to the maximum.
 
-    Parameters
-    ----------
-    bundle : Bundle
-    rig : Rig
-    poses : (K, 4, 4) array
-    gauge_of : callable
-        Rows of the gauge at a rig.
-    sigmas : (L,) array
-        σ_ε by sensor.
-    rules : CalibrationRules
-    blurs : (L,) array or None
-        To begin with; None: as the start needs.
-    noise : (L,) array or None
-        Known noise, of which none is learnt.
+    The blurs (L,) to begin with are as the start needs if left out.  Noise (L,) that is given is
+    known, and none is learnt.
     """
-    blur = first_blurs(bundle, rig, poses, sigmas, rules) if blurs is None else blurs
+    rules = bundle.rules
+    blur = _first_blurs(bundle, state) if blurs is None else blurs
     for _ in range(_MOST_BLURS):
         for _ in range(rules.steps):
-            weighted, _ = _weighted(bundle, rig, poses, blur, blur, rules)
-            rig, poses, _ = _climbed(bundle, rig, poses, gauge_of, weighted)
-        learnt = (
-            noise if noise is not None else _noise(bundle, rig, poses, blur, sigmas, rules, 1.0)
-        )
+            state, _ = _climbed(bundle, state, _weighted(bundle, state, blur, blur)[0])
+        learnt = noise if noise is not None else _noise(bundle, 1.0, state, blur)
         # features that crowd look like noise at a wide blur, which must not widen it further
-        last = np.minimum(rules.blur * learnt, _widest_alike(rig, blur, sigmas))
+        last = np.minimum(rules.blur * learnt, _widest_alike(state.rig, blur, bundle.sigmas))
         if (blur <= last / rules.narrowing).all():
             break
         blur = np.maximum(blur * rules.narrowing, last)
-    learnt = last / rules.blur
     if noise is not None:
-        return _ended(bundle, rig, poses, gauge_of, noise, lambda *_: noise, rules)
-
-    def alike(rig: Rig, poses: Floats, blur: Floats, unlike: float = 1.0) -> Floats:
-        return _noise(bundle, rig, poses, blur, sigmas, rules, unlike)
-
-    found = _ended(bundle, rig, poses, gauge_of, learnt, alike, rules)
+        return _ended(bundle, state, noise, lambda *_: noise)
+    found = _ended(bundle, state, last / rules.blur, partial(_noise, bundle, 1.0))
     if found.inflation > 1:
         return found
-    own = partial(alike, unlike=rules.unlike)
-    return _ended(bundle, found.rig, found.poses, gauge_of, found.noise, own, rules)
+    return _ended(bundle, found.state, found.noise, partial(_noise, bundle, rules.unlike))
 
 
 def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
@@ -146,103 +96,96 @@ def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
 
 
 def _ended(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    gauge_of: GaugeOf,
-    noise: Floats,
-    learnt: Callable[[Rig, Floats, Floats], Floats],
-    rules: CalibrationRules,
+    bundle: Bundle, state: State, noise: Floats, learnt: Callable[[State, Floats], Floats]
 ) -> Adjusted:
     """The last steps, at the noise that is learnt."""
+    rules = bundle.rules
     most = rules.unlike * noise
     for _ in range(rules.last_steps):
-        weighted, _ = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
-        rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
-        before, noise = noise, np.minimum(learnt(rig, poses, rules.blur * noise), most)
+        weighted, _ = _weighted(bundle, state, rules.blur * noise, noise, last=True)
+        state, size = _climbed(bundle, state, weighted)
+        before, noise = noise, np.minimum(learnt(state, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
-    return _finished(bundle, rig, poses, gauge_of, noise, rules)
+    weighted, alone, step = _at_the_end(bundle, state, noise)
+    dimension = float(np.mean([eye.dimension for eye in state.rig.sensors]))
+    scattered = step.covariance * _of_cauchy(dimension, rules.tail)
+    inflation = _inflation(bundle, weighted, scattered)
+    covariance = scattered * inflation + step.of_held
+    pairs = tuple((rows, weight) for (rows, _), weight in zip(weighted, alone, strict=True))
+    return Adjusted(state, noise, covariance, step.unknown, pairs, inflation)
+
+
+def _at_the_end(
+    bundle: Bundle, state: State, noise: Floats
+) -> tuple[list[Weighted], list[Floats], Step]:
+    """What is weighed at the maximum, and the step that is left."""
+    weighted, alone = _weighted(bundle, state, bundle.rules.blur * noise, noise, last=True)
+    return weighted, alone, solved(bundle, state, weighted)
+
+
+def moved_by_held(bundle: Bundle, found: Adjusted) -> Floats:
+    """Standard deviations (G,) of the rig's parameters that come of errors of what is held."""
+    *_, step = _at_the_end(bundle, found.state, found.noise)
+    return np.asarray(np.sqrt(np.diag(step.of_held)))
 
 
 def _weighted(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    blur: Floats,
-    noise: Floats,
-    rules: CalibrationRules,
-    *,
-    last: bool = False,
+    bundle: Bundle, state: State, blur: Floats, noise: Floats, *, last: bool = False
 ) -> tuple[list[Weighted], list[Floats]]:
     """Pairs of all sensors, weighted by the objective and the noise; and by the objective alone."""
+    rules = bundle.rules
     found: list[Weighted] = []
     alone: list[Floats] = []
     faintest = rules.faintest_last if last else rules.faintest
-    for sensor in range(len(rig.sensors)):
-        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], faintest)
-        rows = rows_of(bundle, rig, poses, sensor, pairs)
+    for sensor in range(len(state.rig.sensors)):
+        pairs = match(state, bundle.frames, bundle.clock, sensor, blur[sensor], faintest)
+        rows = rows_of(bundle, state, sensor, pairs)
         squared = (rows.residual**2).sum(axis=1)
         share = pairs.share * rows.known
         weight = share * np.exp(-squared / (4 * blur[sensor] ** 2))
         alone.append(weight)
         if last:
             weight = share / (1 + squared / (rules.tail * noise[sensor]) ** 2)
-        found.append((sensor, pairs, rows, weight / noise[sensor] ** 2))
+        found.append((rows, weight / noise[sensor] ** 2))
     return found, alone
 
 
-def _climbed(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    gauge_of: GaugeOf,
-    weighted: Sequence[Weighted],
-) -> tuple[Rig, Floats, float]:
+def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tuple[State, float]:
     """One step; its size in standard deviations of the rig's parameters."""
-    normal = normal_equations(bundle, len(poses), weighted, 1e-9)
-    step = solved(bundle, normal, gauge_of(rig), len(poses))
-    largest = np.abs(step.poses[:, 3:]).max(initial=0.0)
-    for block in bundle.blocks:
-        turns = [abs(v) for v, u in zip(step.rig[block.place], block.units) if u == "rad"]
-        largest = max(largest, *turns, 0.0) if turns else largest
-    if largest > 0.3:  # the linear model does not reach that far
-        step = replace(step, rig=step.rig * 0.3 / largest, poses=step.poses * 0.3 / largest)
+    step = solved(bundle, state, weighted, 1e-9)
+    is_turn = [unit == "rad" for block in bundle.blocks for unit in block.units]
+    turns = np.concatenate([step.poses[:, 3:].ravel(), step.rig[is_turn]])
+    largest = float(np.abs(turns).max(initial=0.0))
+    if largest > _FARTHEST:
+        share = _FARTHEST / largest
+        step = replace(step, rig=step.rig * share, poses=step.poses * share)
     deviations = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
     moved = step.rig[deviations > 0] / deviations[deviations > 0]
     size = float(np.abs(moved).max(initial=0.0))
     if not bundle.count:
         size = float(np.abs(step.poses).max(initial=0.0)) * 1e3
-    rig, poses = stepped(bundle, rig, poses, step)
-    return rig, poses, size
+    return stepped(bundle, state, step), size
 
 
-def _noise(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    blur: Floats,
-    sigmas: Floats,
-    rules: CalibrationRules,
-    unlike: float,
-) -> Floats:
+def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
     """Standard deviation of detections (L,) from residuals under a Gaussian weight.
 
     That of a sensor is like that of others of its kind, within the factor `unlike`.  Where frames
     err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it had
     no noise at all.
     """
-    weighted, alone = _weighted(bundle, rig, poses, blur, np.ones(len(blur)), rules)
-    alone = [w * one[1].nearest for one, w in zip(weighted, alone)]
-    count = np.array([eye.dimension * float(w.sum()) for eye, w in zip(rig.sensors, alone)])
-    spent = np.array(
-        [float(w @ (one[2].residual ** 2).sum(axis=1)) for one, w in zip(weighted, alone)]
-    )
+    rules, sigmas, sensors = bundle.rules, bundle.sigmas, state.rig.sensors
+    weighted, alone = _weighted(bundle, state, blur, np.ones(len(blur)))
+    rows = [each for each, _ in weighted]
+    near = [weight * each.pairs.nearest for each, weight in zip(rows, alone)]
+    count = np.array([eye.dimension * float(w.sum()) for eye, w in zip(sensors, near)])
+    spent = np.array([float(w @ (r.residual**2).sum(axis=1)) for r, w in zip(rows, near)])
     unknowns = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
     used = unknowns / np.maximum(blur**2 * (count / blur**2).sum(), 1.0)
     left = count * (1 - np.minimum(used, 0.9))
     found = np.array(sigmas, dtype=np.float64)
-    units = np.array([eye.unit for eye in rig.sensors])
+    units = np.array([eye.unit for eye in sensors])
     for unit in sorted(set(units)):
         alike = units == unit
         if count[alike].sum() <= 6:
@@ -256,40 +199,6 @@ def _noise(
         inverse = np.maximum(1 / np.maximum(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
         found[alike] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
     return found
-
-
-def moved_by_held(
-    bundle: Bundle, found: Adjusted, gauge_of: GaugeOf, rules: CalibrationRules
-) -> Floats:
-    """Standard deviations (G,) of the rig's parameters that come of errors of what is held."""
-    weighted, _ = _weighted(
-        bundle, found.rig, found.poses, rules.blur * found.noise, found.noise, rules, last=True
-    )
-    normal = normal_equations(bundle, len(found.poses), weighted, 0.0)
-    step = solved(bundle, normal, gauge_of(found.rig), len(found.poses))
-    return np.asarray(np.sqrt(np.diag(step.of_held)))
-
-
-def _finished(
-    bundle: Bundle,
-    rig: Rig,
-    poses: Floats,
-    gauge_of: GaugeOf,
-    noise: Floats,
-    rules: CalibrationRules,
-) -> Adjusted:
-    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
-    normal = normal_equations(bundle, len(poses), weighted, 0.0)
-    step = solved(bundle, normal, gauge_of(rig), len(poses))
-    dimension = float(np.mean([eye.dimension for eye in rig.sensors]))
-    scattered = step.covariance * _of_cauchy(dimension, rules.tail)
-    inflation = _inflation(bundle, weighted, scattered, len(poses))
-    covariance = scattered * inflation + step.of_held
-    parts = tuple(
-        (pairs, rows.residual, weight)
-        for (_, pairs, rows, _), weight in zip(weighted, alone, strict=True)
-    )
-    return Adjusted(rig, poses, noise, covariance, step.unknown, parts, inflation)
 
 
 def _of_cauchy(dimension: float, tail: float) -> float:
@@ -307,31 +216,20 @@ def _of_cauchy(dimension: float, tail: float) -> float:
     return float(spread * (density @ weight) / (density @ slope) ** 2)
 
 
-def _inflation(
-    bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats, frames: int
-) -> float:
+def _inflation(bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats) -> float:
     """By how much frames differ more than independent errors of detections would let them.
 
     Each frame's pull on the rig has the covariance of its information; a common error of its
     detections, as of a sensor out of step, makes it larger.
     """
-    G = bundle.count
-    if not G:
+    if not bundle.count:
         return 1.0
-    pulls = np.zeros((frames, G))
-    for _, pairs, rows, weight in weighted:
-        flat = rows.residual * weight[:, None]
-        for block, J in rows.by_rig:
-            columns = np.arange(block.place.start, block.place.stop)
-            pull = np.einsum("nmk,nm->nk", J, flat)
-            np.add.at(pulls, (pairs.frame[:, None], columns[None]), pull)
-        if rows.by_point is not None:
-            start = next(b.start for b in bundle.blocks if b.kind == "body")
-            pull = np.einsum("nmk,nm->nk", rows.by_point, flat)
-            columns = start + 3 * pairs.feature[:, None] + np.arange(3)
-            np.add.at(pulls, (pairs.frame[:, None], columns), pull)
+    pulls = np.zeros((len(bundle.frames), bundle.count))
+    for rows, weight in weighted:
+        pull = np.einsum("nmk,nm->nk", rows.by_rig, rows.residual * weight[:, None])
+        np.add.at(pulls, rows.pairs.frame, pull)
     active = int(np.count_nonzero(pulls.any(axis=1)))
-    rank = int(np.linalg.matrix_rank(covariance)) if G else 0
+    rank = int(np.linalg.matrix_rank(covariance))
     if active <= rank + 2 or not rank:
         return 1.0
     seen = float(np.einsum("ki,ij,kj->", pulls, covariance, pulls)) / rank

@@ -7,48 +7,43 @@ and a dense system of G remains (Schur complement).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.interpolation import interpolate
-from mixpose.calibration.matching import Clock, Pairs
-from mixpose.calibration.rig import Block, Rig, by_parameters, moved
+from mixpose.calibration.matching import Clock, Pairs, clock_of, interpolate
+from mixpose.calibration.rig import Block, Rig, State, by_parameters, moved
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.calibration.task import SeenFrame
 from mixpose.objective.projection import pose_jacobian
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import CalibrationError, by_calibration, doubted
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """What stays the same while a rig is adjusted.
-
-    Attributes
-    ----------
-    frames : tuple of SeenFrame
-    clock : Clock
-    blocks : tuple of Block
-        Free parameters of the rig.
-    pose_free : (6,) bool
-        World directions of the poses that are free; none where poses are known.
-    undetermined : float
-        Standard deviation by a parameter's size above which a direction stays as it is.
-    errors : mapping of int to CalibrationError
-        By sensor, how far what is held of it may be off.
-    """
+    """What stays the same while a rig is adjusted."""
 
     frames: tuple[SeenFrame, ...]
-    clock: Clock
-    blocks: tuple[Block, ...]
-    pose_free: NDArray[np.bool_]
-    undetermined: float
+    blocks: tuple[Block, ...]  # free parameters of the rig
+    pose_free: Mask  # (6,): world directions of the poses that are free; none where poses are known
+    # rows (r, G) of the conditions on a step from a rig, in the parameters' sizes
+    gauge: Callable[[Rig], Floats]
+    sigmas: Floats  # (L,): σ_ε by sensor
+    rules: CalibrationRules
+    # by sensor, how far what is held of it may be off
     errors: Mapping[int, CalibrationError] = field(default_factory=dict)
+
+    @cached_property
+    def clock(self) -> Clock:
+        """When sensors look."""
+        return clock_of(self.frames, len(self.sigmas), self.rules.gap)
 
     @property
     def count(self) -> int:
@@ -58,168 +53,101 @@ class Bundle:
     @property
     def scales(self) -> Floats:
         """Sizes of the parameters (G,)."""
-        parts = [np.array(block.scales) for block in self.blocks]
-        return np.concatenate(parts) if parts else np.zeros(0)
+        return np.array([scale for block in self.blocks for scale in block.scales])
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residuals of one sensor's pairs with their Jacobians.
+    """Residuals of one sensor's pairs with their Jacobians."""
 
-    Attributes
-    ----------
-    residual : (n, m) float64
-        Detected minus predicted.
-    by_pose : (n, m, 6) float64
-        By the pose at the moment of the sensor.
-    shares : (n, 4) float64
-        By how much that pose follows its neighbours'.
-    nodes : (n, 4) int
-    by_rig : list of (Block, (n, m, k) float64)
-    by_point : (n, m, 3) float64 or None
-        By the feature's coordinates, where the body is free.
-    by_held : (n, m, c) float64
-        By what is held, of a standard deviation each.
-    known : (n,) bool
-        Whether the moment of the sensor is known.
-    """
-
-    residual: Floats
-    by_pose: Floats
-    shares: Floats
-    nodes: NDArray[np.intp]
-    by_rig: list[tuple[Block, Floats]]
-    by_point: Floats | None
-    by_held: Floats
-    known: NDArray[np.bool_]
+    pairs: Pairs
+    residual: Floats  # (n, m): detected minus predicted
+    by_pose: Floats  # (n, m, 6): by the pose at the moment of the sensor
+    shares: Floats  # (n, 4): by how much that pose follows those of the clock's nodes
+    by_rig: Floats  # (n, m, G)
+    by_held: Floats  # (n, m, c): by what is held, of a standard deviation each
+    known: Mask  # (n,): whether the moment of the sensor is known
 
 
-def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) -> Rows:
+Weighted: TypeAlias = tuple[Rows, Floats]
+"""Rows of a sensor, and weights (n,) of its pairs."""
+
+
+def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
     """Residuals and Jacobians of one sensor."""
-    eye = rig.sensors[sensor]
-    tau = bundle.clock.tau(rig, sensor, pairs.frame)
-    at, n = poses[pairs.frame], len(tau)
+    rig, clock, frame = state.rig, bundle.clock, pairs.frame
+    eye, tau = rig.sensors[sensor], bundle.clock.tau(rig, sensor, frame)
+    at, n = state.poses[frame], len(tau)
     timed = any(b.sensor == sensor and b.kind in ("delay", "drift") for b in bundle.blocks)
     rate, shares, known = np.zeros((n, 6)), np.eye(1, 4).repeat(n, axis=0), np.ones(n, np.bool_)
     if timed or tau.any():
-        between = interpolate(bundle.clock.near, poses, pairs.frame, tau)
+        between = interpolate(clock, state.poses, frame, tau)
         at, rate, shares = perturb(at, between.twist), between.rate, between.shares
         known = between.known | (np.abs(tau) < 1e-9)
     arms = np.einsum("nij,nj->ni", at[:, :3, :3], rig.points[pairs.feature])
     world = arms + at[:, :3, 3]
     y, by_world, visible = eye.linearise(world)
     by_pose = pose_jacobian(by_world, arms)
-    by_rig: list[tuple[Block, Floats]] = []
-    by_point = None
+    by_rig = np.zeros((*y.shape, bundle.count))
     for block in bundle.blocks:
         if block.kind == "body":
-            by_point = by_world @ at[:, :3, :3]
+            columns = block.start + 3 * pairs.feature[:, None] + np.arange(3)
+            columns = np.broadcast_to(columns[:, None], by_world.shape)
+            np.put_along_axis(by_rig, columns, by_world @ at[:, :3, :3], axis=2)
         elif block.sensor != sensor:
             continue
         elif block.kind in ("delay", "drift"):
             J = np.einsum("nmk,nk->nm", by_pose, rate)[..., None]
             if block.kind == "drift":
-                J = J * bundle.clock.since[sensor, pairs.frame][:, None, None]
-            by_rig.append((block, J))
+                J = J * clock.since[sensor, frame][:, None, None]
+            by_rig[:, :, block.place] = J
         else:
-            by_rig.append((block, by_parameters(eye, block.kind, world, by_world)))
-    nodes = bundle.clock.near.nodes[pairs.frame]
+            by_rig[:, :, block.place] = by_parameters(eye, block.kind, world, by_world)
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
         by_held = by_calibration(doubted(eye, bundle.errors[sensor]), world)
-    return Rows(pairs.y - y, by_pose, shares, nodes, by_rig, by_point, by_held, known & visible)
+    return Rows(pairs, pairs.y - y, by_pose, shares, by_rig, by_held, known & visible)
 
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """The normal equations H δ = b, poses eliminated.
+def _normal_equations(
+    bundle: Bundle, weighted: Sequence[Weighted], damping: float
+) -> tuple[Floats, Floats, Floats, Callable[[Floats], Floats]]:
+    """The normal equations S δ = b of the rig (G, G), poses eliminated.
 
-    Attributes
-    ----------
-    S : (G, G) float64
-        Information on the rig, the poses being unknown.
-    held : (G, C) float64
-        The same between the rig and what is held.
-    b : (G,) float64
-    pose_b, pose_solve, W
-        What gives the poses' step from the rig's.
-    """
-
-    S: Floats
-    held: Floats
-    b: Floats
-    pose_b: Floats
-    pose_solve: object = field(repr=False)
-    W: Floats = field(repr=False)  # H_pg
-
-    def poses_step(self, step: Floats) -> Floats:
-        """The step of all poses (6K',) that belongs to a step of the rig."""
-        if self.pose_solve is None:
-            return np.zeros(0)
-        return np.asarray(self.pose_solve.solve(self.pose_b - self.W @ step))  # type: ignore[attr-defined]
-
-
-def normal_equations(
-    bundle: Bundle,
-    poses: int,
-    rows: Sequence[tuple[int, Pairs, Rows, Floats]],
-    damping: float,
-) -> Normal:
-    """Assemble and eliminate.
-
-    Parameters
-    ----------
-    bundle : Bundle
-    poses : int
-        K.
-    rows : sequence of (sensor, pairs, rows, weights)
-        Weights (n,) include the inverse variance.
-    damping : float
-        Share of the diagonal that is added to the poses' part.
+    Beside S there is the information (G, C) between the rig and what is held, beside b the poses'
+    step that belongs to one of the rig.  Weights include the inverse variance; a share of the
+    diagonal is added to the poses' part.
     """
     G, free = bundle.count, np.flatnonzero(bundle.pose_free)
-    P = len(free) * poses
-    edges = G + np.cumsum([0] + [each.by_held.shape[2] for _, _, each, _ in rows])
+    P = len(free) * len(bundle.frames)
+    edges = G + np.cumsum([0] + [rows.by_held.shape[2] for rows, _ in weighted])
     Q = int(edges[-1])  # parameters that are free and that are held
     H_gg, b_g = np.zeros((Q, Q)), np.zeros(Q)
     W, b_p, H_pp = np.zeros((P, Q)), np.zeros(P), sp.csr_matrix((P, P))
-    for (_, pairs, each, weight), start, stop in zip(rows, edges, edges[1:]):
+    for (rows, weight), start, stop in zip(weighted, edges, edges[1:]):
         root = np.sqrt(weight)
-        A = _rig_columns(bundle, pairs, each, Q)
-        A[:, :, start:stop] = each.by_held
-        A = (A * root[:, None, None]).reshape(each.residual.size, Q)
-        r = (each.residual * root[:, None]).ravel()
+        A = np.zeros((*rows.residual.shape, Q))
+        A[:, :, :G], A[:, :, start:stop] = rows.by_rig, rows.by_held
+        A = (A * root[:, None, None]).reshape(rows.residual.size, Q)
+        r = (rows.residual * root[:, None]).ravel()
         H_gg += A.T @ A
         b_g += A.T @ r
         if P:
-            B = _pose_columns(each, root, free, P)
+            B = _pose_columns(rows, bundle.clock, root, free, P)
             H_pp, W, b_p = H_pp + B.T @ B, W + B.T @ A, b_p + B.T @ r
     if not P:
-        return Normal(H_gg[:G, :G], H_gg[:G, G:], b_g[:G], b_p, None, W[:, :G])
+        return H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: b_p
     diagonal = H_pp.diagonal()
     floor = 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
     factor = splu((H_pp + sp.diags(damping * diagonal + floor)).tocsc())
     X = factor.solve(np.column_stack([W[:, :G], b_p]))
     S = H_gg[:, :G] - W.T @ X[:, :-1]
     b = b_g[:G] - W[:, :G].T @ X[:, -1]
-    return Normal((S[:G] + S[:G].T) / 2, S[G:].T, b, b_p, factor, W[:, :G])
+    return (S[:G] + S[:G].T) / 2, S[G:].T, b, lambda step: factor.solve(b_p - W[:, :G] @ step)
 
 
-def _rig_columns(bundle: Bundle, pairs: Pairs, rows: Rows, count: int) -> Floats:
-    n, m = rows.residual.shape
-    A = np.zeros((n, m, count))
-    for block, J in rows.by_rig:
-        A[:, :, block.place] = J
-    if rows.by_point is not None:
-        start = next(block.start for block in bundle.blocks if block.kind == "body")
-        columns = start + 3 * pairs.feature[:, None] + np.arange(3)
-        A[np.arange(n)[:, None, None], np.arange(m)[None, :, None], columns[:, None, :]] = (
-            rows.by_point
-        )
-    return A
-
-
-def _pose_columns(rows: Rows, root: Floats, free: NDArray[np.intp], P: int) -> sp.csr_matrix:
+def _pose_columns(rows: Rows, clock: Clock, root: Floats, free: Indices, P: int) -> Any:
+    """Sparse Jacobian (n m, P) of weighted residuals by the free directions of all poses."""
     n, m = rows.residual.shape
     d = len(free)
     used = [0] if not rows.shares[:, 1:].any() else [0, 1, 2, 3]
@@ -227,7 +155,7 @@ def _pose_columns(rows: Rows, root: Floats, free: NDArray[np.intp], P: int) -> s
     value, column = [], []
     for node in used:
         value.append(J * rows.shares[:, node, None, None])
-        place = rows.nodes[:, node, None] * d + np.arange(d)
+        place = clock.nodes[rows.pairs.frame, node, None] * d + np.arange(d)
         column.append(np.repeat(place[:, None, :], m, axis=1))
     values = np.concatenate(value, axis=2).ravel()
     columns = np.concatenate(column, axis=2).ravel()
@@ -237,55 +165,35 @@ def _pose_columns(rows: Rows, root: Floats, free: NDArray[np.intp], P: int) -> s
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A step of rig and poses.
+    """A step of rig and poses."""
 
-    Attributes
-    ----------
-    rig : (G,) float64
-    poses : (K, 6) float64
-    covariance : (G, G) float64
-        Of the rig, in the gauge; directions that are not determined left out.
-    of_held : (G, G) float64
-        What errors of the held parameters add to it.
-    unknown : (G, u) float64
-        Directions that are not determined, in units of the parameters' sizes.
-    """
-
-    rig: Floats
-    poses: Floats
+    rig: Floats  # (G,)
+    poses: Floats  # (K, 6)
+    # (G, G): of the rig, in the gauge; directions that are not determined left out
     covariance: Floats
-    of_held: Floats
-    unknown: Floats
+    of_held: Floats  # (G, G): what errors of the held parameters add to it
+    unknown: Floats  # (G, u): directions that are not determined, in units of the parameters' sizes
 
 
-def solved(bundle: Bundle, normal: Normal, gauge: Floats, poses: int) -> Step:
-    """Solve within the gauge, leaving alone what the data do not determine.
-
-    Parameters
-    ----------
-    bundle : Bundle
-    normal : Normal
-    gauge : (r, G) array
-        Rows of the conditions on the step, in the parameters' sizes.
-    poses : int
-        K.
-    """
+def solved(
+    bundle: Bundle, state: State, weighted: Sequence[Weighted], damping: float = 0.0
+) -> Step:
+    """Solve within the gauge, leaving alone what the data do not determine."""
+    S, held, b, poses_step = _normal_equations(bundle, weighted, damping)
     scales = bundle.scales
-    S = normal.S * np.outer(scales, scales)
-    basis = _complement(gauge, len(scales))
+    S = S * np.outer(scales, scales)
+    basis = _complement(bundle.gauge(state.rig), len(scales))
     inner = basis.T @ S @ basis
-    pulls = scales[:, None] * normal.held  # of held parameters that are a standard deviation off
+    pulls = scales[:, None] * held  # of held parameters that are a standard deviation off
     told = _told(inner, basis.T @ pulls)
     values, vectors = np.linalg.eigh((told + told.T) / 2)
-    known = values > 1.0 / bundle.undetermined**2
+    known = values > 1.0 / bundle.rules.undetermined**2
     V = basis @ vectors[:, known]
     covariance = V @ np.linalg.inv(V.T @ S @ V) @ V.T
-    step = scales * (covariance @ (scales * normal.b))
+    step = scales * (covariance @ (scales * b))
     by_held = scales[:, None] * (covariance @ pulls)
-    free = np.flatnonzero(bundle.pose_free)
-    pose_steps = np.zeros((poses, 6))
-    if len(free):
-        pose_steps[:, free] = normal.poses_step(step).reshape(poses, len(free))
+    pose_steps = np.zeros((len(state.poses), 6))
+    pose_steps[:, bundle.pose_free] = poses_step(step).reshape(len(pose_steps), -1)
     return Step(
         step,
         pose_steps,
@@ -314,9 +222,7 @@ def _complement(gauge: Floats, count: int) -> Floats:
     return np.asarray(Vt[rank:].T)
 
 
-def stepped(bundle: Bundle, rig: Rig, poses: Floats, step: Step) -> tuple[Rig, Floats]:
+def stepped(bundle: Bundle, state: State, step: Step) -> State:
     """Rig and poses after a step."""
-    rig = moved(rig, bundle.blocks, step.rig)
-    if bundle.pose_free.any():
-        poses = perturb(poses, step.poses)
-    return rig, poses
+    rig, poses = moved(state.rig, bundle.blocks, step.rig), state.poses
+    return State(rig, perturb(poses, step.poses) if bundle.pose_free.any() else poses)

@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.calibration.adjust import Adjusted, GaugeOf, adjust, moved_by_held
-from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.choice import held_back_with
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.gauge import Freedom, gauge_rows
-from mixpose.calibration.interpolation import neighbours
+from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
-from mixpose.calibration.matching import clock_of
-from mixpose.calibration.residuals import (
+from mixpose.calibration.recorded import held_back_with
+from mixpose.calibration.result import (
+    Calibration,
+    Residual,
     explained_share,
     met_share,
     rms,
     sights_of,
     squared_residuals,
 )
-from mixpose.calibration.result import Calibration, Residual
-from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
+from mixpose.calibration.rig import Block, Rig, State, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.start import Start, searched, start_from_cameras, starts_together, without
-from mixpose.calibration.task import Known, Progress, Task, silent
+from mixpose.calibration.searching import searched
+from mixpose.calibration.start import Start, start_from_cameras, starts_together
+from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.sensors import CalibrationError, RangeSensor
 from mixpose.threads import one_blas_thread
 
@@ -43,22 +40,12 @@ def calibrate(
     rules: CalibrationRules = CalibrationRules(),
     *,
     progress: Progress = silent,
-    found: dict[tuple[int, int], Hypotheses] | None = None,
+    found: Known | None = None,
 ) -> Calibration:
     """Calibrate sensors and body from what the sensors saw.
 
-    Parameters
-    ----------
-    task : Task
-    rules : CalibrationRules
-    progress : callable
-    found : dict or None
-        Hypotheses of single cameras that are known from before; new ones are added.
-
-    Raises
-    ------
-    RecordingError
-        If the body is not found in enough frames.
+    `found` are hypotheses of single cameras that are known from before; new ones are added.
+    Raises a RecordingError if the body is not found in enough frames.
     """
     if task.cameras:
         known = searched(task, rules, progress, {} if found is None else found)
@@ -118,7 +105,7 @@ def _best(
     """Number and run of the first start that tells features apart, else of the best."""
     best: tuple[tuple[bool, float], int, _Run] | None = None
     for number, start in enumerate(starts):
-        if not len(start.poses):
+        if not len(start.frames):
             continue
         one = _Run(task, start, rules, progress)
         fits = bool((one.found.noise < rules.failed * task.sigmas).all())
@@ -132,74 +119,60 @@ def _best(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some of the frames with their poses."""
+    """Some of the frames with their poses, and the rig."""
 
     frames: tuple[SeenFrame, ...]
-    poses: Floats
+    state: State
 
-    def only(self, mask: NDArray[np.bool_]) -> _Part:
-        kept = np.flatnonzero(mask)
-        return _Part(tuple(self.frames[k] for k in kept), self.poses[kept])
-
-
-def _left_out(part: _Part, good: NDArray[np.bool_]) -> list[int]:
-    """Numbers of bad frames; none where all are: then no sensor was placed yet."""
-    return [f.number for f, ok in zip(part.frames, good, strict=True) if not ok and good.any()]
+    def only(self, mask: Mask) -> _Part:
+        frames = tuple(frame for frame, kept in zip(self.frames, mask, strict=True) if kept)
+        return _Part(frames, self.state._replace(poses=self.state.poses[mask]))
 
 
 class _Run:
-    """One calibration from a start.
-
-    Attributes
-    ----------
-    found : Calibration
-        Without residuals.
-    """
+    """One calibration from a start; what it `found` is without residuals."""
 
     def __init__(
         self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
     ) -> None:
-        self._task, self._start, self._rules, self._progress = task, start, rules, progress
-        self._known = task.known is not None
-        self._pose_free = task.pose_free & (not self._known)
+        self._asked, self._start, self._rules, self._progress = task, start, rules, progress
+        self._pose_free = task.pose_free & (task.known is None)
         times = [f.time_s for f in start.frames if f.time_s is not None]
         steps = np.diff(np.unique(times)) if len(times) > 1 else np.ones(1)
         self._interval = float(np.median(steps))
-        self._asked = task.free
-        self._late: dict[int, Floats] = {}
-        free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
-        self._task = replace(task, free=free)
-        self._blocks = self._laid_out()
+        self._lay_out(start.unlinked)
         self.found = self._result()
 
-    def _laid_out(self) -> tuple[Block, ...]:
-        return blocks_of(
-            self._start.rig,
-            self._task.free,
-            body=self._task.body_free,
-            length=_size_of(self._start.rig, self._start.poses),
-            interval=self._interval,
-        )
+    def _lay_out(self, unlinked: Collection[int]) -> None:
+        """Seek what is free of sensors that are linked by now."""
+        self._unlinked = tuple(unlinked)
+        free = {s: kinds for s, kinds in self._asked.free.items() if s not in unlinked}
+        self._task = replace(self._asked, free=free)
+        start = self._start.state
+        body, length = self._task.body_free, _size_of(start)
+        self._blocks = blocks_of(start.rig, free, body=body, length=length, interval=self._interval)
 
     def _result(self) -> Calibration:
         """The calibration, but for its residuals."""
-        rules, part = self._rules, _Part(self._start.frames, self._start.poses)
+        part = _Part(self._start.frames, self._start.state)
         self._progress("adjusting all sensors together", 0, _STAGES)
-        adjusted = self._adjusted(part, self._start.rig, None)
-        good = met_share(adjusted, part.frames, self._task) > rules.least_met
-        bad = _left_out(part, good)
-        part = replace(part, poses=adjusted.poses)
-        part = part.only(good) if bad else part
+        adjusted = self._adjusted(part)
+        good = met_share(adjusted, part.frames, self._task) > self._rules.least_met
+        part = replace(part, state=adjusted.state)
+        bad: list[int] = []
+        if good.any():  # else no sensor was placed yet
+            bad = [f.number for f, ok in zip(part.frames, good, strict=True) if not ok]
+            part = part.only(good)
         # from wider blurs, as features that crowd let the noise that is learnt first be too small
         self._progress("adjusting again, without bad frames", 1, _STAGES)
-        adjusted = self._adjusted(part, adjusted.rig, self._again(adjusted))
-        part = replace(part, poses=adjusted.poses)
-        self._place_latecomers(part, adjusted)
-        if self._late:
+        adjusted = self._adjusted(part, adjusted.noise)
+        part = replace(part, state=adjusted.state)
+        late = self._latecomers(part, adjusted.noise)
+        if late:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
-            part, rig = self._completed(part, adjusted.rig)
-            adjusted = self._adjusted(part, rig, self._again(adjusted))
-            part = replace(part, poses=adjusted.poses)
+            part = self._with_latecomers(part, late)
+            adjusted = self._adjusted(part, adjusted.noise)
+            part = replace(part, state=adjusted.state)
         self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
@@ -209,72 +182,68 @@ class _Run:
         Matches are the same in all three, and poses are fitted to each rig.
         """
         part, best = self._part, self._best
-        folds = held_back_with(len(part.poses), self._rules, runs=self._task.times_matter)
+        folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
-        bundle = self._bundle(part, ())
+        bundle = replace(self._bundle(part), blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
         before = squared_residuals(bundle, self._task.rig, best)
-        after = squared_residuals(bundle, best.rig, best)
+        after = squared_residuals(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
-            fit = self._adjusted(part.only(folds != fold), best.rig, self._again(best))
+            fit = self._adjusted(part.only(folds != fold), best.noise)
             lost = {
                 block.sensor
                 for block in self._blocks
                 if (fit.undetermined & ~best.undetermined)[block.place].any()
             }
-            found = squared_residuals(bundle, fit.rig, best)
+            found = squared_residuals(bundle, fit.state.rig, best)
             for s in sensors:
                 if s not in lost:
-                    held[s].append(found[s][folds[best.weighted[s][0].frame] == fold])
+                    held[s].append(found[s][folds[best.weighted[s][0].pairs.frame] == fold])
         return {s: Residual(rms([before[s]]), rms([after[s]]), rms(held[s])) for s in sensors}
 
-    def _again(self, adjusted: Adjusted) -> Floats:
-        """Blurs to begin with near what was adjusted before."""
-        return 2 * self._rules.blur * adjusted.noise
-
-    def _place_latecomers(self, training: _Part, adjusted: Adjusted) -> None:
-        """Place cameras that could not be linked by what they see alone."""
-        task, start = self._task, self._start
-        if not start.unlinked:
-            return
-        numbers = {frame.number: frame for frame in task.frames}
-        frames = tuple(numbers[frame.number] for frame in training.frames)
-        linked = [s for s in task.cameras if s not in start.unlinked]
-        for sensor in start.unlinked:
-            T = placed(
-                task,
-                adjusted.rig,
-                sensor,
-                linked,
-                frames,
-                adjusted.poses,
-                adjusted.noise,
-                self._rules,
-            )
+    def _latecomers(self, part: _Part, noise: Floats) -> dict[int, Floats]:
+        """T_sensor_world of cameras that could not be linked by what they see alone."""
+        task, unlinked, found = self._task, self._unlinked, dict[int, Floats]()
+        frames = self._whole(part)
+        linked = [s for s in task.cameras if s not in unlinked]
+        for sensor in unlinked:
+            T = placed(task, part.state, sensor, linked, frames, noise, self._rules)
             if T is not None:
-                self._late[sensor] = T
+                found[sensor] = T
+        return found
 
-    def _completed(self, part: _Part, rig: Rig) -> tuple[_Part, Rig]:
+    def _with_latecomers(self, part: _Part, late: dict[int, Floats]) -> _Part:
         """Frames with what the cameras that came late saw, and the rig with them."""
-        task = self._task
-        if not self._late:
-            return part, rig
-        rest = {s for s in self._start.unlinked if s not in self._late}
-        numbers = {frame.number: frame for frame in task.frames}
-        frames = tuple(without(numbers[f.number], rest) for f in part.frames)
-        for sensor, T in self._late.items():
+        self._lay_out([s for s in self._unlinked if s not in late])
+        rig = part.state.rig
+        for sensor, T in late.items():
             rig = rig.placed(sensor, T)
-        free = {s: kinds for s, kinds in self._asked.items() if s not in rest}
-        self._task = replace(task, free=free)
-        self._blocks = self._laid_out()
-        return _Part(frames, part.poses), rig
+        frames = tuple(frame.without(self._unlinked) for frame in self._whole(part))
+        return _Part(frames, part.state._replace(rig=rig))
 
-    def _bundle(self, part: _Part, blocks: tuple[Block, ...]) -> Bundle:
-        near = neighbours([f.time_s for f in part.frames], self._rules.gap)
-        clock = clock_of(part.frames, near, len(self._task.rig.sensors))
-        errors = self._task.errors if blocks else {}
-        return Bundle(part.frames, clock, blocks, self._pose_free, self._rules.undetermined, errors)
+    def _whole(self, part: _Part) -> tuple[SeenFrame, ...]:
+        """The frames with all that sensors saw."""
+        numbers = {frame.number: frame for frame in self._task.frames}
+        return tuple(numbers[frame.number] for frame in part.frames)
+
+    def _bundle(self, part: _Part) -> Bundle:
+        task = self._task
+
+        def gauge(rig: Rig) -> Floats:
+            return self._gauge(part.state._replace(rig=rig))[0]
+
+        return Bundle(
+            part.frames, self._blocks, self._pose_free, gauge, task.sigmas, self._rules, task.errors
+        )
+
+    def _gauge(self, state: State) -> tuple[Floats, tuple[str, ...]]:
+        return gauge_rows(state, self._blocks, self._pose_free, self._task.length)
+
+    def _adjusted(self, part: _Part, noise: Floats | None = None) -> Adjusted:
+        """A part adjusted, from narrow blurs where the noise is known from before."""
+        blurs = None if noise is None else 2 * self._rules.blur * noise
+        return adjust(self._bundle(part), part.state, blurs=blurs)
 
     def _moved_by_biases(self, part: _Part, adjusted: Adjusted) -> Floats:
         """What biases as large as σ_ε would move (G,), of sensors of which nothing is stated."""
@@ -287,39 +256,22 @@ class _Run:
         }
         if not errors:
             return np.zeros(sum(len(block.names) for block in self._blocks))
-        bundle = replace(self._bundle(part, self._blocks), errors=errors)
-        return moved_by_held(bundle, adjusted, self._gauge(part.poses), self._rules)
+        return moved_by_held(replace(self._bundle(part), errors=errors), adjusted)
 
-    def _gauge(self, poses: Floats) -> GaugeOf:
-        freedom = Freedom(self._pose_free, poses)
-        return lambda rig: gauge_rows(rig, self._blocks, freedom, self._task.length)[0]
-
-    def _adjusted(self, part: _Part, rig: Rig, blurs: Floats | None) -> Adjusted:
-        bundle = self._bundle(part, self._blocks)
-        gauge = self._gauge(part.poses)
-        return adjust(bundle, rig, part.poses, gauge, self._task.sigmas, self._rules, blurs=blurs)
-
-    def _told(
-        self,
-        part: _Part,
-        adjusted: Adjusted,
-        bad: list[int],
-    ) -> Calibration:
-        task = self._task
-        freedom = Freedom(self._pose_free, part.poses)
-        _, gauge = gauge_rows(adjusted.rig, self._blocks, freedom, task.length)
+    def _told(self, part: _Part, adjusted: Adjusted, bad: list[int]) -> Calibration:
+        task, rig = self._task, adjusted.state.rig
         deviations, refused = _determined(self._blocks, adjusted, task.rig.names)
         numbers = [f.number for f in part.frames]
         return Calibration(
             before=task.rig,
-            after=adjusted.rig,
+            after=rig,
             blocks=self._blocks,
             deviations=deviations,
             covariance=adjusted.covariance,
             refused=refused,
-            gauge=gauge,
+            gauge=self._gauge(part.state)[1],
             through=self._start.through,
-            unlinked=tuple(s for s in self._start.unlinked if s not in self._late),
+            unlinked=self._unlinked,
             used=tuple(numbers),
             bad=tuple(sorted(bad)),
             recorded=len(task.frames),
@@ -330,13 +282,13 @@ class _Run:
             moved_by_biases=self._moved_by_biases(part, adjusted),
             explained=explained_share(adjusted, part.frames, task),
             sights=sights_of(adjusted, numbers),
-            poses=dict(zip(numbers, adjusted.poses, strict=True)),
-            frames=part.frames,
+            poses=dict(zip(numbers, adjusted.state.poses, strict=True)),
         )
 
 
-def _size_of(rig: Rig, poses: Floats) -> float:
+def _size_of(state: State) -> float:
     """Median distance from sensors to the body, or from sensor to sensor if that is more."""
+    rig, poses = state
     centres = np.array([centre_of(s) for s in rig.sensors])
     places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
     away = np.linalg.norm(places[:, None] - centres[None], axis=2)

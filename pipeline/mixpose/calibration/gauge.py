@@ -7,107 +7,80 @@ each step of the parameters, which change no residual either.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-from mixpose.calibration.rig import Block, Rig, centre_of
-from mixpose.records import Floats
+from mixpose.calibration.rig import Block, Kind, Rig, State, centre_of
+from mixpose.objective.projection import pose_jacobian
+from mixpose.records import Floats, Mask
 from mixpose.sensors import RangeSensor
 
 _GENERATORS = 13  # six motions of the world, six of the body in its frame, one scale
 _MOST_POSES = 40
 
 
-@dataclass(frozen=True, eq=False)
-class Freedom:
-    """What is free beside the parameters of the rig.
-
-    Attributes
-    ----------
-    pose_free : (6,) bool
-    poses : (K, 4, 4) float64
-    """
-
-    pose_free: NDArray[np.bool_]
-    poses: Floats
-
-
 def gauge_rows(
-    rig: Rig, blocks: Sequence[Block], freedom: Freedom, length: tuple[int, int] | None = None
+    state: State, blocks: Sequence[Block], pose_free: Mask, length: tuple[int, int] | None = None
 ) -> tuple[Floats, tuple[str, ...]]:
-    """Conditions on a step of the parameters, in the parameters' sizes, and what they say.
+    """Conditions (r, G) on a step of the parameters, in the parameters' sizes, and what they say.
 
-    Parameters
-    ----------
-    rig : Rig
-    blocks : sequence of Block
-    freedom : Freedom
-    length : (int, int) or None
-        Sensors whose distance is known.
-
-    Returns
-    -------
-    (r, G) array
-    tuple of str
-        A sentence for each freedom that was removed.
+    There is a sentence for each freedom that was removed.  `length` are two sensors whose distance
+    is known.
     """
-    count = sum(len(block.names) for block in blocks)
-    scales = np.concatenate([np.array(b.scales) for b in blocks]) if blocks else np.zeros(0)
-    moves, held = _generators(rig, blocks, freedom, count)
+    rig = state.rig
+    scales = np.array([scale for block in blocks for scale in block.scales])
+    moves, held = _generators(state, blocks, pose_free, len(scales))
     idle = null_space(held, rcond=1e-9) if len(held) else np.eye(_GENERATORS)
     Z = (moves @ idle) / scales[:, None]
     rows: list[Floats] = []
     said: list[str] = []
-    for row, text in _conditions(rig, blocks, count, scales, Z, length):
+    for row, text in _conditions(rig, blocks, scales, Z, length):
         left = Z @ null_space(np.array(rows) @ Z) if rows else Z
         if left.size and np.linalg.norm(row @ left) > 1e-6 * np.linalg.norm(row):
             rows.append(row / np.linalg.norm(row))
             if text not in said:
                 said.append(text)
-    return np.array(rows).reshape(len(rows), count), tuple(said)
+    return np.array(rows).reshape(len(rows), len(scales)), tuple(said)
 
 
 def _generators(
-    rig: Rig, blocks: Sequence[Block], freedom: Freedom, count: int
+    state: State, blocks: Sequence[Block], pose_free: Mask, count: int
 ) -> tuple[Floats, Floats]:
     """Each generator's change of the free parameters (G, 13), and of all that is held (h, 13)."""
-    moves, held = np.zeros((count, _GENERATORS)), []
+    moves, held = np.zeros((count, _GENERATORS)), [np.zeros((0, _GENERATORS))]
     place = {(block.sensor, block.kind): block.place for block in blocks}
-    for index, sensor in enumerate(rig.sensors):
-        kind = "position" if isinstance(sensor, RangeSensor) else "pose"
-        change = _sensor_change(sensor)
-        if (index, kind) in place:
-            moves[place[index, kind]] = change  # type: ignore[index]
-        else:
+
+    def told(of: slice | None, change: Floats) -> None:
+        if of is None:
             held.append(change)
-        if isinstance(sensor, RangeSensor) or not hasattr(sensor, "camera_matrix"):
+        else:
+            moves[of] = change
+
+    for index, sensor in enumerate(state.rig.sensors):
+        kind: Kind = "position" if isinstance(sensor, RangeSensor) else "pose"
+        told(place.get((index, kind)), _sensor_change(sensor))
+        if not hasattr(sensor, "camera_matrix"):
             held.append(np.eye(_GENERATORS)[12:])  # it measures lengths
-    change = _body_change(rig.points)
-    if (None, "body") in place:
-        moves[place[None, "body"]] = change
-    else:
-        held.append(change)
-    fixed = ~freedom.pose_free
+    told(place.get((None, "body")), _body_change(state.rig.points))
+    fixed = ~pose_free
     if fixed.any():
-        poses = freedom.poses[:: max(len(freedom.poses) // _MOST_POSES, 1)]
+        poses = state.poses[:: max(len(state.poses) // _MOST_POSES, 1)]
         held += [_pose_change(T)[fixed] for T in poses]
-    return moves, np.concatenate(held) if held else np.zeros((0, _GENERATORS))
+    return moves, np.concatenate(held)
 
 
-def _cross(v: Floats) -> Floats:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0.0]])
+def _by_motion(points: Floats) -> Floats:
+    """Change (n, 3, 6) of points (n, 3) by a motion about the origin."""
+    return pose_jacobian(np.broadcast_to(np.eye(3), (len(points), 3, 3)), points)
 
 
 def _sensor_change(sensor: Any) -> Floats:
     """Change of a sensor's pose in its axes, or of a position, by all generators."""
     centre = centre_of(sensor)
     moved = np.zeros((3, _GENERATORS))
-    moved[:, :3] = np.eye(3)
-    moved[:, 3:6] = -_cross(centre)
+    moved[:, :6] = _by_motion(centre[None])[0]
     moved[:, 12] = centre
     if isinstance(sensor, RangeSensor):
         return moved
@@ -121,8 +94,7 @@ def _sensor_change(sensor: Any) -> Floats:
 
 def _body_change(points: Floats) -> Floats:
     change = np.zeros((len(points), 3, _GENERATORS))
-    change[:, :, 6:9] = np.eye(3)
-    change[:, :, 9:12] = [-_cross(p) for p in points]
+    change[:, :, 6:12] = _by_motion(points)
     change[:, :, 12] = points
     return change.reshape(-1, _GENERATORS)
 
@@ -131,79 +103,74 @@ def _pose_change(T: Floats) -> Floats:
     """Change of a pose in world axes: x y z rx ry rz."""
     R, t = T[:3, :3], T[:3, 3]
     change = np.zeros((6, _GENERATORS))
-    change[:3, :3], change[:3, 3:6], change[3:, 3:6] = np.eye(3), -_cross(t), np.eye(3)
+    change[:3, :6], change[3:, 3:6] = _by_motion(t[None])[0], np.eye(3)
     change[:3, 6:9], change[3:, 9:12] = -R, -R
     change[:3, 12] = t
     return change
 
 
 def _conditions(
-    rig: Rig,
-    blocks: Sequence[Block],
-    count: int,
-    scales: Floats,
-    Z: Floats,
-    length: tuple[int, int] | None,
+    rig: Rig, blocks: Sequence[Block], scales: Floats, Z: Floats, length: tuple[int, int] | None
 ) -> list[tuple[Floats, str]]:
     """Conditions in the order in which they are preferred."""
     found: list[tuple[Floats, str]] = []
 
-    def row(place: slice, values: Floats) -> Floats:
-        out = np.zeros(count)
-        out[place] = values
-        return out * scales
+    def add(text: str, *parts: tuple[Block, Floats]) -> None:
+        row = np.zeros(len(scales))
+        for block, values in parts:
+            row[block.place] += values
+        found.append((row * scales, text))
 
     positions = [b for b in blocks if b.kind == "position"]
     if len(positions) > 1:
-        found += _range_conditions(rig, positions, row)
+        for block, values, text in _range_conditions(rig, positions[:3]):
+            add(text, (block, values))
     body = next((b for b in blocks if b.kind == "body"), None)
     if body is not None:
         change = _body_change(rig.points)
         text = "the body's own frame stays where its features are on average"
-        found += [(row(body.place, change[:, k]), text) for k in range(6, 12)]
+        for k in range(6, 12):
+            add(text, (body, change[:, k]))
         if length is not None:
-            text = "the known length between two sensors stays"
-            found.append((_length_row(rig, blocks, length, row, count), text))
+            parts = _length_parts(rig, blocks, length)
+            add("the known length between two sensors stays", *parts)
         else:
             text = "the body keeps its size: cameras alone do not tell scale"
-            found.append((row(body.place, change[:, 12]), text))
-    for direction in Z.T:
-        if np.linalg.norm(direction) > 1e-9:
-            text = "the rig as a whole stays where it is: no data tell where it stands"
-            found.append((direction, text))
+            add(text, (body, change[:, 12]))
+    text = "the rig as a whole stays where it is: no data tell where it stands"
+    found += [(direction, text) for direction in Z.T if np.linalg.norm(direction) > 1e-9]
     return found
 
 
-def _length_row(
-    rig: Rig, blocks: Sequence[Block], length: tuple[int, int], row: Any, count: int
-) -> Floats:
-    """The change of the distance between two sensors by a step of the parameters."""
-    centres = [centre_of(rig.sensors[k]) for k in length]
-    along = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
-    out = np.zeros(count)
-    for index, sign in zip(length, (-1.0, 1.0), strict=True):
-        for block in blocks:
-            if block.sensor == index and block.kind == "position":
-                out += row(block.place, sign * along)
-            elif block.sensor == index and block.kind == "pose":
-                sensor: Any = rig.sensors[index]
-                turned = -sign * sensor.T_sensor_world[:3, :3] @ along
-                out += row(block.place, np.concatenate([turned, np.zeros(3)]))
-    return out
+def _length_parts(
+    rig: Rig, blocks: Sequence[Block], length: tuple[int, int]
+) -> list[tuple[Block, Floats]]:
+    """The change of the distance between two sensors by their places."""
+    first, second = (centre_of(rig.sensors[k]) for k in length)
+    along = (second - first) / np.linalg.norm(second - first)
+    found = []
+    for block in blocks:
+        if block.sensor in length and block.kind in ("position", "pose"):
+            signed = along if block.sensor == length[1] else -along
+            if block.kind == "pose":
+                sensor: Any = rig.sensors[block.sensor]
+                signed = np.append(-sensor.T_sensor_world[:3, :3] @ signed, np.zeros(3))
+            found.append((block, signed))
+    return found
 
 
-def _range_conditions(rig: Rig, positions: Sequence[Block], row: Any) -> list[tuple[Floats, str]]:
+def _range_conditions(rig: Rig, positions: Sequence[Block]) -> list[tuple[Block, Floats, str]]:
     """First at its place, second on the line from it, third in their plane."""
-    first, second = positions[0], positions[1]
-    p = [centre_of(rig.sensors[b.sensor]) for b in positions[:3] if b.sensor is not None]
-    names = [rig.names[b.sensor] for b in positions[:3] if b.sensor is not None]
-    found = [(row(first.place, axis), f"{names[0]} stays at its place") for axis in np.eye(3)]
+    sensors = [b.sensor for b in positions if b.sensor is not None]
+    p = [centre_of(rig.sensors[s]) for s in sensors]
+    names = [rig.names[s] for s in sensors]
+    found = [(positions[0], axis, f"{names[0]} stays at its place") for axis in np.eye(3)]
     along = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
     text = f"{names[1]} stays on the line from {names[0]}"
-    found += [(row(second.place, axis), text) for axis in null_space(along[None]).T]
+    found += [(positions[1], axis, text) for axis in null_space(along[None]).T]
     if len(positions) > 2:
         normal = np.cross(along, p[2] - p[0])
         if np.linalg.norm(normal) > 1e-9 * np.linalg.norm(p[2] - p[0]):
             text = f"{names[2]} stays in the plane of {names[0]}, {names[1]} and itself"
-            found.append((row(positions[2].place, normal / np.linalg.norm(normal)), text))
+            found.append((positions[2], normal / np.linalg.norm(normal), text))
     return found

@@ -12,17 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.calibration.adjust import adjust
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.interpolation import neighbours
-from mixpose.calibration.matching import Ints, clock_of, feature_spacing
-from mixpose.calibration.rig import Rig, blocks_of, centre_of
+from mixpose.calibration.matching import feature_spacing
+from mixpose.calibration.rig import Rig, State, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.starting import agreement
-from mixpose.calibration.task import Task
-from mixpose.records import Floats
+from mixpose.calibration.start import agreement
+from mixpose.calibration.task import SeenFrame, Task
+from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.search import SIDES, align_triples, depths
-from mixpose.sensors import facing
 
 _TRIED = 6  # starts that are adjusted
 _TRIPLES = 20_000  # of pairs that are tried: of 360 pairs, 18 of them right, 150 triples are right
@@ -31,95 +28,66 @@ _MOST = 1_000_000  # detections of a frame
 
 def placed(
     task: Task,
-    rig: Rig,
+    state: State,
     sensor: int,
     linked: Sequence[int],
     frames: Sequence[SeenFrame],
-    poses: Floats,
     noise: Floats,
     rules: CalibrationRules,
 ) -> Floats | None:
     """T_sensor_world of a camera from known poses of the body; None where they do not tell.
 
-    It is believed to stand to one of the linked sensors about as the session has it.
-
-    Parameters
-    ----------
-    task : Task
-    rig : Rig
-        With the linked sensors where they are by now.
-    sensor : int
-    linked : sequence of int
-    frames : sequence of SeenFrame
-        With what the camera saw.
-    poses : (K, 4, 4) array
-    noise : (L,) array
-    rules : CalibrationRules
+    It is believed to stand to one of the linked sensors about as the session has it; in the state
+    these are where they are by now.
     """
-    own = [
-        replace(frame, points={s: y for s, y in frame.points.items() if s == sensor})
-        for frame in frames
-    ]
+    others = [s for s in range(len(task.rig.sensors)) if s != sensor]
+    own = tuple(frame.without(others) for frame in frames)
     total = sum(len(frame.points.get(sensor, ())) for frame in own)
     if total < rules.least_detections:
         return None
-    near = neighbours([frame.time_s for frame in own], rules.gap)
-    clock = clock_of(own, near, len(rig.sensors))
-    blocks = blocks_of(rig, {sensor: ("pose",)}, body=False, length=1.0, interval=1.0)
+    blocks = blocks_of(state.rig, {sensor: ("pose",)}, body=False, length=1.0, interval=1.0)
     known = np.zeros(6, dtype=np.bool_)
-    bundle = Bundle(tuple(own), clock, blocks, known, np.inf)
+    sure = replace(rules, undetermined=np.inf)
+    bundle = Bundle(own, blocks, known, lambda _: np.zeros((0, 6)), task.sigmas, sure)
     best, best_met = None, 0.0
-    for T in _starts(task, rig, sensor, linked, own, poses, rules):
-        start = rig.placed(sensor, T)
+    for T in _starts(task, state, sensor, linked, own, rules):
+        start = State(state.rig.placed(sensor, T), state.poses)
         blurs = np.array(noise)
-        blurs[sensor] = rules.widest * min(feature_spacing(start, poses, sensor), 1e6)
-        fit = adjust(
-            bundle,
-            start,
-            poses,
-            lambda _: np.zeros((0, 6)),
-            task.sigmas,
-            rules,
-            blurs=blurs,
-            noise=noise,
-        )
-        met = float(np.count_nonzero(fit.weighted[sensor][2] > rules.faintest))
+        blurs[sensor] = rules.widest * min(feature_spacing(start, sensor), 1e6)
+        fit = adjust(bundle, start, blurs=blurs, noise=noise)
+        met = float(np.count_nonzero(fit.weighted[sensor][1] > rules.faintest))
         if met > best_met:
-            best, best_met = fit.rig.sensors[sensor].T_sensor_world, met  # type: ignore[attr-defined]
+            best, best_met = fit.state.rig.sensors[sensor].T_sensor_world, met  # type: ignore[attr-defined]
     enough = best_met >= max(rules.explained * total, rules.least_detections)
     return best if enough else None
 
 
 def _starts(
     task: Task,
-    rig: Rig,
+    state: State,
     sensor: int,
     linked: Sequence[int],
     frames: Sequence[SeenFrame],
-    poses: Floats,
     rules: CalibrationRules,
 ) -> Floats:
     """Where to begin (H, 4, 4): near the mean of what all linked sensors tell."""
-    session = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
+    session: list[Floats] = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
+    now: list[Floats] = [one.T_sensor_world for one in state.rig.sensors]  # type: ignore[attr-defined]
     told = np.array(
-        [
-            session[sensor] @ inverse(session[a]) @ rig.sensors[a].T_sensor_world  # type: ignore[attr-defined]
-            for a in linked
-        ]
-        or [session[sensor]]
+        [session[sensor] @ inverse(session[a]) @ now[a] for a in linked] or [session[sensor]]
     )
     centre = np.median(np.array([inverse(T)[:3, 3] for T in told]), axis=0)
     R = Rotation.from_matrix(told[:, :3, :3]).mean().as_matrix()
     T_mean = from_parts(R, -R @ centre)
-    rig = rig.placed(sensor, T_mean)
+    rig = state.rig.placed(sensor, T_mean)
     seen = [
         (pose, frame.points[sensor])
-        for pose, frame in zip(poses, frames, strict=True)
+        for pose, frame in zip(state.poses, frames, strict=True)
         if len(frame.points.get(sensor, ()))
     ]
     # moving the world is moving the camera the other way
     motions = _motions(rig, sensor, seen, rules)
-    blur = rules.widest / 2 * min(feature_spacing(rig, poses, sensor), 1e6)
+    blur = rules.widest / 2 * min(feature_spacing(State(rig, state.poses), sensor), 1e6)
     worth = sum(agreement(rig, sensor, motions @ pose, y, blur) * len(y) for pose, y in seen)
     best = np.argsort(-np.asarray(worth), kind="stable")[:_TRIED]
     return np.asarray(T_mean @ motions[best])
@@ -133,8 +101,7 @@ def _motions(
     Three features near them, about equally far off in the image, are brought onto their lines of
     sight.  The first motion is none.
     """
-    eye: Any = rig.sensors[sensor]
-    places, lines, off, number = _near(rig, eye, seen, rules)
+    places, lines, off, number = _near(rig, sensor, seen, rules)
     none = np.eye(4)[None]
     if len(off) < 3:
         return none
@@ -142,18 +109,14 @@ def _motions(
     alike = cKDTree(off).query_ball_point(off, reach / 4)
     each = -(-_TRIPLES // len(off))
     rng = np.random.default_rng(0)
-    triples = np.concatenate(
-        [
-            np.column_stack([np.full(each, k), rng.choice(near, (each, 2))])
-            for k, near in enumerate(alike)
-        ]
-    ).T
+    drawn = np.concatenate([rng.choice(near, (each, 2)) for near in alike])
+    triples = np.column_stack([np.repeat(np.arange(len(off)), each), drawn]).T
     differ = [number[triples[i]] != number[triples[j]] for i, j in SIDES]
     triples = triples[:, np.all(differ, axis=0)]
     cosines = np.array([(lines[triples[i]] * lines[triples[j]]).sum(axis=1) for i, j in SIDES])
     apart = [places[triples[i]] - places[triples[j]] for i, j in SIDES]
     away, which = depths(cosines, np.array([(d * d).sum(axis=1) for d in apart]))
-    corners, centre = triples[:, which], centre_of(eye)
+    corners, centre = triples[:, which], centre_of(rig.sensors[sensor])
     on_lines = centre + lines[corners] * away[..., None]
     motions = align_triples(places[corners].swapaxes(1, 2), on_lines.swapaxes(1, 2))
     shift = np.linalg.norm(inverse(motions) @ np.append(centre, 1) - np.append(centre, 1), axis=1)
@@ -163,18 +126,18 @@ def _motions(
 
 
 def _near(
-    rig: Rig, eye: Any, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
-) -> tuple[Floats, Floats, Floats, Ints]:
+    rig: Rig, sensor: int, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
+) -> tuple[Floats, Floats, Floats, Indices]:
     """Features and detections that may be the same (n): place, line of sight, px between, which."""
+    eye: Any = rig.sensors[sensor]
     found = []
     for k, (pose, y) in enumerate(seen):
-        world = transform(pose, rig.points)
-        at, visible = eye.project(world)
-        visible = visible & facing(eye, pose[None], world[None], rig.normals)[0]
+        at, visible = (each[0] for each in rig.seen(sensor, pose[None]))
         rays = eye.rays(y)
         off = rays.pixels - at[:, None]
         reach = np.tan(np.radians(rules.turn_deg)) / rays.slope
         i, j = np.nonzero(visible[:, None] & (np.linalg.norm(off, axis=2) < reach))
+        world = transform(pose, rig.points)
         found.append((world[i], rays.directions[j], off[i, j], k * _MOST + j))
     places, lines, off, number = (np.concatenate(each) for each in zip(*found, strict=True))
     return places, lines, off, number

@@ -3,76 +3,46 @@
 The gradient of ⟨g, h⟩ at a blur σ is that of weighted least squares over all pairs of a detection d
 and a predicted feature p, with the weights exp(−|d − p|²/4σ²); ⟨h, h⟩ keeps features from taking
 the same detection, for which a pair's weight is shared out where several compete.
+
+Features are where the body is at the moment a sensor looks.  Between the frames' common times the
+pose is the cubic through the frames next to it, in the twists that lead there from the nearest one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.interpolation import Neighbours, interpolate
-from mixpose.calibration.rig import Rig
-from mixpose.records import Floats
-from mixpose.rigid import perturb, transform
-from mixpose.sensors import facing
+from mixpose.calibration.rig import Rig, State
+from mixpose.calibration.task import SeenFrame
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import perturb, twist_between
 
-Ints = NDArray[np.intp]
-
-
-@dataclass(frozen=True, eq=False)
-class Pairs:
-    """Pairs of detections and features of one sensor, over all frames.
-
-    Attributes
-    ----------
-    frame, feature, detection : (n,) int
-    y : (n, m) float64
-        Detected place.
-    share : (n,) float64
-        1 where nothing competes.
-    nearest : (n,) bool
-        Whether each of the two is the nearest that the other has.
-    """
-
-    frame: Ints
-    feature: Ints
-    detection: Ints
-    y: Floats
-    share: Floats
-    nearest: NDArray[np.bool_]
+_NODES = 4  # frames that motion is interpolated through
 
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """When sensors look.
+    """When sensors look, and the frames that a frame's motion is interpolated through."""
 
-    Attributes
-    ----------
-    near : Neighbours
-    late : (L, K) float64
-        Seconds from a frame's common time to a sensor's; 0 where not known.
-    since : (L, K) float64
-        Seconds from the middle of the recording.
-    """
+    nodes: Indices  # (K, 4): the frame itself first; where there are fewer, itself again
+    away: Floats  # (K, 4): seconds from the frame to each; NaN where there are fewer
+    late: Floats  # (L, K): seconds from a frame's common time to a sensor's; 0 where not known
+    since: Floats  # (L, K): seconds from the middle of the recording
 
-    near: Neighbours
-    late: Floats
-    since: Floats
-
-    def tau(self, rig: Rig, sensor: int, frame: Ints) -> Floats:
+    def tau(self, rig: Rig, sensor: int, frame: Indices) -> Floats:
         """Seconds from the common time of frames (n,) to when a sensor took them."""
         late = self.late[sensor, frame] + rig.delays[sensor]
         return np.asarray(late + rig.drifts[sensor] * self.since[sensor, frame])
 
 
-def clock_of(frames: Sequence[SeenFrame], near: Neighbours, sensors: int) -> Clock:
-    """When sensors say that they look."""
+def clock_of(frames: Sequence[SeenFrame], sensors: int, gap: float) -> Clock:
+    """When sensors say that they look; frames are neighbours within `gap` median intervals each."""
     late, since = np.zeros((sensors, len(frames))), np.zeros((sensors, len(frames)))
     times = [frame.time_s for frame in frames if frame.time_s is not None]
     middle = (min(times) + max(times)) / 2 if times else 0.0
@@ -81,64 +51,126 @@ def clock_of(frames: Sequence[SeenFrame], near: Neighbours, sensors: int) -> Clo
             if frame.time_s is not None:
                 late[sensor, k] = time - frame.time_s
                 since[sensor, k] = time - middle
-    return Clock(near, late, since)
+    return Clock(*_neighbours([frame.time_s for frame in frames], gap), late, since)
 
 
-def seen_poses(rig: Rig, poses: Floats, clock: Clock, sensor: int) -> Floats:
-    """Poses (K, 4, 4) at the moments when a sensor looks."""
-    frame = np.arange(len(poses))
-    tau = clock.tau(rig, sensor, frame)
-    if not tau.any():
-        return poses
-    return perturb(poses, interpolate(clock.near, poses, frame, tau).twist)
+def _neighbours(times: Sequence[float | None], gap: float) -> tuple[Indices, Floats]:
+    """Nodes and how far they are away, as of `Clock`."""
+    count = len(times)
+    index = np.repeat(np.arange(count)[:, None], _NODES, axis=1)
+    away = np.full((count, _NODES), np.nan)
+    away[:, 0] = 0.0
+    if count < 2 or any(t is None for t in times):
+        return index, away
+    stamps = np.array(times, dtype=np.float64)
+    order = np.argsort(stamps, kind="stable")
+    reach = gap * float(np.median(np.diff(stamps[order])))
+    for place, k in enumerate(order):
+        near = [p for p in range(place - 3, place + 4) if 0 <= p < count and p != place]
+        near = [p for p in near if 0 < abs(stamps[order[p]] - stamps[k]) <= reach * 1.5]
+        near.sort(key=lambda p: abs(stamps[order[p]] - stamps[k]))
+        for node, p in enumerate(near[: _NODES - 1], start=1):
+            index[k, node], away[k, node] = order[p], stamps[order[p]] - stamps[k]
+    return index, away
+
+
+class Interpolated(NamedTuple):
+    """Poses at offsets in time."""
+
+    twist: Floats  # (n, 6): from the frame's pose to that at the offset
+    rate: Floats  # (n, 6): twist per second there
+    shares: Floats  # (n, 4): by how much it follows each of the neighbours
+    known: Mask  # (n,): whether there are frames to interpolate between
+
+
+def interpolate(clock: Clock, poses: Floats, frame: Indices, tau: Floats) -> Interpolated:
+    """Twists from frames (n,), of poses (K, 4, 4), to the poses tau (n,) seconds later."""
+    nodes, away = clock.nodes[frame], clock.away[frame]
+    shares, slopes = _lagrange(away, tau)
+    T_here = np.repeat(poses[frame][:, None], _NODES, axis=1)
+    twists = twist_between(T_here, poses[nodes])
+    return Interpolated(
+        np.einsum("nj,njk->nk", shares, twists),
+        np.einsum("nj,njk->nk", slopes, twists),
+        shares,
+        np.isfinite(away[:, 1]),
+    )
+
+
+def _lagrange(away: Floats, tau: Floats) -> tuple[Floats, Floats]:
+    """Lagrange polynomials through nodes (n, 4) at tau (n,), and their slopes; 0 where NaN."""
+    there = np.isfinite(away)
+    x = np.where(there, away, 0.0)
+    shares, slopes = np.zeros(away.shape), np.zeros(away.shape)
+    for j in range(_NODES):
+        value, slope = np.ones(len(tau)), np.zeros(len(tau))
+        for i in range(_NODES):
+            if i == j:
+                continue
+            both = there[:, i] & there[:, j]
+            width = np.where(both, x[:, j] - x[:, i], 1.0)
+            factor = np.where(both, (tau - x[:, i]) / width, 1.0)
+            slope = slope * factor + np.where(both, value / width, 0.0)
+            value = value * factor
+        shares[:, j], slopes[:, j] = value * there[:, j], slope * there[:, j]
+    return shares, slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of detections and features of one sensor, over all frames."""
+
+    frame: Indices  # (n,)
+    feature: Indices  # (n,)
+    detection: Indices  # (n,)
+    y: Floats  # (n, m): detected place
+    share: Floats  # (n,): 1 where nothing competes
+    nearest: Mask  # (n,): whether each of the two is the nearest that the other has
 
 
 def match(
-    rig: Rig,
-    poses: Floats,
+    state: State,
     frames: Sequence[SeenFrame],
     clock: Clock,
     sensor: int,
     blur: float,
     faintest: float,
 ) -> Pairs:
-    """Pair detections and features of a sensor at a blur.
+    """Pair detections and features of a sensor at a blur, in sensor units.
 
-    Parameters
-    ----------
-    rig : Rig
-    poses : (K, 4, 4) array
-    frames : sequence of SeenFrame
-    clock : Clock
-    sensor : int
-    blur : float
-        In sensor units.
-    faintest : float
-        Weight below which a pair is left out.
+    Pairs whose weight is less than `faintest` are left out.
     """
-    at = seen_poses(rig, poses, clock, sensor)
-    eye = rig.sensors[sensor]
-    world = transform(at, rig.points)
-    y, visible = eye.project(world)
-    visible = visible & facing(eye, at, world, rig.normals)
     reach = 2 * blur * np.sqrt(-np.log(faintest))
-    parts: list[tuple[NDArray[Any], ...]] = []
-    for k, frame in enumerate(frames):
-        points = frame.points.get(sensor)
-        if points is None or not len(points) or not visible[k].any():
-            continue
-        features = np.flatnonzero(visible[k])
-        i, j, share, nearest = _near(y[k, features], points, blur, reach)
+    none = np.zeros(0, dtype=np.intp)
+    dimension = state.rig.sensors[sensor].dimension
+    parts: list[tuple[NDArray[np.generic], ...]] = [
+        (none, none, none, np.zeros((0, dimension)), np.zeros(0), none > 0)
+    ]
+    for k, features, y, points in _seen(state, frames, clock, sensor):
+        i, j, share, nearest = _near(y, points, blur, reach)
         parts.append((np.full(len(i), k), features[i], j, points[j], share, nearest))
-    if not parts:
-        none = np.zeros(0, dtype=np.intp)
-        return Pairs(none, none, none, np.zeros((0, eye.dimension)), np.zeros(0), none > 0)
     return Pairs(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _seen(
+    state: State, frames: Sequence[SeenFrame], clock: Clock, sensor: int
+) -> Iterator[tuple[int, Indices, Floats, Floats]]:
+    """Of frames in which a sensor sees something: features in view, where, and detections."""
+    poses, frame = state.poses, np.arange(len(state.poses))
+    tau = clock.tau(state.rig, sensor, frame)
+    if tau.any():
+        poses = perturb(poses, interpolate(clock, poses, frame, tau).twist)
+    y, visible = state.rig.seen(sensor, poses)
+    for k, each in enumerate(frames):
+        points = each.points.get(sensor)
+        if points is not None and len(points) and visible[k].any():
+            features = np.flatnonzero(visible[k])
+            yield k, features, y[k, features], points
 
 
 def _near(
     y: Floats, points: Floats, blur: float, reach: float
-) -> tuple[Ints, Ints, Floats, NDArray[np.bool_]]:
+) -> tuple[Indices, Indices, Floats, Mask]:
     """Pairs within reach: features, detections, shares, and whether they are nearest."""
     away = y[:, None, :] - points[None, :, :]
     squared = (away * away).sum(axis=2)
@@ -150,31 +182,18 @@ def _near(
 
 
 def nearest_distance(
-    rig: Rig, poses: Floats, frames: Sequence[SeenFrame], clock: Clock, sensor: int
+    state: State, frames: Sequence[SeenFrame], clock: Clock, sensor: int
 ) -> Floats:
     """Distance of every predicted feature in view to the nearest detection, all frames together."""
-    at = seen_poses(rig, poses, clock, sensor)
-    eye = rig.sensors[sensor]
-    world = transform(at, rig.points)
-    y, visible = eye.project(world)
-    visible = visible & facing(eye, at, world, rig.normals)
-    found = [np.zeros(0)]
-    for k, frame in enumerate(frames):
-        points = frame.points.get(sensor)
-        if points is not None and len(points) and visible[k].any():
-            found.append(cKDTree(points).query(y[k, visible[k]])[0])
-    return np.concatenate(found)
+    found = [cKDTree(points).query(y)[0] for _, _, y, points in _seen(state, frames, clock, sensor)]
+    return np.concatenate([np.zeros(0), *found])
 
 
-def feature_spacing(rig: Rig, poses: Floats, sensor: int) -> float:
+def feature_spacing(state: State, sensor: int) -> float:
     """Median distance of a feature to its neighbour in a sensor."""
-    eye = rig.sensors[sensor]
-    world = transform(poses, rig.points)
-    y, visible = eye.project(world)
-    visible = visible & facing(eye, poses, world, rig.normals)
     found = [
-        cKDTree(y[k, visible[k]]).query(y[k, visible[k]], k=2)[0][:, 1]
-        for k in range(len(poses))
-        if visible[k].sum() > 1
+        cKDTree(y[visible]).query(y[visible], k=2)[0][:, 1]
+        for y, visible in zip(*state.rig.seen(sensor, state.poses), strict=True)
+        if visible.sum() > 1
     ]
     return float(np.median(np.concatenate(found))) if found else np.inf

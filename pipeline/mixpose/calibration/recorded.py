@@ -1,36 +1,33 @@
-"""From a session and its recording to what a calibration takes."""
+"""From a session and its recording to the frames that are calibrated from."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 
 import numpy as np
 from scipy.signal import find_peaks
 
 from mixpose.body import Body
-from mixpose.calibration.choice import RUN, informative
-from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.task import Progress
+from mixpose.calibration.task import Progress, SeenFrame
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
 from mixpose.objective import View
-from mixpose.records import Floats, FrameSet, GridPattern, PointPattern
+from mixpose.records import Floats, FrameSet, GridPattern, Indices, PointPattern
 from mixpose.runner import as_sensors, observe, open_sources
 from mixpose.search import is_pointlike, peaks
 from mixpose.session import Session
 
 _HIGHEST = 0.3  # of a profile's highest peak: a lower one is noise
+_RUN = 8  # frames read together where motion between them counts
+_HELD_RUN = 4  # frames held back together likewise
+_FARTHEST = 2.5  # spreads from the middle: what lies beyond is as likely clutter
+_MEANS = 1e-3  # information before the first frame, of a descriptor's spread
 
 
 def require_points(body: Body) -> None:
-    """Refuse bodies whose detections are not points.
-
-    Raises
-    ------
-    SessionError
-    """
+    """Refuse, by a SessionError, bodies whose detections are not points."""
     if not is_pointlike(body):
         raise SessionError(
             "calibrate: object: found segments or spread features; allowed: points, which leave "
@@ -51,11 +48,8 @@ def read_frames(
 
     Parameters
     ----------
-    session : Session
     sources : mapping of str to str
         Recordings in place of the session's.
-    rules : CalibrationRules
-    progress : callable
     runs : bool
         Whether frames next to each other are needed, as motion between them counts.
     known : collection of int or None
@@ -74,8 +68,9 @@ def read_frames(
         )
     found: list[SeenFrame] = []
     index = {setup.name: k for k, setup in enumerate(session.sensors)}
-    total = min(_length(opened), rules.most_read)
-    for start, stop, step in _stretches(opened, rules, runs=runs):
+    length = max((source.length or 0 for source in opened.values()), default=0)
+    total = min(length, rules.most_read)
+    for start, stop, step in _stretches(opened, length, rules, runs=runs):
         with closing(pair(opened, start, stop, step)) as sets:
             for frame_set in sets:
                 progress("reading frames", len(found), total)
@@ -90,23 +85,18 @@ def read_frames(
     return informative(found, len(index), rules.most_candidates, runs=runs)
 
 
-def _length(opened: Mapping[str, Source]) -> int:
-    return max((source.length or 0 for source in opened.values()), default=0)
-
-
 def _stretches(
-    opened: Mapping[str, Source], rules: CalibrationRules, *, runs: bool
+    opened: Mapping[str, Source], length: int, rules: CalibrationRules, *, runs: bool
 ) -> list[tuple[int | None, int | None, int]]:
     """Which numbers are read: all, every n-th, or runs of neighbours spread evenly."""
-    length = _length(opened)
     if length <= rules.most_read:
         return [(None, None, 1)]
     if not runs:
         return [(None, None, -(-length // rules.most_read))]
     first = min((s.first for s in opened.values() if s.first is not None), default=0)
-    count = rules.most_read // RUN
-    starts = first + np.linspace(0, length - RUN, count).astype(int)
-    return [(int(start), int(start) + RUN, 1) for start in np.unique(starts)]
+    count = rules.most_read // _RUN
+    starts = first + np.linspace(0, length - _RUN, count).astype(int)
+    return [(int(start), int(start) + _RUN, 1) for start in np.unique(starts)]
 
 
 def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:
@@ -141,3 +131,78 @@ def _profile_peaks(pattern: GridPattern) -> Floats:
     shift = 0.5 * (after - before) / np.maximum(2 * here - before - after, 1e-12)
     places = pattern.origin[0] + pattern.step * (inner + np.clip(shift, -0.5, 0.5))
     return np.asarray(places[:, None])
+
+
+def held_back_with(count: int, rules: CalibrationRules, *, runs: bool) -> Indices:
+    """Which of `count` frames are held back together (count,): a fifth at a time; -1: never.
+
+    Every fifth frame, or every fifth run of four.
+    """
+    period = round(1 / rules.held_back)
+    if count - -(-count // period) < rules.least_frames:
+        return np.full(count, -1)
+    size = _HELD_RUN if runs and count >= _HELD_RUN * period else 1
+    return np.asarray((np.arange(count) // size) % period)
+
+
+def informative(
+    frames: Sequence[SeenFrame], sensors: int, most: int, *, runs: bool
+) -> tuple[SeenFrame, ...]:
+    """The frames, at most so many, that add most information, in their order.
+
+    Poses are not known yet.  What a frame tells goes by where, how large and how turned the body is
+    in each sensor's view, which its detections' means and second moments say; one after the other,
+    the frame is taken that adds most to the information on a model that is linear in these
+    (D-optimal design).  So a body that lies still for most of a recording is taken but a few times.
+    Where motion counts, frames are taken in runs of neighbours.
+    """
+    if len(frames) <= most:
+        return tuple(frames)
+    described = _described(frames, sensors)
+    size = _RUN if runs else 1
+    groups = np.array_split(np.arange(len(frames)), -(-len(frames) // size))
+    rows = np.array([described[group].mean(axis=0) for group in groups])
+    if runs:  # what moves tells of time
+        changes = np.array([described[group[-1]] - described[group[0]] for group in groups])
+        rows = np.column_stack([rows, changes])
+    rows = np.column_stack([np.ones(len(rows)), rows])
+    inverse = np.eye(rows.shape[1]) / _MEANS
+    left = np.ones(len(rows), dtype=np.bool_)
+    chosen: list[int] = []
+    while left.any() and len(chosen) + size <= most:
+        gains = np.einsum("ki,ij,kj->k", rows, inverse, rows, optimize=True)
+        best = int(np.argmax(np.where(left, gains, -1.0)))
+        left[best] = False
+        chosen += groups[best].tolist()
+        along = inverse @ rows[best]
+        inverse = inverse - np.outer(along, along) / (1 + gains[best])
+    return tuple(frames[k] for k in sorted(chosen))
+
+
+def _described(frames: Sequence[SeenFrame], sensors: int) -> Floats:
+    """Means and second moments of each sensor's detections (K, D), in their spreads; 0 for none."""
+    columns = []
+    for sensor in range(sensors):
+        seen = [k for k, frame in enumerate(frames) if len(frame.points.get(sensor, ()))]
+        if not seen:
+            continue
+        told = np.array([_moments(frames[k].points[sensor]) for k in seen])
+        middle = np.median(told, axis=0)
+        spread = np.median(np.abs(told - middle), axis=0) + 1e-3 * np.ptp(told, axis=0) + 1e-12
+        column = np.zeros((len(frames), told.shape[1] + 1))
+        column[seen, :-1] = np.clip((told - middle) / (1.5 * spread), -_FARTHEST, _FARTHEST)
+        column[seen, -1] = 1.0
+        columns.append(column)
+    return np.concatenate(columns, axis=1)
+
+
+def _moments(points: Floats) -> Floats:
+    """Mean and, for two coordinates, half the log spread, elongation and direction of points."""
+    middle = np.median(points, axis=0)
+    away = points - middle
+    second = (away.T @ away) / len(points)
+    size = float(np.trace(second)) + 1e-12
+    if points.shape[1] == 1:
+        return np.array([middle[0], np.log(size) / 2])
+    shape = np.array([second[0, 0] - second[1, 1], 2 * second[0, 1]]) / size
+    return np.array([*middle, np.log(size) / 2, *shape])

@@ -1,117 +1,240 @@
-"""What a calibration found."""
+"""What a calibration found, how closely it meets what was seen, and which sensor was bumped.
+
+A new calibration from the recording says by how much every sensor is off, relative to the others,
+and how sure that is.  Moving all sensors together is no matter: what counts is each sensor against
+the consensus of the rest.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.rig import Block, Rig
+from mixpose.body.symmetry import motions
+from mixpose.calibration.adjust import Adjusted
+from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
+from mixpose.calibration.rig import Block, Rig, State, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.records import Floats
+from mixpose.calibration.task import SeenFrame, Task
+from mixpose.records import Floats, Indices
+from mixpose.rigid import from_parts, inverse
+
+_MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
+_CLIMBS = 12
+_CLIMBED = 1e-6  # of the squared residuals: less gained, and poses are fitted
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Root mean square residuals of one sensor, sensor units; NaN without any.
+    """Root mean square residuals of one sensor, sensor units; NaN without any."""
 
-    Attributes
-    ----------
-    before, after : float
-        With the calibration before and after.
-    held : float
-        Of every frame, with the calibration that the others tell: that of new data.
-    """
-
-    before: float
+    before: float  # with the calibration before
     after: float
-    held: float
+    held: float  # of every frame, with the calibration that the others tell: that of new data
 
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """All that one sensor saw and met, for pictures and lists.
+    """All that one sensor saw and met, for pictures and lists."""
 
-    Attributes
-    ----------
-    y : (n, m) float64
-        Detections that were met.
-    offset : (n, m) float64
-        Detected minus predicted, after.
-    frame : (n,) int
-        Frame numbers.
-    feature : (n,) int
-    """
-
-    y: Floats
-    offset: Floats
-    frame: NDArray[np.intp]
-    feature: NDArray[np.intp]
+    y: Floats  # (n, m): detections that were met
+    offset: Floats  # (n, m): detected minus predicted, after
+    frame: Indices  # (n,): frame numbers
+    feature: Indices  # (n,)
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration with all that tells whether to trust it.
-
-    Attributes
-    ----------
-    before, after : Rig
-    blocks : tuple of Block
-    deviations : (G,) float64
-        One standard deviation of each free parameter; infinite where not determined.
-    covariance : (G, G) float64
-    refused : tuple of str
-        Directions that the data do not determine; they stay as they were.
-    gauge : tuple of str
-        Freedoms of the rig that were removed.
-    through : mapping of int to (int or None, int)
-    unlinked : tuple of int
-    used, bad : tuple of int
-        Frame numbers: calibrated from; left out as bad.
-    recorded : int
-        Frames of the recording with detections.
-    residuals : mapping of int to Residual
-    noise : (L,) float64
-    inflation : float
-    certainty : float
-        Share of the weight of pairs of which each is the nearest that the other has: near 1, or
-        detections cannot be told apart.
-    moved_by_biases : (G,) float64
-        Standard deviations that biases of ranges as large as σ_ε would add, where they are held and
-        nothing is stated of them.
-    explained : (L,) float64
-        Share of what each sensor could show that is met, weighted as in the objective; NaN without.
-    sights : mapping of int to Sights
-    poses : mapping of int to (4, 4) float64
-        By frame number.
-    frames : tuple of SeenFrame
-    """
+    """A calibration with all that tells whether to trust it."""
 
     before: Rig
     after: Rig
     blocks: tuple[Block, ...]
-    deviations: Floats
-    covariance: Floats
-    refused: tuple[str, ...]
-    gauge: tuple[str, ...]
-    through: Mapping[int, tuple[int | None, int]]
+    deviations: Floats  # (G,): of the free parameters; infinite where not determined
+    covariance: Floats  # (G, G)
+    refused: tuple[str, ...]  # directions that the data do not determine; they stay as they were
+    gauge: tuple[str, ...]  # freedoms of the rig that were removed
+    through: Mapping[int, tuple[int | None, int]]  # as of `Start`
     unlinked: tuple[int, ...]
-    used: tuple[int, ...]
-    bad: tuple[int, ...]
-    recorded: int
+    used: tuple[int, ...]  # numbers of the frames that are calibrated from
+    bad: tuple[int, ...]  # and of those left out
+    recorded: int  # frames of the recording with detections
     residuals: Mapping[int, Residual]
-    noise: Floats
+    noise: Floats  # (L,)
     inflation: float
+    # share of the weight of pairs of which each is the nearest that the other has: near 1, or
+    # detections cannot be told apart
     certainty: float
+    # (G,): standard deviations that biases of ranges as large as σ_ε would add, where they are held
+    # and nothing is stated of them
     moved_by_biases: Floats
+    # (L,): share of what each sensor could show that is met, weighted as in the objective; NaN
+    # without
     explained: Floats
     sights: Mapping[int, Sights]
-    poses: Mapping[int, Floats]
-    frames: tuple[SeenFrame, ...]
+    poses: Mapping[int, Floats]  # (4, 4), by frame number
 
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
         """Sensors that most likely stand elsewhere: what they saw is not explained."""
         return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))
+
+
+def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floats]:
+    """Squared residuals (n,) of each sensor's pairs under a rig; NaN of pairs that are not met.
+
+    Poses are fitted to the rig by least squares first, in a bundle without parameters of the rig,
+    so that all rigs are held to the same.
+    """
+    state = State(rig, adjusted.state.poses)
+
+    def seen() -> list[Weighted]:
+        found = []
+        for s, (before, weight) in enumerate(adjusted.weighted):
+            rows = rows_of(bundle, state, s, before.pairs)
+            found.append((rows, (weight > _MET) * rows.known / adjusted.noise[s] ** 2))
+        return found
+
+    rows, spent = seen(), np.inf
+    for _ in range(_CLIMBS if bundle.pose_free.any() else 0):
+        before, spent = spent, sum(float(w @ (e.residual**2).sum(axis=1)) for e, w in rows)
+        if before - spent < _CLIMBED * spent:
+            break
+        state = stepped(bundle, state, solved(bundle, state, rows, 1e-6))
+        rows = seen()
+    return [np.where(w > 0, (e.residual**2).sum(axis=1), np.nan) for e, w in rows]
+
+
+def rms(squared: Sequence[Floats]) -> float:
+    """Root mean square of what is not NaN; NaN of nothing."""
+    flat = np.concatenate([np.zeros(0), *squared])
+    known = np.isfinite(flat)
+    return float(np.sqrt(flat[known].mean())) if known.any() else float("nan")
+
+
+def _could_show(frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Features (K, L) that each sensor could show."""
+    most, sensors = len(task.rig.points), range(len(task.rig.sensors))
+    return np.array([[min(len(f.points.get(s, ())), most) for s in sensors] for f in frames])
+
+
+def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Share (K,) of the features that frames could show which were met, all sensors together."""
+    met = sum(
+        np.bincount(rows.pairs.frame, weight > _MET, len(frames))
+        for rows, weight in adjusted.weighted
+    )
+    return np.asarray(met / np.maximum(_could_show(frames, task).sum(axis=1), 1))
+
+
+def explained_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Share (L,) of what each sensor could show that is met, by the objective; NaN without any."""
+    could = _could_show(frames, task).sum(axis=0)
+    met = np.array([weight.sum() for _, weight in adjusted.weighted])
+    return np.asarray(np.where(could > 0, met / np.maximum(could, 1), np.nan))
+
+
+def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
+    """What each sensor saw and met."""
+    found = {}
+    for s, (rows, weight) in enumerate(adjusted.weighted):
+        pairs, kept = rows.pairs, weight > _MET
+        named = np.array(numbers, dtype=np.intp)[pairs.frame[kept]]
+        found[s] = Sights(pairs.y[kept], rows.residual[kept], named, pairs.feature[kept])
+    return found
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """How far one sensor is from where the old calibration has it."""
+
+    name: str
+    turn_deg: float  # against the consensus of the sensors, like the shift
+    shift: float
+    turn_deviation_deg: float
+    shift_deviation: float
+    residual_before: float  # sensor units
+    residual_after: float  # of frames that are held back where there are enough
+    moved: bool
+
+
+def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displacement, ...]:
+    """Compare a calibration with the one it began from."""
+    G = _consensus(found.before, found.after)
+    deviations = _deviations(found)
+    told = []
+    for index, name in enumerate(found.after.names):
+        turn, shift = _apart(found.before, found.after, index, G)
+        sd_turn, sd_shift = deviations[index]
+        each = found.residuals[index]
+        before, after = each.before, each.held if np.isfinite(each.held) else each.after
+        worse = bool(np.isfinite(before) and before > rules.worse * max(after, 1e-12))
+        far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
+        told.append(
+            Displacement(name, turn, shift, sd_turn, sd_shift, before, after, worse and far)
+        )
+    return tuple(told)
+
+
+def _poses(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
+    """T_sensor_world of a sensor before and after; None of a range sensor."""
+    old, new = (getattr(rig.sensors[index], "T_sensor_world", None) for rig in (before, after))
+    return None if old is None or new is None else (old, new)
+
+
+def _consensus(before: Rig, after: Rig) -> Floats:
+    """The motion of the world (4, 4) after which most sensors stand where they stood.
+
+    That of the sensor from which the others differ least: the bumped ones are outvoted.
+    """
+    count = len(before.names)
+    poses = [_poses(before, after, k) for k in range(count)]
+    told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
+    if len(told) < 3:  # of two, none is outvoted: the first is believed
+        return told[0] if told else _from_places(before, after)
+    worth = []
+    for G in told:
+        apart = [_apart(before, after, k, G) for k in range(count)]
+        worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
+    return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
+
+
+def _from_places(before: Rig, after: Rig) -> Floats:
+    """The best motion between range sensors."""
+    a = np.array([centre_of(s) for s in after.sensors])
+    b = np.array([centre_of(s) for s in before.sensors])
+    if len(a) < 3:
+        return from_parts(np.eye(3), (b - a).mean(axis=0))
+    return motions(a, b[None])[0]  # type: ignore[no-any-return]
+
+
+def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
+    """Turn in degrees and shift of a sensor, the new world moved into the old one by G."""
+    poses = _poses(before, after, index)
+    if poses is None:
+        place = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
+        return 0.0, float(np.linalg.norm(place - centre_of(before.sensors[index])))
+    old, moved = poses[0], poses[1] @ inverse(G)
+    turn = Rotation.from_matrix(moved[:3, :3] @ old[:3, :3].T).magnitude()
+    shift = np.linalg.norm(inverse(moved)[:3, 3] - inverse(old)[:3, 3])
+    return float(np.degrees(turn)), float(shift)
+
+
+def _deviations(found: Calibration) -> list[tuple[float, float]]:
+    """Standard deviations of turn in degrees and shift of each sensor; those held have the least.
+
+    A sensor that is held is as uncertain against the others as they are against it.
+    """
+    own: dict[int, tuple[float, float]] = {}
+    for block in found.blocks:
+        if block.kind in ("pose", "position") and block.sensor is not None:
+            part = found.deviations[block.place]
+            turn = float(np.degrees(np.sqrt((part[3:] ** 2).sum()))) if len(part) > 3 else 0.0
+            own[block.sensor] = (turn, float(np.sqrt((part[:3] ** 2).sum())))
+    least = (
+        min((t for t, _ in own.values()), default=np.inf),
+        min((s for _, s in own.values()), default=np.inf),
+    )
+    return [own.get(index, least) for index in range(len(found.after.names))]

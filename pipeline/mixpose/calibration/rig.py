@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 from mixpose.objective.projection import pose_jacobian
-from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse
-from mixpose.sensors import CloudSensor, RangeSensor, Sensor
+from mixpose.records import Floats, Mask
+from mixpose.rigid import from_parts, inverse, transform
+from mixpose.sensors import CloudSensor, FisheyeCamera, RangeSensor, Sensor, facing
 
 Kind: TypeAlias = Literal[
     "pose",
@@ -26,16 +26,7 @@ Kind: TypeAlias = Literal[
     "drift",
     "body",
 ]
-KINDS: tuple[Kind, ...] = (
-    "pose",
-    "position",
-    "focal",
-    "principal_point",
-    "distortion",
-    "range_bias",
-    "delay",
-    "drift",
-)
+KINDS: tuple[Kind, ...] = get_args(Kind)[:-1]  # of sensors
 
 _LENS = ("k1", "k2", "p1", "p2", "k3")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
@@ -43,30 +34,15 @@ _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Sensors and body as they are believed to be.
-
-    Attributes
-    ----------
-    names : tuple of str
-    sensors : tuple of Sensor
-    points : (N, 3) float64
-        Features of the body, in its frame.
-    normals : (N, 3) float64 or None
-    delays : (L,) float64
-        Seconds by which a sensor's frames are taken later than their times say.
-    drifts : (L,) float64
-        Seconds per second by which that grows.
-    labels : tuple of str
-        What the features are called in messages.
-    """
+    """Sensors and body as they are believed to be."""
 
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
-    points: Floats
-    normals: Floats | None
-    delays: Floats
-    drifts: Floats
-    labels: tuple[str, ...]
+    points: Floats  # (N, 3): features of the body, in its frame
+    normals: Floats | None  # (N, 3)
+    delays: Floats  # (L,): seconds by which a sensor's frames are taken later than their times say
+    drifts: Floats  # (L,): seconds per second by which that grows
+    labels: tuple[str, ...]  # what the features are called in messages
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:
@@ -85,29 +61,30 @@ class Rig:
         sensors[index] = sensor
         return replace(self, sensors=tuple(sensors))
 
+    def seen(self, sensor: int, poses: Floats) -> tuple[Floats, Mask]:
+        """Where a sensor sees the features (K, N, m) at poses (K, 4, 4), and which are in view."""
+        eye, world = self.sensors[sensor], transform(poses, self.points)
+        y, visible = eye.project(world)
+        return y, visible & facing(eye, poses, world, self.normals)
+
+
+class State(NamedTuple):
+    """All that a calibration seeks."""
+
+    rig: Rig
+    poses: Floats  # (K, 4, 4): of the body, in each frame
+
 
 @dataclass(frozen=True)
 class Block:
-    """Parameters of one kind, of one sensor or of the body.
-
-    Attributes
-    ----------
-    kind : str
-    sensor : int or None
-        None for the body.
-    start : int
-        Of the block among all parameters.
-    names : tuple of str
-    units : tuple of {"length", "rad", "px", "s", ""}
-    scales : tuple of float
-        Size of what is sought, in `units`: by it a standard deviation is large or small.
-    """
+    """Parameters of one kind, of one sensor or of the body."""
 
     kind: Kind
-    sensor: int | None
-    start: int
+    sensor: int | None  # None for the body
+    start: int  # of the block among all parameters
     names: tuple[str, ...]
-    units: tuple[str, ...]
+    units: tuple[str, ...]  # of "length", "rad", "px", "s" and ""
+    # size of what is sought, in `units`: by it a standard deviation is large or small
     scales: tuple[float, ...]
 
     @property
@@ -137,35 +114,19 @@ def kinds_of(sensor: Sensor) -> tuple[Kind, ...]:
 
 
 def blocks_of(
-    rig: Rig,
-    free: Mapping[int, Sequence[Kind]],
-    *,
-    body: bool,
-    length: float,
-    interval: float,
+    rig: Rig, free: Mapping[int, Sequence[Kind]], *, body: bool, length: float, interval: float
 ) -> tuple[Block, ...]:
     """Lay out the free parameters, one after the other.
 
-    Parameters
-    ----------
-    rig : Rig
-    free : mapping of int to sequence of kinds
-        By sensor.
-    body : bool
-        Whether the features of the body are free.
-    length : float
-        Size of the rig.
-    interval : float
-        Seconds from frame to frame.
+    Their sizes go by that of the rig, `length`, and the seconds from frame to frame, `interval`.
     """
     blocks: list[Block] = []
+    wanted = [(s, kind) for s in sorted(free) for kind in KINDS if kind in free[s]]
     start = 0
-    for index in sorted(free):
-        for kind in KINDS:
-            if kind in free[index]:
-                block = _block(rig.sensors[index], kind, index, start, length, interval)
-                blocks.append(block)
-                start += len(block.names)
+    for index, kind in wanted:
+        names, units, scales = _laid_out(rig.sensors[index], kind, length, interval)
+        blocks.append(Block(kind, index, start, names, units, scales))
+        start += len(names)
     if body:
         names = tuple(f"{label}.{axis}" for label in rig.labels for axis in "xyz")
         radius = float(np.linalg.norm(rig.points - rig.points.mean(axis=0), axis=1).max())
@@ -174,43 +135,37 @@ def blocks_of(
     return tuple(blocks)
 
 
-def _block(
-    sensor: Any, kind: Kind, index: int, start: int, length: float, interval: float
-) -> Block:
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    scales: tuple[float, ...]
+def _laid_out(
+    sensor: Any, kind: Kind, length: float, interval: float
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
+    """Names, units and scales of a sensor's parameters of one kind."""
+    if kind == "pose":
+        units = ("length",) * 3 + ("rad",) * 3
+        return ("x", "y", "z", "rx", "ry", "rz"), units, (length,) * 3 + (1.0,) * 3
+    names: tuple[str, ...] = (kind,)
+    unit, scale = "", 1.0
     match kind:
-        case "pose":
-            names = ("x", "y", "z", "rx", "ry", "rz")
-            units = ("length",) * 3 + ("rad",) * 3
-            scales = (length,) * 3 + (1.0,) * 3
         case "position":
-            names, units, scales = ("x", "y", "z"), ("length",) * 3, (length,) * 3
+            names, unit, scale = ("x", "y", "z"), "length", length
         case "focal":
             K = sensor.camera_matrix
             names = ("f",) if np.isclose(K[0, 0], K[1, 1], rtol=1e-9) else ("fx", "fy")
-            units, scales = ("px",) * len(names), (float(K[0, 0]),) * len(names)
+            unit, scale = "px", float(K[0, 0])
         case "principal_point":
-            size = 1000.0 if sensor.resolution is None else float(max(sensor.resolution)) / 2
-            names, units, scales = ("cx", "cy"), ("px",) * 2, (size,) * 2
+            names, unit = ("cx", "cy"), "px"
+            scale = 1000.0 if sensor.resolution is None else float(max(sensor.resolution)) / 2
         case "distortion":
-            names = _lens_names(sensor)
-            units, scales = ("",) * len(names), (1.0,) * len(names)
+            # of rational and tilted models the first five are sought
+            most = max(4, min(5, len(sensor.distortion)))
+            is_fisheye = isinstance(sensor, FisheyeCamera)
+            names = _FISHEYE_LENS if is_fisheye else _LENS[:most]
         case "range_bias":
-            names, units, scales = ("bias",), ("length",), (length,)
+            names, unit, scale = ("bias",), "length", length
         case "delay":
-            names, units, scales = ("delay",), ("s",), (interval,)
+            unit, scale = "s", interval
         case _:
-            names, units, scales = ("drift",), ("",), (1e-2,)
-    return Block(kind, index, start, names, units, scales)
-
-
-def _lens_names(sensor: Any) -> tuple[str, ...]:
-    """Coefficients that are sought: of rational and tilted models the first five."""
-    if type(sensor).__name__ == "FisheyeCamera":
-        return _FISHEYE_LENS
-    return _LENS[: max(4, min(5, len(sensor.distortion)))]
+            scale = 1e-2
+    return names, (unit,) * len(names), (scale,) * len(names)
 
 
 def moved(rig: Rig, blocks: Sequence[Block], step: Floats) -> Rig:
@@ -228,35 +183,48 @@ def moved(rig: Rig, blocks: Sequence[Block], step: Floats) -> Rig:
             late = block.kind == "delay"
             rig = replace(rig, delays=values) if late else replace(rig, drifts=values)
         else:
-            sensor = changed(rig.sensors[block.sensor], block.kind, delta)
+            sensor = _changed(rig.sensors[block.sensor], block.kind, delta)
             rig = rig.exchanged(block.sensor, sensor)
     return rig
 
 
-def changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
+def values_of(rig: Rig, block: Block) -> Floats:
+    """Values of a sensor's parameters, other than a pose."""
+    assert block.sensor is not None, "features of the body are in rig.points"
+    if block.kind in ("delay", "drift"):
+        return (rig.delays if block.kind == "delay" else rig.drifts)[[block.sensor]]
+    return _values(rig.sensors[block.sensor], block.kind)[: len(block.names)]
+
+
+def _values(sensor: Any, kind: Kind) -> Floats:
+    """Values of all parameters of one kind, of a lens four or more."""
+    if kind == "focal":
+        return sensor.camera_matrix.diagonal()[:2]  # type: ignore[no-any-return]
+    if kind == "principal_point" and hasattr(sensor, "camera_matrix"):
+        return sensor.camera_matrix[:2, 2]  # type: ignore[no-any-return]
+    if kind == "distortion":
+        return np.pad(sensor.distortion, (0, max(4 - len(sensor.distortion), 0)))
+    return np.atleast_1d(getattr(sensor, kind)).astype(np.float64)
+
+
+def _changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
     """A sensor after a step of its parameters of one kind."""
     if kind == "pose":
         turn = Rotation.from_rotvec(delta[3:]).as_matrix()
         T = from_parts(turn, delta[:3]) @ sensor.T_sensor_world
         return replace(sensor, T_sensor_world=T)
-    if kind == "position":
-        return replace(sensor, position=sensor.position + delta)
-    if kind == "range_bias":
-        return replace(sensor, range_bias=sensor.range_bias + float(delta[0]))
-    if kind == "distortion":
-        lens = np.zeros(max(len(sensor.distortion), 4))
-        lens[: len(sensor.distortion)] = sensor.distortion
-        lens[: len(delta)] += delta
-        return replace(sensor, distortion=lens)
-    if kind == "principal_point" and not hasattr(sensor, "camera_matrix"):
-        return replace(sensor, principal_point=sensor.principal_point + delta)
-    K = sensor.camera_matrix.copy()
-    if kind == "focal":
-        K[0, 0] += delta[0]
-        K[1, 1] += delta[-1]
+    values = _values(sensor, kind).copy()
+    if kind == "focal":  # one number may stand for both
+        values += delta
     else:
-        K[:2, 2] += delta
-    return replace(sensor, camera_matrix=K)
+        values[: len(delta)] += delta
+    if kind == "range_bias":
+        return replace(sensor, range_bias=float(values[0]))
+    if kind == "focal" or (kind == "principal_point" and hasattr(sensor, "camera_matrix")):
+        K = sensor.camera_matrix.copy()
+        K[[0, 1], [0, 1] if kind == "focal" else [2, 2]] = values
+        return replace(sensor, camera_matrix=K)
+    return replace(sensor, **{kind: values})
 
 
 _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}
@@ -265,30 +233,20 @@ _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}
 def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
     """Jacobian (n, m, k) of what a sensor sees of points (n, 3) by its own parameters.
 
-    Parameters
-    ----------
-    sensor : Sensor
-    kind : str
-    world : (n, 3) array
-    by_world : (n, m, 3) array
-        Jacobian by the points.
+    `by_world` is that by the points (n, m, 3).
     """
     if kind == "pose":
         T = sensor.T_sensor_world
-        by_sensor = by_world @ T[:3, :3].T
-        x = world @ T[:3, :3].T + T[:3, 3]
-        return pose_jacobian(by_sensor, x)
+        return pose_jacobian(by_world @ T[:3, :3].T, transform(T, world))
     if kind == "position":
         return -by_world
     if kind == "range_bias":
         return np.ones((len(world), 1, 1))
-    count = len(_block(sensor, kind, 0, 0, 1.0, 1.0).names)
+    count = len(_laid_out(sensor, kind, 1.0, 1.0)[0])
     unbounded = replace(sensor, resolution=None)
     J = np.empty((len(world), 2, count))
-    for k in range(count):
-        delta = np.zeros(count)
-        delta[k] = _STEPS[kind]
-        high, _ = changed(unbounded, kind, delta).project(world)
-        low, _ = changed(unbounded, kind, -delta).project(world)
+    for k, step in enumerate(_STEPS[kind] * np.eye(count)):
+        high, _ = _changed(unbounded, kind, step).project(world)
+        low, _ = _changed(unbounded, kind, -step).project(world)
         J[:, :, k] = (high - low) / (2 * _STEPS[kind])
     return J

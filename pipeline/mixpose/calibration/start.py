@@ -1,171 +1,288 @@
-"""The start of a calibration: which sensors are linked, and where the body is in each frame."""
+"""The start of a calibration: which sensors are linked, and where the body is in each frame.
+
+Where sensors stand to each other is told by where each of them sees the body.  Every frame that two
+sensors see gives votes for their relative pose, one for each combination of their hypotheses and of
+the body's symmetries; only the right ones agree over frames.  Sensors are then linked along the
+pairs with most frames in agreement.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mixpose.calibration.alone import Hypotheses, hypotheses
-from mixpose.calibration.biases import biased
-from mixpose.calibration.frames import SeenFrame
-from mixpose.calibration.jointly import joint_poses
-from mixpose.calibration.linking import Link, agreed, link_all
-from mixpose.calibration.rig import Rig
+from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.starting import start_poses
-from mixpose.calibration.task import Known, Progress, Task
-from mixpose.records import Floats
-from mixpose.rigid import inverse
+from mixpose.calibration.searching import joint_poses
+from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.sensors import RangeSensor
 
 _LINK_BLUR = 6.0  # σ_ε by which a linked sensor may be off before all are adjusted together
+_BIAS_STEPS = 4  # of the search for a bias in a σ_ε
+_FARTHEST = 0.5  # of the median distance: no bias is larger
+
+_Seen: TypeAlias = Sequence[Mapping[int, Hypotheses]]
+"""By frame, then by sensor; only those that have a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a calibration begins.
+    """Where a calibration begins."""
 
-    Attributes
-    ----------
-    rig : Rig
-    frames : tuple of SeenFrame
-        Those with a pose.
-    poses : (K, 4, 4) float64
-    through : mapping of int to (int or None, int)
-        Through which sensor each was linked (None: through known poses), and frames that agree.
-    unlinked : tuple of int
-        Sensors that share no view with the others.
-    """
-
-    rig: Rig
-    frames: tuple[SeenFrame, ...]
-    poses: Floats
+    state: State
+    frames: tuple[SeenFrame, ...]  # those with a pose
+    # through which sensor each was linked (None: through known poses), and frames that agree
     through: Mapping[int, tuple[int | None, int]]
-    unlinked: tuple[int, ...]
-
-
-def searched(
-    task: Task,
-    rules: CalibrationRules,
-    progress: Progress,
-    found: dict[tuple[int, int], Hypotheses],
-) -> Known:
-    """Hypotheses of every camera for every frame; those in `found` are not made again."""
-    wanted = [
-        (frame, sensor)
-        for frame in task.frames
-        for sensor in task.cameras
-        if sensor in frame.points
-    ]
-    for done, (frame, sensor) in enumerate(wanted):
-        progress("searching the body in each camera alone", done, len(wanted))
-        if (frame.number, sensor) not in found:
-            found[frame.number, sensor] = hypotheses(
-                task.rig.names[sensor],
-                task.rig.sensors[sensor],
-                frame.points[sensor],
-                float(task.sigmas[sensor]),
-                task.body,
-                rules,
-            )
-    return found
+    unlinked: tuple[int, ...]  # sensors that share no view with the others
 
 
 def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Start:
     """Link cameras by what each sees alone, and choose a pose for every frame."""
-    seen = [
-        {s: known[f.number, s] for s in task.cameras if (f.number, s) in known} for f in task.frames
-    ]
+    seen: list[dict[int, Hypotheses]] = [{} for _ in task.frames]
+    for frame, each in zip(task.frames, seen, strict=True):
+        for s in task.cameras:
+            if len(known.get((frame.number, s), NOTHING).poses):
+                each[s] = known[frame.number, s]
     if task.known is not None:
-        return _from_known_poses(task, seen, rules)
+        return _from_known_poses(task, task.known, seen, rules)
     rig = task.rig
     movable = [s for s in task.cameras if "pose" in task.free.get(s, ())]
-    placed = {s: rig.sensors[s].T_sensor_world for s in task.cameras if s not in movable}  # type: ignore[attr-defined]
-    expected = {s: rig.sensors[s].T_sensor_world for s in task.cameras}  # type: ignore[attr-defined]
+    placed = [s for s in task.cameras if s not in movable]
     if not placed:  # all are free: one stays, and the rig is moved back in the end
-        first = next(
-            (s for s in movable if any(len(e[s].poses) for e in seen if s in e)), movable[0]
-        )
-        placed = {first: expected[first]}
-    T, through = link_all(seen, placed, movable, expected, task.body.symmetries, rules)
+        placed = [next((s for s in movable if any(s in each for each in seen)), movable[0])]
+    T, through = _link_all(task, seen, placed, movable, rules)
     for sensor in through:
         rig = rig.placed(sensor, T[sensor])
-    linked = sorted(T)
-    poses, worth = start_poses(rig, task.frames, seen, linked, _LINK_BLUR * task.sigmas)
+    poses, worth = _likeliest_poses(rig, task, seen, sorted(T))
     kept = np.flatnonzero(worth > 0)
-    unlinked = tuple(s for s in task.cameras if s not in T)
+    unlinked = [s for s in task.cameras if s not in T]
     if len(placed) > 1:  # those that stay and see nothing with the others are no matter
-        unlinked = tuple(s for s in unlinked if s in movable)
-    return Start(
-        rig,
-        tuple(without(task.frames[k], unlinked) for k in kept),
-        poses[kept],
-        {s: (a, n) for s, (a, n) in through.items()},
-        unlinked,
-    )
+        unlinked = [s for s in unlinked if s in movable]
+    frames = tuple(task.frames[k].without(unlinked) for k in kept)
+    return Start(State(rig, poses[kept]), frames, {**through}, tuple(unlinked))
+
+
+def _from_known_poses(
+    task: Task, known: Mapping[int, Floats], seen: _Seen, rules: CalibrationRules
+) -> Start:
+    """Place each camera by itself, as poses are known."""
+    rig, through = task.rig, dict[int, tuple[int | None, int]]()
+    kept = [k for k, frame in enumerate(task.frames) if frame.number in known]
+    poses = np.array([known[task.frames[k].number] for k in kept]).reshape(-1, 4, 4)
+    unlinked = []
+    for sensor in task.cameras:
+        if "pose" not in task.free.get(sensor, ()):
+            continue
+        told = []
+        for k, T_world_object in zip(kept, poses, strict=True):
+            if sensor in seen[k]:
+                own = seen[k][sensor].poses
+                motions = own[:, None] @ task.body.symmetries[None] @ inverse(T_world_object)
+                told.append(_Votes(motions, float(np.linalg.norm(own[0][:3, 3]))))
+        link = _agreed(told, _pose_of(task, sensor), rules)
+        if link is None or link.frames < 1:
+            unlinked.append(sensor)
+            continue
+        rig = rig.placed(sensor, link.T_a_b)
+        through[sensor] = (None, link.frames)
+    frames = tuple(task.frames[k].without(unlinked) for k in kept)
+    return Start(State(rig, poses), frames, through, tuple(unlinked))
 
 
 def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
     """Poses that all sensors together know, or that are known anyway."""
     if task.known is None:
         for frames, poses in joint_poses(task, rules, progress):
-            yield Start(task.rig, frames, poses, {}, ())
+            yield Start(State(task.rig, poses), frames, {}, ())
         return
     frames = tuple(frame for frame in task.frames if frame.number in task.known)
     poses = np.array([task.known[frame.number] for frame in frames]).reshape(-1, 4, 4)
-    yield Start(biased(task, frames, poses), frames, poses, {}, ())
+    yield Start(State(_biased(task, frames, poses), poses), frames, {}, ())
 
 
-def without(frame: SeenFrame, sensors: Collection[int]) -> SeenFrame:
-    """A frame without what some sensors saw."""
-    points = {s: y for s, y in frame.points.items() if s not in sensors}
-    return replace(frame, points=points)
+def _likeliest_poses(
+    rig: Rig, task: Task, seen: _Seen, linked: Sequence[int]
+) -> tuple[Floats, Floats]:
+    """The pose of each frame (K, 4, 4) that most detections of all linked sensors agree with.
 
-
-def _from_known_poses(
-    task: Task, seen: list[dict[int, Hypotheses]], rules: CalibrationRules
-) -> Start:
-    """Place each camera by itself, as poses are known."""
-    assert task.known is not None
-    rig, through = task.rig, {}
-    kept = [k for k, frame in enumerate(task.frames) if frame.number in task.known]
-    poses = np.array([task.known[task.frames[k].number] for k in kept]).reshape(-1, 4, 4)
-    unlinked = []
-    for sensor in task.cameras:
-        if "pose" not in task.free.get(sensor, ()):
+    And the mean share (K,) of features in view that are met.  Where no sensor knew a pose these are
+    the identity and -1.
+    """
+    frames = task.frames
+    poses, worth = np.tile(np.eye(4), (len(frames), 1, 1)), np.full(len(frames), -1.0)
+    for k, (frame, each) in enumerate(zip(frames, seen, strict=True)):
+        starts = [
+            inverse(rig.sensors[a].T_sensor_world) @ each[a].poses  # type: ignore[attr-defined]
+            for a in linked
+            if a in each
+        ]
+        if not starts:
             continue
-        link = _vote(task, seen, kept, poses, sensor, rules)
-        if link is None or link.frames < 1:
-            unlinked.append(sensor)
-            continue
-        rig = rig.placed(sensor, link.T_a_b)
-        through[sensor] = (None, link.frames)
-    gone = tuple(unlinked)
-    frames = tuple(without(task.frames[k], gone) for k in kept)
-    return Start(rig, frames, poses, through, gone)
+        at = np.concatenate(starts)
+        points = {a: frame.points[a] for a in linked if a in frame.points}
+        met = np.zeros(len(at))
+        for a, y in points.items():
+            met += agreement(rig, a, at, y, _LINK_BLUR * task.sigmas[a])
+        best = int(np.argmax(met))
+        seeing = sum(len(y) > 0 for y in points.values())
+        poses[k], worth[k] = at[best], met[best] / max(seeing, 1)
+    return poses, worth
 
 
-def _vote(
-    task: Task,
-    seen: list[dict[int, Hypotheses]],
-    kept: list[int],
-    poses: Floats,
-    sensor: int,
-    rules: CalibrationRules,
-) -> Link | None:
-    votes, frame, away = [], [], []
-    for k, T_world_object in zip(kept, poses, strict=True):
-        each = seen[k].get(sensor)
-        if each is None or not len(each.poses):
+def agreement(rig: Rig, sensor: int, poses: Floats, points: Floats, blur: float) -> Floats:
+    """Share (H,) of features in view, or of detections if fewer, that are met at poses."""
+    if not len(points):
+        return np.zeros(len(poses))
+    y, visible = rig.seen(sensor, poses)
+    squared = ((y[:, :, None] - points) ** 2).sum(axis=3)
+    kernel = np.exp(-squared / (4 * blur * blur)) * visible[:, :, None]
+    # a detection counts once, a feature too
+    score = np.minimum(kernel.max(axis=2).sum(axis=1), kernel.max(axis=1).sum(axis=1))
+    return np.asarray(score / np.maximum(np.minimum(visible.sum(axis=1), len(points)), 1))
+
+
+def _biased(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
+    """The rig with those range biases that are free where most ranges agree on them."""
+    rig = task.rig
+    for sensor, kinds in task.free.items():
+        eye = rig.sensors[sensor]
+        if not isinstance(eye, RangeSensor) or "range_bias" not in kinds:
             continue
-        at = each.poses[:, None] @ task.body.symmetries[None] @ inverse(T_world_object)
-        flat = at.reshape(-1, 4, 4)
-        votes.append(flat)
-        frame.append(np.full(len(flat), k))
-        away.append(np.full(len(flat), rules.shift * np.linalg.norm(each.poses[0][:3, 3])))
-    if not votes:
+        y, _ = eye.project(transform(poses, rig.points))
+        shifts = [
+            (frame.points[sensor].T - y[k]).ravel()
+            for k, frame in enumerate(frames)
+            if sensor in frame.points
+        ]
+        if shifts:
+            farthest = _FARTHEST * float(np.median(y))
+            bias = _agreed_bias(np.concatenate(shifts), farthest, float(task.sigmas[sensor]))
+            rig = rig.exchanged(sensor, replace(eye, range_bias=eye.range_bias + bias))
+    return rig
+
+
+def _agreed_bias(shifts: Floats, farthest: float, sigma: float) -> float:
+    """The shift that most ranges agree on.
+
+    That is the objective over one number at a wide blur: Σ over all frames, features and ranges of
+    a kernel at range − distance − bias.
+    """
+    step = sigma / _BIAS_STEPS
+    places = np.arange(-farthest, farthest, step)
+    counts, _ = np.histogram(shifts, bins=np.append(places, places[-1] + step) - step / 2)
+    width = 4 * _BIAS_STEPS
+    kernel = np.exp(-0.25 * (np.arange(-width, width + 1) / _BIAS_STEPS) ** 2)
+    return float(places[np.argmax(np.convolve(counts, kernel, mode="same"))])
+
+
+class _Votes(NamedTuple):
+    """What one frame says of a relative pose."""
+
+    motions: Floats  # (..., 4, 4)
+    distance: float  # to the body: translations err by a share of it
+
+
+class _Link(NamedTuple):
+    """The relative pose of two sensors."""
+
+    T_a_b: Floats  # (4, 4)
+    frames: int  # that agree on it
+
+
+def _agreed(told: Sequence[_Votes], T_expected: Floats, rules: CalibrationRules) -> _Link | None:
+    """The motion that votes of most frames agree on; the expected one decides between equals."""
+    if not told:
         return None
-    expected = task.rig.sensors[sensor].T_sensor_world  # type: ignore[attr-defined]
-    parts = np.concatenate(votes), np.concatenate(frame), np.concatenate(away)
-    return agreed(*parts, expected, rules)
+    parts = [each.motions.reshape(-1, 4, 4) for each in told]
+    votes, counts = np.concatenate(parts), [len(part) for part in parts]
+    frame = np.repeat(np.arange(len(told)), counts)
+    away = np.repeat([rules.shift * each.distance for each in told], counts)
+    near = np.argsort(rotation_angle_deg(T_expected, votes), kind="stable")
+    half = rules.seeds // 2
+    spread = np.linspace(0, len(votes) - 1, min(half, len(votes))).astype(int)
+    best, best_score = 0, (-1.0, 0.0)
+    for seed in np.unique(np.concatenate([near[:half], spread])):
+        inside, distance = _inside(votes[seed], votes, away, rules)
+        # the mean distance decides between middles of one cluster
+        score = (float(len(np.unique(frame[inside]))), -float(distance[inside].mean()))
+        if score > best_score:
+            best, best_score = int(seed), score
+    T = votes[best]
+    for _ in range(3):
+        inside, distance = _inside(T, votes, away, rules)
+        chosen = _nearest_of_each(frame, distance, inside)
+        # the mean rotation and the median shift
+        R = Rotation.from_matrix(votes[chosen, :3, :3]).mean().as_matrix()
+        T = from_parts(R, np.median(votes[chosen, :3, 3], axis=0))
+    return _Link(T, len(chosen))
+
+
+def _inside(T: Floats, votes: Floats, away: Floats, rules: CalibrationRules) -> tuple[Mask, Floats]:
+    turn = rotation_angle_deg(T, votes) / rules.turn_deg
+    shift = np.linalg.norm(votes[:, :3, 3] - T[:3, 3], axis=1) / away
+    distance = np.maximum(turn, shift)
+    return distance < 1, distance
+
+
+def _nearest_of_each(frame: Indices, distance: Floats, inside: Mask) -> Indices:
+    """Of each frame the vote that is nearest, among those inside."""
+    order = np.flatnonzero(inside)
+    order = order[np.argsort(distance[order], kind="stable")]
+    _, first = np.unique(frame[order], return_index=True)
+    return np.asarray(order[first])
+
+
+def _pair_link(task: Task, seen: _Seen, a: int, b: int, rules: CalibrationRules) -> _Link | None:
+    """Where sensor b stands to sensor a, by frames in which both know a pose."""
+    told = []
+    for each in seen:
+        if a in each and b in each:
+            T_a, T_b = each[a].poses, each[b].poses
+            S = task.body.symmetries[None, None]
+            motions = T_a[:, None, None] @ S @ inverse(T_b)[None, :, None]
+            reach = float(np.linalg.norm(T_a[0][:3, 3]) + np.linalg.norm(T_b[0][:3, 3])) / 2
+            told.append(_Votes(motions, reach))
+    link = _agreed(told, _pose_of(task, a) @ inverse(_pose_of(task, b)), rules)
+    # fewer frames must agree only where hardly any are there
+    least = max(min(rules.least_link, len(told)), 1)
+    return link if link is not None and link.frames >= least else None
+
+
+def _link_all(
+    task: Task, seen: _Seen, placed: Collection[int], wanted: Sequence[int], rules: CalibrationRules
+) -> tuple[dict[int, Floats], dict[int, tuple[int, int]]]:
+    """Place sensors one after the other, along the strongest links to those that stay.
+
+    Of all that are linked T_sensor_world (4, 4); and through which sensor each was linked, and in
+    how many frames the two agree.
+    """
+    T, through = {s: _pose_of(task, s) for s in placed}, {}
+    left = [one for one in wanted if one not in T]
+    links: dict[tuple[int, int], _Link | None] = {}
+    while left:
+        best: tuple[_Link, int, int] | None = None
+        for b in left:
+            for a in sorted(T):
+                if (b, a) not in links:
+                    links[b, a] = _pair_link(task, seen, b, a, rules)
+                link = links[b, a]
+                if link is not None and (best is None or link.frames > best[0].frames):
+                    best = (link, b, a)
+        if best is None:
+            break
+        link, b, a = best
+        T[b] = link.T_a_b @ T[a]
+        through[b] = (a, link.frames)
+        left.remove(b)
+    return T, through
+
+
+def _pose_of(task: Task, sensor: int) -> Floats:
+    """T_sensor_world as the session has it."""
+    return task.rig.sensors[sensor].T_sensor_world  # type: ignore[attr-defined, no-any-return]

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.calibration.alone import Hypotheses
-from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rig import Kind, Rig
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.sensors import CalibrationError, CloudSensor
 
 Progress = Callable[[str, int, int], None]
@@ -24,59 +21,62 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """Detections of one frame."""
+
+    number: int
+    time_s: float | None  # common time of the frame
+    points: Mapping[int, Floats]  # detections (M, m) by sensor
+    times: Mapping[int, float]  # when each sensor says that it took the frame
+
+    def without(self, sensors: Collection[int]) -> SeenFrame:
+        """The frame without what some sensors saw."""
+        return replace(self, points={s: y for s, y in self.points.items() if s not in sensors})
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Poses that explain what one sensor saw."""
+
+    poses: Floats  # (H, 4, 4): T_sensor_object, most evident first; none where nothing convinces
+    evidence: Floats  # (H,): log-odds against clutter
+
+
+NOTHING = Hypotheses(np.zeros((0, 4, 4)), np.zeros(0))
+Known = dict[tuple[int, int], Hypotheses]
+"""Hypotheses of single sensors, by frame number and sensor."""
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
-    """A calibration to be made.
+    """A calibration to be made."""
 
-    Attributes
-    ----------
-    rig : Rig
-        As it is believed to be.
-    body : Body
-    frames : tuple of SeenFrame
-    sigmas : (L,) float64
-        σ_ε by sensor.
-    free : mapping of int to tuple of kinds
-        Free parameters by sensor.
-    body_free : bool
-        Whether marker coordinates are free.
-    pose_free : (6,) bool
-        World directions of the body's poses that are not known.
-    T_held : (4, 4) float64 or None
-        Where the other directions stay.
-    around : (float or None, float or None)
-        Half-widths in degrees and length of where the body is about `T_held`.
-    fuse : bool
-        Whether a frame's pose tells of the next one's where sensors alone tell little.
-    known : mapping of int to (4, 4) float64, or None
-        Poses of the body by frame number, where they are known.
-    length : (int, int) or None
-        Sensors whose distance is known, and right in `rig`.
-    errors : mapping of int to CalibrationError
-        By sensor, how far what is held of it may be off.
-    """
-
-    rig: Rig
+    rig: Rig  # as it is believed to be
     body: Body
     frames: tuple[SeenFrame, ...]
-    sigmas: Floats
-    free: Mapping[int, tuple[Kind, ...]]
-    body_free: bool = False
-    pose_free: NDArray[np.bool_] = field(default_factory=lambda: np.ones(6, dtype=np.bool_))
-    T_held: Floats | None = None
+    sigmas: Floats  # (L,): σ_ε by sensor
+    free: Mapping[int, tuple[Kind, ...]]  # free parameters by sensor
+    body_free: bool = False  # whether marker coordinates are free
+    # (6,): world directions of the body's poses that are not known
+    pose_free: Mask = field(default_factory=lambda: np.ones(6, dtype=np.bool_))
+    T_held: Floats | None = None  # (4, 4): where the other directions stay
+    # half-widths in degrees and length of where the body is about `T_held`
     around: tuple[float | None, float | None] = (None, None)
+    # whether a frame's pose tells of the next one's where sensors alone tell little
     fuse: bool = True
-    known: Mapping[int, Floats] | None = None
-    length: tuple[int, int] | None = None
+    known: Mapping[int, Floats] | None = None  # poses by frame number, where they are known
+    length: tuple[int, int] | None = None  # sensors whose distance is known, and right in `rig`
+    # by sensor, how far what is held of it may be off
     errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[int, ...]:
         """Sensors that know a pose alone."""
-        alone = [
-            hasattr(one, "camera_matrix") or isinstance(one, CloudSensor)
-            for one in self.rig.sensors
-        ]
-        return tuple(np.flatnonzero(alone).tolist())
+        return tuple(
+            k
+            for k, one in enumerate(self.rig.sensors)
+            if hasattr(one, "camera_matrix") or isinstance(one, CloudSensor)
+        )
 
     @property
     def times_matter(self) -> bool:
@@ -88,7 +88,3 @@ class Task:
             for time in frame.times.values()
         )
         return late or bool(kinds & {"delay", "drift"}) or bool(self.rig.delays.any())
-
-
-Known = Mapping[tuple[int, int], Hypotheses]
-"""Hypotheses of single sensors, by frame number and sensor."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
-from mixpose.calibration.checking import Displacement, displacements
-from mixpose.calibration.result import Calibration
-from mixpose.calibration.rig import Block, centre_of
+from mixpose.calibration.result import Calibration, Displacement, displacements
+from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
 from mixpose.rigid import rotation_angle_deg
@@ -28,7 +25,7 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
             lines += _block_lines(found, block, unit)
     if any(block.kind == "body" for block in found.blocks):
         lines += _body_lines(found, unit)
-    lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found, unit)]
+    lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found)]
     lines += _coverage_lines(found)
     if found.inflation > 1:
         lines.append(
@@ -37,15 +34,21 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
         )
     lines += _held_lines(found, unit)
     lines += [f"{'doubt':<10}{text}" for text in doubts_of(found, unit)]
-    for direction in found.refused:
-        lines.append(f"{'refused':<10}not determined: {direction}")
-    return lines
+    return lines + [f"{'refused':<10}not determined: {text}" for text in found.refused]
+
+
+def _unit_of(found: Calibration, sensor: int, unit: str) -> str:
+    return "px" if found.after.sensors[sensor].unit == "px" else unit
+
+
+def _plus_minus(deviation: float, unit: str) -> str:
+    return f"± {deviation:.2g} {unit}" if np.isfinite(deviation) else "not determined"
 
 
 def _held_lines(found: Calibration, unit: str) -> list[str]:
     """What biases of ranges that are taken as exact would do."""
-    lengths = np.concatenate([[u == "length" for u in b.units] for b in found.blocks] or [[]])
-    moved = np.where(np.isfinite(found.deviations) & (lengths > 0), found.moved_by_biases, 0.0)
+    lengths = np.array([unit == "length" for block in found.blocks for unit in block.units], bool)
+    moved = np.where(np.isfinite(found.deviations) & lengths, found.moved_by_biases, 0.0)
     if not moved.any():
         return []
     worst = int(np.argmax(moved))
@@ -72,7 +75,7 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
         )
     for sensor, each in found.residuals.items():
         if each.held > rules.rising * each.after:
-            of = "px" if found.after.sensors[sensor].unit == "px" else unit
+            of = _unit_of(found, sensor, unit)
             told.append(
                 f"{found.after.names[sensor]}: the residual rises from {each.after:.3g} to "
                 f"{each.held:.3g} {of} in the frames held back: the others are too few or "
@@ -95,17 +98,16 @@ def _frames_line(found: Calibration) -> str:
 
 def _block_lines(found: Calibration, block: Block, unit: str) -> list[str]:
     assert block.sensor is not None, "the body has lines of its own"
-    name = found.after.names[block.sensor]
-    before, after = values_of(found, block)
-    lines = []
     if block.kind == "pose":
-        lines.append(_moved_line(found, block, unit))
-        return lines
+        return [_moved_line(found, block, unit)]
+    name = found.after.names[block.sensor]
+    before, after = values_of(found.before, block), values_of(found.after, block)
+    lines = []
     for k, part in enumerate(block.names):
         of = unit if block.units[k] == "length" else block.units[k]
         scale, of = (1e3, "ms") if of == "s" else (1.0, of)
         deviation = found.deviations[block.start + k] * scale
-        said = f"± {deviation:.2g} {of}" if np.isfinite(deviation) else "not determined"
+        said = _plus_minus(deviation, of)
         title = f"{name} {block.kind}" + (f" {part}" if len(block.names) > 1 else "")
         lines.append(f"{title:<28}{before[k] * scale:>14.6g} -> {after[k] * scale:<14.6g}{said}")
     return lines
@@ -131,51 +133,21 @@ def _moved_line(found: Calibration, block: Block, unit: str) -> str:
     return f"{title:<28}turned by {turn:.4g} ± {words[1]}, moved by {shift:.5g} ± {words[0]}{link}"
 
 
-def values_of(found: Calibration, block: Block) -> tuple[Floats, Floats]:
-    """Values of a block before and after."""
-    both = []
-    for rig in (found.before, found.after):
-        sensor = rig.sensors[block.sensor or 0]
-        value: Floats
-        if block.kind == "position":
-            value = sensor.position  # type: ignore[attr-defined]
-        elif block.kind == "range_bias":
-            value = np.array([sensor.range_bias])  # type: ignore[attr-defined]
-        elif block.kind == "focal":
-            K = sensor.camera_matrix  # type: ignore[attr-defined]
-            value = np.array([K[0, 0], K[1, 1]])[: len(block.names)]
-        elif block.kind == "principal_point":
-            K = getattr(sensor, "camera_matrix", None)
-            value = sensor.principal_point if K is None else K[:2, 2]  # type: ignore[attr-defined]
-        elif block.kind == "distortion":
-            value = np.zeros(len(block.names))
-            given = sensor.distortion[: len(value)]  # type: ignore[attr-defined]
-            value[: len(given)] = given
-        else:
-            source = rig.delays if block.kind == "delay" else rig.drifts
-            value = source[[block.sensor or 0]]
-        both.append(np.asarray(value, dtype=np.float64))
-    return both[0], both[1]
-
-
 def _body_lines(found: Calibration, unit: str) -> list[str]:
     block = next(b for b in found.blocks if b.kind == "body")
     deviation = found.deviations[block.place].reshape(-1, 3)
     shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
     lines = []
     for label, moved, each in zip(found.after.labels, shift, deviation, strict=True):
-        total = np.sqrt((each**2).sum())
-        said = f"± {total:.2g} {unit}" if np.isfinite(total) else "not determined"
+        said = _plus_minus(np.sqrt((each**2).sum()), unit)
         lines.append(f"{f'body feature {label}':<28}moved by {moved:.4g} {said}")
     return lines
 
 
 def _residual_lines(found: Calibration, unit: str) -> list[str]:
-    lines = [
-        f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>12}",
-    ]
+    lines = [f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>12}"]
     for sensor, each in found.residuals.items():
-        of = "px" if found.after.sensors[sensor].unit == "px" else unit
+        of = _unit_of(found, sensor, unit)
         numbers = "".join(
             f"{value:>{width}.3g}" if np.isfinite(value) else f"{'–':>{width}}"
             for value, width in ((each.before, 10), (each.after, 10), (each.held, 12))
@@ -184,26 +156,20 @@ def _residual_lines(found: Calibration, unit: str) -> list[str]:
     return lines
 
 
-def _worst_lines(found: Calibration, unit: str) -> list[str]:
+def _worst_lines(found: Calibration) -> list[str]:
     """Frames and features that fit worst, by name."""
+    squared = [(s.offset**2).sum(axis=1) / found.noise[k] ** 2 for k, s in found.sights.items()]
+    numbers = [sights.frame for sights in found.sights.values()]
+    features = [sights.feature for sights in found.sights.values()]
     lines = []
-    frames: dict[int, list[float]] = {}
-    features: dict[int, list[float]] = {}
-    for sensor, sights in found.sights.items():
-        squared = (sights.offset**2).sum(axis=1) / found.noise[sensor] ** 2
-        for number, feature, value in zip(sights.frame, sights.feature, squared, strict=True):
-            frames.setdefault(int(number), []).append(float(value))
-            features.setdefault(int(feature), []).append(float(value))
-    called = found.after.labels
-    for title, groups in (("frames", frames), ("features", features)):
-        rms = {key: float(np.sqrt(np.mean(values))) for key, values in groups.items()}
-        worst = sorted(rms, key=lambda key: (-rms[key], key))[:_WORST]
-        typical = float(np.median(list(rms.values()))) if rms else 1.0
-        names = [called[key] if groups is features else str(key) for key in worst]
-        parts = ", ".join(
-            f"{name} ({rms[key] / typical:.2g})" for name, key in zip(names, worst, strict=True)
-        )
-        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {parts}")
+    for title, parts in (("frames", numbers), ("features", features)):
+        keys, which = np.unique(np.concatenate(parts), return_inverse=True)
+        rms = np.sqrt(np.bincount(which, np.concatenate(squared)) / np.bincount(which))
+        called = found.after.labels if title == "features" else dict(zip(keys, keys.astype(str)))
+        typical = np.median(rms) if len(rms) else 1.0
+        worst = np.lexsort((keys, -rms))[:_WORST]
+        told = ", ".join(f"{called[keys[k]]} ({rms[k] / typical:.2g})" for k in worst)
+        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {told}")
     return lines
 
 
@@ -224,7 +190,7 @@ def _coverage_lines(found: Calibration) -> list[str]:
         counts = coverage(found, sensor)
         if counts is None:
             continue
-        empty = Counter(counts.ravel() == 0)[True]
+        empty = np.count_nonzero(counts == 0)
         said = f"{counts.size - empty} of {counts.size} parts of the image seen"
         if empty:
             said += f"; none at {_where(counts)}"
@@ -234,14 +200,9 @@ def _coverage_lines(found: Calibration) -> list[str]:
 
 def _where(counts: Floats) -> str:
     """Which sides of the image are empty, in words."""
-    sides = {
-        "top": counts[0],
-        "bottom": counts[-1],
-        "left": counts[:, 0],
-        "right": counts[:, -1],
-    }
+    sides = {"top": counts[0], "bottom": counts[-1], "left": counts[:, 0], "right": counts[:, -1]}
     empty = [name for name, row in sides.items() if not row.any()]
-    return ", ".join(empty) if empty else "some corners or gaps"
+    return ", ".join(empty) or "some corners or gaps"
 
 
 def check_lines(found: Calibration, unit: str) -> list[str]:
@@ -250,7 +211,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     bumped = [one.name for one in told if one.moved]
     lines = [_frames_line(found)]
     for index, one in enumerate(told):
-        of = "px" if found.after.sensors[index].unit == "px" else unit
+        of = _unit_of(found, index, unit)
         lines.append(
             f"{one.name:<20}{_displaced(one, unit)}; residual "
             f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mixpose.calibration.result import Calibration
-from mixpose.calibration.rig import Block, Kind
+from mixpose.calibration.rig import Block
+from mixpose.records import Floats
 from mixpose.session import Session
 from mixpose.session.rewriting import ROTATIONS, document_of, plain, put, text_of
 
@@ -17,65 +17,59 @@ MARK = "# Calibrated by mixpose"
 
 
 def calibrated_text(session: Session, found: Calibration, target: Path, version: str) -> str:
-    """The text of the calibrated session.
+    """The text of the calibrated session, as it will stand at a target.
 
     Comments and keys that were not calibrated stay; paths lead to the same files as before.
-
-    Parameters
-    ----------
-    session : Session
-    found : Calibration
-    target : Path
-        Where it will stand.
-    version : str
-        Of mixpose.
     """
     document = document_of(session, target)
     for index, table in enumerate(document["sensor"]):
-        kinds = [block.kind for block in found.blocks if block.sensor == index]
-        _put_sensor(table, found, index, kinds)
+        _put_sensor(table, found, index)
     if any(block.kind == "body" for block in found.blocks):
         _put_body(document["object"], found, session)
     origin = f"{session.path.name}, {len(found.used)} frames"
     return f"{MARK} {version} from {origin}.\n{text_of(document)}"
 
 
-def _put_sensor(table: Any, found: Calibration, index: int, kinds: Sequence[Kind]) -> None:
+def _put_sensor(table: Any, found: Calibration, index: int) -> None:
+    before: Any = found.before.sensors[index]
     sensor: Any = found.after.sensors[index]
     said = {block.kind: _said(found, block) for block in found.blocks if block.sensor == index}
-    before: Any = found.before.sensors[index]
-    if hasattr(sensor, "T_sensor_world") and not np.array_equal(
-        sensor.T_sensor_world, before.T_sensor_world
-    ):
+
+    def has_moved(key: str) -> bool:
+        there = hasattr(sensor, key)
+        return there and not np.array_equal(getattr(sensor, key), getattr(before, key))
+
+    if has_moved("T_sensor_world"):
         for key in ROTATIONS:
             table.pop(key, None)
-        _put(table, "T_sensor_world", plain(sensor.T_sensor_world), said.get("pose"))
-    if {"focal", "principal_point", "distortion"} & set(kinds) and hasattr(sensor, "camera_matrix"):
+        _put(table, "T_sensor_world", sensor.T_sensor_world, said.get("pose"))
+    if {"focal", "principal_point", "distortion"} & said.keys() and hasattr(
+        sensor, "camera_matrix"
+    ):
         if table.pop("calibration", None) is not None and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
         lens = [said[k] for k in ("focal", "principal_point") if k in said]
-        _put(table, "camera_matrix", plain(sensor.camera_matrix), ", ".join(lens) or None)
+        _put(table, "camera_matrix", sensor.camera_matrix, ", ".join(lens) or None)
         if len(sensor.distortion):
-            _put(table, "distortion", plain(sensor.distortion), said.get("distortion"))
-    elif "principal_point" in kinds:
-        _put(table, "principal_point", plain(sensor.principal_point), said["principal_point"])
-    if hasattr(sensor, "position") and not np.array_equal(sensor.position, before.position):
-        _put(table, "position", plain(sensor.position), said.get("position"))
-    if "range_bias" in kinds:
-        _put(table, "range_bias", plain(sensor.range_bias), said["range_bias"])
-    if "delay" in kinds:
-        _put(table, "delay", plain(found.after.delays[index]), said["delay"])
+            _put(table, "distortion", sensor.distortion, said.get("distortion"))
+    elif "principal_point" in said:
+        _put(table, "principal_point", sensor.principal_point, said["principal_point"])
+    if has_moved("position"):
+        _put(table, "position", sensor.position, said.get("position"))
+    if "range_bias" in said:
+        _put(table, "range_bias", sensor.range_bias, said["range_bias"])
+    if "delay" in said:
+        _put(table, "delay", found.after.delays[index], said["delay"])
 
 
-def _put(table: Any, key: str, value: Any, said: str | None) -> None:
-    put(table, key, value, f"one standard deviation: {said}" if said else None)
+def _put(table: Any, key: str, value: Floats | float, said: str | None) -> None:
+    put(table, key, plain(value), f"one standard deviation: {said}" if said else None)
 
 
 def _said(found: Calibration, block: Block) -> str:
     parts = []
-    for name, deviation, unit in zip(
-        block.names, found.deviations[block.place], block.units, strict=True
-    ):
+    rows = zip(block.names, found.deviations[block.place], block.units, strict=True)
+    for name, deviation, unit in rows:
         value, word = (np.degrees(deviation), " deg") if unit == "rad" else (deviation, "")
         said = f"{value:.2g}{word}" if np.isfinite(value) else "not determined"
         parts.append(f"{name} {said}")

@@ -13,13 +13,18 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.calibration import Calibration, CalibrationRules, Rig, Task, calibrate, free_parameters
-from mixpose.calibration.free import error_of_held, words_of
 from mixpose.calibration.recorded import read_frames, require_points
-from mixpose.calibration.saved import MARK as SAVED_MARK
-from mixpose.calibration.saved import Saved
+from mixpose.calibration.searching import MARK as SAVED_MARK
+from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
-from mixpose.calibration.world import check_world, in_world, with_length
+from mixpose.calibration.words import (
+    check_world,
+    error_of_held,
+    in_world,
+    with_length,
+    words_of,
+)
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but

@@ -13,8 +13,7 @@ from mixpose.cli.run import named_sources
 from mixpose.cli.watching import watched
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
-from mixpose.learning.telling import doubts_of, lines_of, look_alikes
-from mixpose.learning.writing import MARK, table_text
+from mixpose.learning.telling import MARK, doubts_of, lines_of, look_alikes, table_text
 from mixpose.session import Session, load_scene
 from mixpose.session.marker_files import read_marker_file
 from mixpose.session.markers import Markers

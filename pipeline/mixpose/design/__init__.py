@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
+from mixpose.design.advice import (
+    MarkerMove,
+    NewSensor,
+    best_marker_move,
+    best_new_sensor,
+    noise_to_equal,
+)
 from mixpose.design.confirmation import Confirmation, confirm
-from mixpose.design.equality import noise_to_equal
 from mixpose.design.poses import spread_poses
-from mixpose.design.prediction import Plan, Prediction, plan_of, predict
+from mixpose.design.prediction import Plan, Prediction, Summary, plan_of, predict, summarise
 from mixpose.design.study import Request, Study, study
-from mixpose.design.summary import Summary, summarise
 
 __all__ = [
     "Confirmation",

@@ -1,4 +1,4 @@
-"""Which marker to move, and where to put one more sensor, to gain most."""
+"""What would help: a marker that is moved, one more sensor, or detections that err by less."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from scipy.optimize import brentq
 
 from mixpose.body import Body, PointFeature
 from mixpose.design.prediction import Plan
@@ -18,43 +19,25 @@ ErrorOf: TypeAlias = Callable[[Plan], float]
 
 _STEP = 0.25  # of the body's radius
 _PLACES = 60  # for one more sensor, all around
+_WIDEST = 1e4  # times the noise: beyond it nobody would build the system
 
 
 @dataclass(frozen=True)
 class MarkerMove:
-    """A marker that is moved.
+    """A marker that is moved."""
 
-    Attributes
-    ----------
-    marker : int
-        From 0.
-    shift : (3,) float64
-        In the object's frame.
-    error : float
-        What is left then.
-    """
-
-    marker: int
-    shift: Floats
-    error: float
+    marker: int  # from 0
+    shift: Floats  # (3,): in the object's frame
+    error: float  # what is left then
 
 
 @dataclass(frozen=True)
 class NewSensor:
-    """One more sensor, of a kind that is there.
+    """One more sensor, of a kind that is there."""
 
-    Attributes
-    ----------
-    like : str
-        The sensor that it is a copy of.
-    sensor : Sensor
-    error : float
-        What is left then.
-    """
-
-    like: str
+    like: str  # the sensor that it is a copy of
     sensor: Sensor
-    error: float
+    error: float  # what is left then
 
 
 def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
@@ -78,17 +61,7 @@ def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
 def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor | None:
     """Where a copy of one of the sensors leaves the least error: all around, as far away as it.
 
-    Parameters
-    ----------
-    plan : Plan
-    error_of : callable
-    middle : (3,) array
-        Of the volume, in the world: what the sensor looks at.
-
-    Returns
-    -------
-    NewSensor or None
-        None where no place helps.
+    It looks at the middle (3,) of the volume.  None where no place helps.
     """
     best: NewSensor | None = None
     least = error_of(plan)
@@ -147,3 +120,26 @@ def _placed(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
     if not isinstance(sensor, ParallelBeam):
         seen_at = np.array([0.0, 0.0, abs(depth)])
     return replace(sensor, T_sensor_world=from_parts(R, seen_at - R @ middle))
+
+
+def noise_to_equal(plan: Plan, wanted: float, error_of: ErrorOf) -> float | None:
+    """Factor on all noises of a plan with which an error, which grows with them, is as wanted.
+
+    None where the errors of markers alone are too large, or no factor is large enough.
+    """
+
+    def excess(log_factor: float) -> float:
+        return float(np.log(error_of(scaled(plan, float(np.exp(log_factor)))) / wanted))
+
+    low, high = -np.log(_WIDEST), np.log(_WIDEST)
+    if not (np.isfinite(wanted) and np.isfinite(error_of(plan))):
+        return None
+    if excess(low) > 0 or excess(high) < 0:
+        return None
+    return float(np.exp(brentq(excess, low, high, xtol=1e-10)))
+
+
+def scaled(plan: Plan, factor: float) -> Plan:
+    """The plan with all noises times a factor, and the widths that go with them."""
+    noises, sigmas = (tuple(each * factor for each in all_) for all_ in (plan.noises, plan.sigmas))
+    return replace(plan, noises=noises, sigmas=sigmas)

@@ -9,15 +9,19 @@ from collections import Counter
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
+import tomlkit
 
+from mixpose.body import Body, SegmentFeature
 from mixpose.design.prediction import Plan, Prediction, at_tip, predict
-from mixpose.design.written import plan_text
+from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_threads
 from mixpose.records import Floats
-from mixpose.rigid import inverse, twist_between
+from mixpose.rigid import TWIST_NAMES, inverse, twist_between
 from mixpose.runner import run
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.session import Session, load_session
 from mixpose.simulation import SimulationOptions, simulate
 
@@ -27,41 +31,21 @@ _MOST_POSES = 8
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Errors of simulated frames beside those that were predicted.
+    """Errors of simulated frames beside those that were predicted."""
 
-    Attributes
-    ----------
-    frames : int
-        Estimated, lost ones included.
-    statuses : dict of str to int
-    ratios : (6,) float64
-        Root mean square error over the predicted one, per direction; NaN where held or open.
-    overall : float
-        The same over all directions at once: of errors in units of their covariance.
-    chance : float
-        What `overall` is off 1 by through chance alone, one standard deviation.
-    predicted, found : (3,) float64
-        Position, rotation (radians) and tip: root mean squares over the frames.
-    """
-
-    frames: int
+    frames: int  # estimated, lost ones included
     statuses: dict[str, int]
+    # (6,): root mean square error over the predicted one, per direction; NaN where held or open
     ratios: Floats
-    overall: float
-    chance: float
+    overall: float  # the same over all directions at once: of errors in units of their covariance
+    chance: float  # what `overall` is off 1 by through chance alone, one standard deviation
+    # (3,): position, rotation (radians) and tip: root mean squares over the frames
     predicted: Floats
-    found: Floats
+    found: Floats  # (3,)
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Frames to simulate at one pose."""
-
-    session: Session
-    plan: Plan
-    T_world_object: Floats
-    frames: int
-    seed: int
+_Place: TypeAlias = tuple[Session, Plan, Floats, int, int]
+"""Where to simulate how many frames of what: T_world_object, and a seed at the end."""
 
 
 def confirm(
@@ -74,30 +58,17 @@ def confirm(
     seed: int = 0,
     executor: Executor | None = None,
 ) -> Confirmation:
-    """Simulate frames of a body that stands still at some of the poses, and estimate them.
+    """Simulate so many frames of a body that stands still at some of the poses, and estimate them.
 
-    Parameters
-    ----------
-    session : Session
-    plan : Plan
-        Its system, perhaps with other noises.
-    poses : (P, 4, 4) array
-        At which everything is determined.
-    runs : int
-        Frames in all.
-    tip : (3,) array
-    seed : int
-    executor : Executor, optional
-        Does the poses; one after the other if left out.
+    The plan is of the session's system, perhaps with other noises, and everything is determined at
+    the poses (P, 4, 4), which an executor does; one after the other if it is left out.
     """
     count = min(len(poses), _MOST_POSES, max(1, runs // _FEWEST_FRAMES))
     chosen = poses[np.linspace(0, len(poses) - 1, count).astype(int)]
     prediction = predict(plan, chosen)
     places = [
         # a seed of its own for each pose and each study
-        _Place(
-            session, plan, T, frames, int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
-        )
+        (session, plan, T, frames, int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
         for k, T in enumerate(chosen)
         if (frames := runs // count + (k < runs % count))
     ]
@@ -115,14 +86,14 @@ def confirm(
 
 def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
     """Twists (6,) from the truth to the estimate, modulo the body's symmetries; and statuses."""
-    plan, T = place.plan, place.T_world_object
+    session, plan, T, frames, seed = place
     least = {
         m: min((n for n, one in zip(plan.noises, plan.sensors) if one.dimension == m), default=0.0)
         for m in (1, 2)
     }
     options = SimulationOptions(
-        frames=place.frames,
-        seed=place.seed,
+        frames=frames,
+        seed=seed,
         amplitude_translation=0.0,
         amplitude_rotation_deg=0.0,
         pixel_noise=least[2],
@@ -134,10 +105,10 @@ def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
     statuses: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.toml"
-        path.write_text(plan_text(place.session, plan, T), encoding="utf-8")
+        path.write_text(_plan_text(session, plan, T), encoding="utf-8")
         recording = Path(folder) / "recording"
         simulate(load_session(path), recording, options)
-        rng = np.random.default_rng([place.seed, place.frames])
+        rng = np.random.default_rng([seed, frames])
         for name, sensor, noise in zip(plan.names, plan.sensors, plan.noises, strict=True):
             more = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
             if more > 0:
@@ -152,6 +123,71 @@ def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
             same = estimate.T_world_object @ inverse(plan.body.symmetries[nearest])
             errors.append(twist_between(T, same))
     return errors, statuses
+
+
+def _plan_text(session: Session, plan: Plan, T_world_object: Floats) -> str:
+    """A session in which a plan's body starts at a pose, whose recordings are tables of detections.
+
+    Numbers are told to the last bit.
+    """
+    rows = zip(plan.names, plan.sensors, plan.sigmas, strict=True)
+    free = [name for name, is_free in zip(TWIST_NAMES, plan.free, strict=True) if is_free]
+    tables = {
+        "unit": session.unit,
+        "object": _body(plan.body),
+        "start": {"T_world_object": T_world_object},
+        # every frame stands for itself: none is to profit from the one before
+        "estimator": {"fuse": False, "free": free},
+        "sensor": [_sensor(name, sensor, sigma) for name, sensor, sigma in rows],
+    }
+    return str(tomlkit.dumps(plain(tables)))
+
+
+def _body(body: Body) -> dict[str, Any]:
+    points = [f.mean for f in body.features if not isinstance(f, SegmentFeature)]
+    segments = [[f.start, f.end] for f in body.features if isinstance(f, SegmentFeature)]
+    table: dict[str, Any] = {"name": body.name}
+    if points:
+        table["points"] = points
+    if segments:
+        table["segments"] = segments
+    if body.covariances.any():
+        table |= {"sigma": body.covariances, "spread": body.features[0].spread}
+    if body.normals is not None:
+        table["normals"] = body.normals
+    if body.gravity is not None:
+        table["gravity"] = {"direction": body.gravity.direction, "sigma": body.gravity.sigma}
+    return table
+
+
+def _sensor(name: str, sensor: Sensor, width: float) -> dict[str, Any]:
+    table: dict[str, Any] = {"name": name, "source": f"{name}.csv", "extract": {"sigma": width}}
+    match sensor:
+        case RangeSensor():
+            table |= {"model": "lateration", "position": sensor.position}
+            return table | {"range_bias": sensor.range_bias}
+        case PinholeCamera() | FisheyeCamera():
+            table["model"] = "pinhole" if isinstance(sensor, PinholeCamera) else "fisheye"
+            table["camera_matrix"] = sensor.camera_matrix
+            if sensor.distortion.size:
+                table["distortion"] = sensor.distortion
+        case ParallelBeam():
+            table |= {"model": "parallel", "pixel_size": sensor.pixel_size}
+            table["principal_point"] = sensor.principal_point
+        case _:
+            raise SessionError(f"design: a {type(sensor).__name__} cannot be simulated")
+    return table | {"resolution": sensor.resolution or (), "T_sensor_world": sensor.T_sensor_world}
+
+
+def plain(value: Any) -> Any:
+    """The same of lists and Python's own numbers; None for what is not finite."""
+    if isinstance(value, dict):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _made_noisier(table: Path, noise: float, rng: np.random.Generator) -> None:

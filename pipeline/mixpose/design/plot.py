@@ -21,10 +21,7 @@ _SUFFIXES = (".png", ".svg", ".pdf")
 def require_plots(path: Path) -> None:
     """See that a picture can be drawn, before anything is computed for it.
 
-    Raises
-    ------
-    SessionError
-        If matplotlib is not installed, or does not write such files.
+    Raises a SessionError if matplotlib is not installed, or does not write such files.
     """
     if path.suffix.lower() not in _SUFFIXES:
         raise SessionError(f"--plot {path}: found {path.suffix!r}; allowed: {', '.join(_SUFFIXES)}")

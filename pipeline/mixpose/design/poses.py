@@ -24,26 +24,19 @@ def spread_poses(
     turn_deg: float | None = None,
     seed: int = 0,
 ) -> Floats:
-    """Poses T_world_object spread evenly over a volume; the first is its middle.
+    """Poses T_world_object (P, 4, 4) spread evenly over a volume; the first is its middle.
+
+    Cameras must have a resolution.  The middle is the session's ``[start]``, else where its sensors
+    look together.
 
     Parameters
     ----------
-    session : Session
-        Every camera with a resolution.  The middle is its ``[start]``, else where its sensors
-        look together.
-    count : int
-        P.
     volume : (3,) array, optional
         Sides of the box that the body's middle is in, along the world's axes; left out, twice the
         body's radius.
     turn_deg : float, optional
         Largest angle from the orientation of the middle, up to 180; left out, 20 around a
         ``[start]`` and else 180.
-    seed : int
-
-    Returns
-    -------
-    (P, 4, 4) float64
 
     Raises
     ------

@@ -11,6 +11,8 @@ W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹, with s_l between the sensor's `sigma`
 terms are summed over sensors before they are squared.  Where s_l is in proportion to σ_l and
 markers are exact it is the inverse information.  For points that are measured in three directions
 alike it is the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
+
+Over many poses a prediction is summed up as few numbers: how accurate, where weak, what is seen.
 """
 
 from __future__ import annotations
@@ -20,41 +22,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking import noise_of
+from mixpose.checking import LookAlike, look_alikes, noise_of
 from mixpose.fit import free_mask
 from mixpose.judgement import NoiseModel, invert_information
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
-from mixpose.session import Session
+from mixpose.session import SensorSetup, Session
+
+_TRIED = 3  # poses at which others that look alike are searched for: a second each
+_NEAR = 4.0  # standard deviations between features whose labels are then mixed up now and then
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A system: sensors with what each of their features errs by, and a body.
+    """A system: sensors with what each of their features errs by, and a body."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the sensors.
-    sensors : tuple of Sensor
-    noises : tuple of float
-        Standard deviation of a measured feature along each coordinate, px or length units.
-    sigmas : tuple of float
-        σ_ε of the sensors, by which a run weighs them against each other at first.
-    body : Body
-        Spreads of its features are errors of markers.
-    free : (6,) bool
-        Directions that are estimated.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the sensors
     sensors: tuple[Sensor, ...]
+    # standard deviation of a measured feature along each coordinate, px or length units
     noises: tuple[float, ...]
+    # σ_ε of the sensors, by which a run weighs them against each other at first
     sigmas: tuple[float, ...]
-    body: Body
-    free: Mask
+    body: Body  # spreads of its features are errors of markers
+    free: Mask  # (6,): directions that are estimated
 
     def weighed(self) -> Floats:
         """Variances s_l² (L,) by which a run weighs sensors once frames have shown their noise.
@@ -71,33 +63,17 @@ class Plan:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is expected at P poses.
+    """What is expected at P poses."""
 
-    Attributes
-    ----------
-    poses : (P, 4, 4) float64
-        T_world_object.
-    covariances : (P, 6, 6) float64
-        In the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a direction
-        open, zero where it is not free.
-    seen : (P, L, N) bool
-        Features that are in view of a sensor and face it.
-    """
-
-    poses: Floats
+    poses: Floats  # (P, 4, 4): T_world_object
+    # (P, 6, 6): in the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a
+    # direction open, zero where it is not free
     covariances: Floats
-    seen: Mask
+    seen: Mask  # (P, L, N): features that are in view of a sensor and face it
 
 
 def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
-    """The system of a session.
-
-    Parameters
-    ----------
-    session : Session
-    noises : dict of str to float, optional
-        Standard deviations by sensor in place of those that its `sigma` stands for.
-    """
+    """The system of a session; noises by sensor stand in place of those of its `sigma`."""
     given = noises or {}
     return Plan(
         names=tuple(setup.name for setup in session.sensors),
@@ -165,3 +141,107 @@ def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
     covariance = inverse @ V @ inverse
     covariance[is_open, is_open] = np.inf
     return np.asarray((covariance + covariance.T) / 2)
+
+
+@dataclass(frozen=True)
+class Weakness:
+    """Where a system is weakest, and in which direction."""
+
+    pose: int  # number of the pose, from 0
+    deviation: float  # along the worst direction
+    direction: Floats  # (3,): in world axes: of the position, or the axis of the turn
+    ratio: float  # to the deviation along the best direction there
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a system achieves over P poses."""
+
+    deviations: Floats  # (P, 6): x y z rx ry rz, lengths and radians; infinite where not determined
+    position: Floats  # (P,): root mean square error of the origin
+    rotation: Floats  # (P,): of the turn, radians
+    tip: Floats  # (P,)
+    weakest_position: Weakness | None  # None where a direction is not determined at any pose
+    weakest_rotation: Weakness | None
+    seen: Floats  # (L,): share of the features that each sensor sees, on average
+    fewest: Floats  # (L,): features that each sensor sees at its worst pose
+    undetermined: tuple[int, ...]  # poses at which a free direction is open
+    # (L,): what a sensor's features err by, markers included, over its `sigma`.  From a third on
+    # some of them are given up as false, and errors are larger than predicted.
+    narrow: Floats
+    # (L,): share of the features with another nearer than four standard deviations in a sensor:
+    # there detections are mixed up, and errors larger than predicted
+    crowded: Floats
+    symmetries: int  # orientations that look the same
+    # poses that look nearly the same as one of the first, the most alike first
+    alike: tuple[LookAlike, ...]
+
+
+def summarise(
+    plan: Plan, setups: tuple[SensorSetup, ...], prediction: Prediction, tip: Floats
+) -> Summary:
+    """Sum a prediction up; the setups are those of the plan's sensors."""
+    variances = np.einsum("pii->pi", prediction.covariances)
+    tips = at_tip(prediction, tip)
+    closed = np.isfinite(variances).all(axis=1)
+    narrow, crowded = _doubts(plan, prediction)
+    alike = [
+        other
+        for T in prediction.poses[closed][:_TRIED]
+        for other in look_alikes(setups, plan.body, T, plan.free)
+    ]
+    return Summary(
+        deviations=np.sqrt(variances),
+        position=np.sqrt(variances[:, :3].sum(axis=1)),
+        rotation=np.sqrt(variances[:, 3:].sum(axis=1)),
+        tip=np.sqrt(np.einsum("pii->p", tips)),
+        weakest_position=_weakest(tips),
+        weakest_rotation=_weakest(prediction.covariances[:, 3:, 3:]),
+        seen=prediction.seen.mean(axis=(0, 2)),
+        fewest=prediction.seen.sum(axis=2).min(axis=0),
+        undetermined=tuple(np.flatnonzero(~closed).tolist()),
+        narrow=narrow,
+        crowded=crowded,
+        symmetries=len(plan.body.symmetries),
+        alike=tuple(sorted(alike, key=lambda other: other.difference)),
+    )
+
+
+def pooled(errors: Floats) -> float:
+    """Root mean square over the poses at which it is determined; infinite where there are none."""
+    known = errors[np.isfinite(errors)]
+    return float(np.sqrt((known**2).mean())) if known.size else float("inf")
+
+
+def _weakest(covariances: Floats) -> Weakness | None:
+    """Of (P, 3, 3), the largest deviation."""
+    known = np.isfinite(np.einsum("pii->p", covariances))
+    if not known.any():
+        return None
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
+    pose = int(values[:, 2].argmax())
+    direction = vectors[pose, :, 2]
+    direction = direction * np.sign(direction[np.abs(direction).argmax()])
+    least = max(float(values[pose, 0]), 0.0)
+    worst = float(values[pose, 2])
+    ratio = float(np.sqrt(worst / least)) if least > 1e-18 * worst else float("inf")
+    return Weakness(pose, float(np.sqrt(worst)), direction, ratio)
+
+
+def _doubts(plan: Plan, prediction: Prediction) -> tuple[Floats, Floats]:
+    """What features err by over `sigma`, and the share of those that are near others, by sensor."""
+    narrow, shares = np.zeros(len(plan.sensors)), np.zeros(len(plan.sensors))
+    world = transform(prediction.poses, plan.body.means)
+    for k, (sensor, noise) in enumerate(zip(plan.sensors, plan.noises, strict=True)):
+        y, A, _ = sensor.linearise(world)
+        # of markers, as the sensor shows them
+        shown = plan.body.spread * np.linalg.norm(A, axis=-1).max(axis=-1)
+        errs = np.sqrt(noise**2 + shown**2)
+        seen = prediction.seen[:, k]
+        narrow[k] = np.median(errs[seen]) / plan.sigmas[k] if seen.any() else 0.0
+        apart = np.linalg.norm(y[:, :, None] - y[:, None], axis=-1)
+        apart[~(seen[:, :, None] & seen[:, None])] = np.inf
+        apart[:, np.arange(len(plan.body)), np.arange(len(plan.body))] = np.inf
+        crowded = apart.min(axis=2) < _NEAR * errs
+        shares[k] = crowded.sum() / max(int(seen.sum()), 1)
+    return narrow, shares

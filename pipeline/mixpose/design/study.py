@@ -10,11 +10,16 @@ import numpy as np
 
 from mixpose.body import Body, LookAlike, congruent_parts
 from mixpose.checking import noise_of
-from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
+from mixpose.design.advice import (
+    MarkerMove,
+    NewSensor,
+    best_marker_move,
+    best_new_sensor,
+    noise_to_equal,
+    scaled,
+)
 from mixpose.design.confirmation import Confirmation, confirm
-from mixpose.design.equality import noise_to_equal, scaled
-from mixpose.design.prediction import Plan, at_tip, plan_of, predict
-from mixpose.design.summary import Summary, pooled, summarise
+from mixpose.design.prediction import Plan, Summary, at_tip, plan_of, pooled, predict, summarise
 from mixpose.executing import Executor
 from mixpose.records import Floats
 from mixpose.session import SensorSetup, Session
@@ -26,50 +31,36 @@ a motion capture recording that are taken for each other, rigid to 2 to 5 mm, ha
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study.
+    """What is asked of a study."""
 
-    Attributes
-    ----------
-    poses : (P, 4, 4) float64
-    tip : (3,) float64 or None
-        In the object's frame; None for its origin.
-    noises : mapping of (int or None, str) to float
-        Standard deviations by system (None: all) and sensor.
-    runs : int
-        Frames to simulate for each system; 0 for none.
-    seed : int
-    tolerance : float or None
-        Within which markers of bodies lie alike; None for a share of the radius.
-    """
-
-    poses: Floats
-    tip: Floats | None = None
+    poses: Floats  # (P, 4, 4)
+    tip: Floats | None = None  # (3,): in the object's frame; None for its origin
+    # standard deviations by system (None: all) and sensor
     noises: Mapping[tuple[int | None, str], float] = field(default_factory=dict)
-    runs: int = 0
+    runs: int = 0  # frames to simulate for each system; 0 for none
     seed: int = 0
+    # within which markers of bodies lie alike; None for a share of the radius
     tolerance: float | None = None
+
+    @property
+    def point(self) -> Floats:
+        """The tip (3,), or the origin."""
+        return np.zeros(3) if self.tip is None else self.tip
+
+    def error_of(self, plan: Plan) -> float:
+        """Error of the point with a plan, pooled over the poses."""
+        variances = np.einsum("pii->p", at_tip(predict(plan, self.poses), self.point))
+        return pooled(np.sqrt(variances))
 
 
 @dataclass(frozen=True)
 class Equal:
-    """What a system's detections must err by to be as accurate as the first system.
+    """What a system's detections must err by to be as accurate as the first system."""
 
-    Attributes
-    ----------
-    factor : float or None
-        On all its noises; None where nothing makes it so.
-    noises : tuple of float
-        The noises with that factor.
-    wanted : float
-        Error of the first system.
-    confirmation : Confirmation or None
-        Of the system with these noises.
-    """
-
-    factor: float | None
-    noises: tuple[float, ...]
-    wanted: float
-    confirmation: Confirmation | None = None
+    factor: float | None  # on all its noises; None where nothing makes it so
+    noises: tuple[float, ...]  # the noises with that factor
+    wanted: float  # error of the first system
+    confirmation: Confirmation | None = None  # of the system with these noises
 
 
 @dataclass(frozen=True)
@@ -80,7 +71,7 @@ class System:
     session: Session
     plan: Plan
     summary: Summary
-    error: float  # pooled over the poses: of the tip, or of the origin
+    error: float  # as of the request
     weighed: float  # the same with sigmas in proportion to what features err by
     confirmation: Confirmation | None = None
     equal: Equal | None = None
@@ -104,17 +95,10 @@ def study(
     say: Callable[[str], None] = lambda text: None,
     executor: Executor | None = None,
 ) -> Study:
-    """Study systems, the first being what the others are compared with.
+    """Study systems of one unit, the first being what the others are compared with.
 
-    Parameters
-    ----------
-    named : sequence of (str, Session)
-        Of one unit; cameras with resolutions.
-    request : Request
-    say : callable
-        Told what is being done.
-    executor : Executor, optional
-        Does the simulated frames.
+    Their cameras have resolutions.  `say` is told what is being done; an executor does the
+    simulated frames.
     """
     systems: list[System] = []
     for k, (name, session) in enumerate(named):
@@ -127,35 +111,18 @@ def study(
             say(f"{system.name}: {request.runs} simulated frames")
             systems[k] = replace(system, confirmation=confirmed(system, system.plan))
         if k > 0:
-            systems[k] = replace(
-                systems[k], equal=_equal(systems[k], systems[0], request, say, confirmed)
-            )
+            equal = _equal(system, systems[0], request, say, confirmed)
+            systems[k] = replace(systems[k], equal=equal)
     bodies = [each.body for _, session in named for each in session.objects]
-    return Study(
-        request=request,
-        unit=named[0][1].unit,
-        systems=tuple(systems),
-        congruences=tuple(_congruences(bodies, request)),
-    )
-
-
-def _tip(request: Request) -> Floats:
-    return np.zeros(3) if request.tip is None else request.tip
-
-
-def _error_of(request: Request) -> Callable[[Plan], float]:
-    def error_of(plan: Plan) -> float:
-        tips = at_tip(predict(plan, request.poses), _tip(request))
-        return pooled(np.sqrt(np.einsum("pii->p", tips)))
-
-    return error_of
+    congruences = tuple(_congruences(bodies, request))
+    return Study(request, named[0][1].unit, tuple(systems), congruences)
 
 
 def _system(name: str, session: Session, plan: Plan, request: Request) -> System:
-    error_of = _error_of(request)
+    error_of = request.error_of
     prediction = predict(plan, request.poses)
     setups = tuple(_with_noise(s, n) for s, n in zip(session.sensors, plan.noises, strict=True))
-    summary = summarise(plan, setups, prediction, _tip(request))
+    summary = summarise(plan, setups, prediction, request.point)
     middle = (request.poses[:, :3, :3] @ plan.body.means.mean(axis=0)).mean(axis=0)
     middle = middle + request.poses[:, :3, 3].mean(axis=0)
     return System(
@@ -187,7 +154,7 @@ def _confirmed(
         plan,
         request.poses[closed],
         request.runs,
-        tip=_tip(request),
+        tip=request.point,
         seed=request.seed,
         executor=executor,
     )
@@ -200,7 +167,7 @@ def _equal(
     say: Callable[[str], None],
     confirmed: Callable[[System, Plan], Confirmation | None],
 ) -> Equal:
-    factor = noise_to_equal(system.plan, first.error, _error_of(request))
+    factor = noise_to_equal(system.plan, first.error, request.error_of)
     if factor is None:
         return Equal(None, (), first.error)
     plan = scaled(system.plan, factor)
@@ -215,16 +182,11 @@ def _congruences(bodies: Sequence[Body], request: Request) -> list[LookAlike]:
     found: list[LookAlike] = []
     known: list[Body] = []
     for body in bodies:
-        if any(_same(body, other) for other in known):
+        if any(body.name == o.name and np.array_equal(body.means, o.means) for o in known):
             continue
         for other in known:
-            tolerance = request.tolerance
-            if tolerance is None:
-                tolerance = SHARE_OF_RADIUS * min(body.radius, other.radius)
+            share = SHARE_OF_RADIUS * min(body.radius, other.radius)
+            tolerance = share if request.tolerance is None else request.tolerance
             found += congruent_parts(other, body, tolerance)[:1]
         known.append(body)
     return found
-
-
-def _same(body: Body, other: Body) -> bool:
-    return body.name == other.name and np.array_equal(body.means, other.means)

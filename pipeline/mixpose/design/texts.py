@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from mixpose.body import LookAlike
-from mixpose.design.confirmation import Confirmation
-from mixpose.design.prediction import Plan
+from mixpose.design.confirmation import Confirmation, plain
+from mixpose.design.prediction import Plan, Summary, Weakness, pooled
 from mixpose.design.study import Equal, Study, System
-from mixpose.design.summary import Summary, Weakness, pooled
 from mixpose.records import Floats
-from mixpose.rigid import TWIST_NAMES
+from mixpose.rigid import TWIST_NAMES, inverse
 from mixpose.sensors import RangeSensor, Sensor
 
 _DEGREES = 180 / np.pi
@@ -39,55 +40,56 @@ def study_text(study: Study) -> str:
 
 
 def _system_lines(system: System, study: Study) -> list[str]:
+    head = f"{system.name}: {_errs_text(system.plan, system.plan.noises, study.unit)}"
+    return [head, *(f"  {title:<10}{text}" for title, text in _told(system, study))]
+
+
+def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:
+    """Titles and texts."""
     summary, plan, unit = system.summary, system.plan, study.unit
-    lines = [f"{system.name}: {_errs_text(plan, plan.noises, unit)}"]
-
-    def say(title: str, text: str) -> None:
-        lines.append(f"  {title:<10}{text}")
-
-    say("deviation", _deviations_text(summary, plan, unit))
-    say("error", _errors_text(summary, unit, with_tip=study.request.tip is not None))
-    for what, weakness, each, scale in (
-        ("weakest", summary.weakest_position, unit, 1.0),
-        ("", summary.weakest_rotation, "deg", _DEGREES),
-    ):
-        if weakness is not None:
-            say(what, _weakness_text(weakness, each, scale))
+    yield "deviation", _deviations_text(summary, plan, unit)
+    yield "error", _errors_text(summary, unit, with_tip=study.request.tip is not None)
+    if summary.weakest_position is not None:
+        yield "weakest", _weakness_text(summary.weakest_position, unit, 1.0)
+    if summary.weakest_rotation is not None:
+        yield "", _weakness_text(summary.weakest_rotation, "deg", _DEGREES)
     if summary.undetermined:
         listed = ", ".join(map(str, summary.undetermined[:_NOTED]))
         more = ", ..." if len(summary.undetermined) > _NOTED else ""
-        say("open", f"not determined at {len(summary.undetermined)} poses: {listed}{more}")
+        yield "open", f"not determined at {len(summary.undetermined)} poses: {listed}{more}"
+    yield from _told_of_sensors(system)
+    yield "alike", _alike_text(summary)
+    if system.confirmation is not None:
+        yield "simulated", _confirmation_text(system.confirmation, plan)
+    if system.move is not None:
+        name, gain = plan.body.labels[system.move.marker], _gain(system.move.error, system.error)
+        yield "marker", f"moving {name} by {_vector(system.move.shift)} {unit} gains {gain}"
+    if system.new is not None:
+        like, place = system.new.like, _place(system.new.sensor)
+        gain = _gain(system.new.error, system.error)
+        yield "sensor", f"one more like {like} {place} gains {gain}"
+
+
+def _told_of_sensors(system: System) -> Iterator[tuple[str, str]]:
+    """What is seen by which sensor, and what is odd about it."""
+    summary, plan = system.summary, system.plan
     rows = zip(plan.names, summary.seen, summary.fewest, strict=True)
-    say("in view", ", ".join(f"{n} {s:.0%} (least {f} of {len(plan.body)})" for n, s, f in rows))
-    crowded = [(n, c) for n, c in zip(plan.names, summary.crowded, strict=True) if c > _CROWDED]
+    yield "in view", ", ".join(f"{n} {s:.0%} (least {f} of {len(plan.body)})" for n, s, f in rows)
+    crowded = [f"{n} {c:.0%}" for n, c in zip(plan.names, summary.crowded) if c > _CROWDED]
     if crowded:
-        told = ", ".join(f"{n} {c:.0%}" for n, c in crowded)
-        say(
-            "crowded", f"features nearer than 4 deviations to another: {told}; expect larger errors"
-        )
-    narrow = [
-        (n, share)
-        for n, share, sensor in zip(plan.names, summary.narrow, plan.sensors, strict=True)
-        if share > (_FILLED if sensor.unit == "length" else _NARROW)
-    ]
+        told = f"{', '.join(crowded)}; expect larger errors"
+        yield "crowded", f"features nearer than 4 deviations to another: {told}"
+    most = [_FILLED if sensor.unit == "length" else _NARROW for sensor in plan.sensors]
+    shares = zip(plan.names, summary.narrow, most, strict=True)
+    narrow = [f"{name} {share:.2g}" for name, share, limit in shares if share > limit]
     if narrow:
-        told = ", ".join(f"{n} {share:.2g}" for n, share in narrow)
-        say("sigma", f"features err by much of sigma: {told} of it; raise sigma in [extract]")
+        told = f"{', '.join(narrow)} of it; raise sigma in [extract]"
+        yield "sigma", f"features err by much of sigma: {told}"
     if system.weighed < (1 - _WORTHWHILE) * system.error:
         largest = max(plan.noises)
         told = ", ".join(f"{n} {e / largest:.2g}" for n, e in zip(plan.names, plan.noises))
         gain = _gain(system.weighed, system.error)
-        say("weights", f"sigma in proportion to what features err by ({told}) gains {gain}")
-    say("alike", _alike_text(summary))
-    if system.confirmation is not None:
-        say("simulated", _confirmation_text(system.confirmation, plan))
-    if system.move is not None:
-        name, gain = plan.body.labels[system.move.marker], _gain(system.move.error, system.error)
-        say("marker", f"moving {name} by {_vector(system.move.shift)} {unit} gains {gain}")
-    if system.new is not None:
-        gain = _gain(system.new.error, system.error)
-        say("sensor", f"one more like {system.new.like} {_place(system.new.sensor)} gains {gain}")
-    return lines
+        yield "weights", f"sigma in proportion to what features err by ({told}) gains {gain}"
 
 
 def _errs_text(plan: Plan, noises: tuple[float, ...], unit: str) -> str:
@@ -131,15 +133,13 @@ def _weakness_text(weakness: Weakness, unit: str, scale: float) -> str:
 
 
 def _alike_text(summary: Summary) -> str:
-    parts = ["no symmetry"]
-    if summary.symmetries > 1:
-        parts = [f"{summary.symmetries} orientations look the same"]
-    for other in summary.alike[:_NOTED]:
-        parts.append(
-            f"another pose turned by {other.turn_deg:.0f} deg looks nearly the same, "
-            f"{other.difference:.1f} deviations apart"
-        )
-    return "; ".join(parts)
+    same = f"{summary.symmetries} orientations look the same"
+    others = [
+        f"another pose turned by {other.turn_deg:.0f} deg looks nearly the same, "
+        f"{other.difference:.1f} deviations apart"
+        for other in summary.alike[:_NOTED]
+    ]
+    return "; ".join([same if summary.symmetries > 1 else "no symmetry", *others])
 
 
 def _confirmation_text(found: Confirmation, plan: Plan) -> str:
@@ -152,23 +152,21 @@ def _confirmation_text(found: Confirmation, plan: Plan) -> str:
 
 
 def _comparison(study: Study) -> list[str]:
-    first = study.systems[0]
-    names = [system.name for system in study.systems]
-    width = max(12, *(len(name) + 2 for name in names))
-    rows: list[tuple[str, list[str]]] = [("", names)]
-
-    def add(title: str, errors: list[Floats], scale: float) -> None:
-        rows.append((title, [_number(pooled(error) * scale) for error in errors]))
-
-    summaries = [system.summary for system in study.systems]
-    add(f"position, {study.unit}", [one.position for one in summaries], 1.0)
-    add("rotation, deg", [one.rotation for one in summaries], _DEGREES)
+    systems = study.systems
+    summaries = [system.summary for system in systems]
+    rows = [
+        (f"position, {study.unit}", [one.position for one in summaries]),
+        ("rotation, deg", [one.rotation * _DEGREES for one in summaries]),
+    ]
     if study.request.tip is not None:
-        add(f"tip, {study.unit}", [one.tip for one in summaries], 1.0)
-    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in rows]
-    for system in study.systems[1:]:
+        rows.append((f"tip, {study.unit}", [one.tip for one in summaries]))
+    width = max(12, *(len(system.name) + 2 for system in systems))
+    cells = [("", [system.name for system in systems])]
+    cells += [(title, [_number(pooled(error)) for error in errors]) for title, errors in rows]
+    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in cells]
+    for system in systems[1:]:
         assert system.equal is not None, "all but the first are compared"
-        lines.append(_equal_text(system, system.equal, first.name, study.unit))
+        lines.append(_equal_text(system, system.equal, systems[0].name, study.unit))
     return lines
 
 
@@ -202,8 +200,7 @@ def _place(sensor: Sensor) -> str:
     if isinstance(sensor, RangeSensor):
         return f"at {_vector(sensor.position)}"
     T: Floats = sensor.T_sensor_world  # type: ignore[attr-defined]
-    centre = -T[:3, :3].T @ T[:3, 3]
-    return f"at {_vector(centre)} that looks along {_vector(T[2, :3])}"
+    return f"at {_vector(inverse(T)[:3, 3])} that looks along {_vector(T[2, :3])}"
 
 
 def _number(value: float) -> str:
@@ -222,103 +219,78 @@ JSON_MARK = '"type": "design"'
 
 def study_json(study: Study) -> dict[str, Any]:
     """The same as JSON; what is not determined is null."""
-    return {
-        "type": "design",
-        "unit": study.unit,
-        "tip": None if study.request.tip is None else study.request.tip.tolist(),
-        "poses": study.request.poses.tolist(),
-        "systems": [_system_json(system) for system in study.systems],
-        "congruent": [
-            {
-                "bodies": [alike.body.name, alike.other.name],
-                "markers": [
-                    list(pair) for pair in zip(alike.features, alike.partners, strict=True)
-                ],
-                "misfit": alike.off,
-            }
-            for alike in study.congruences
-        ],
-    }
+    congruent = [
+        {
+            "bodies": [alike.body.name, alike.other.name],
+            "markers": list(zip(alike.features, alike.partners, strict=True)),
+            "misfit": alike.off,
+        }
+        for alike in study.congruences
+    ]
+    told: dict[str, Any] = plain(
+        {
+            "type": "design",
+            "unit": study.unit,
+            "tip": study.request.tip,
+            "poses": study.request.poses,
+            "systems": [_system_json(system) for system in study.systems],
+            "congruent": congruent,
+        }
+    )
+    return told
 
 
 def _system_json(system: System) -> dict[str, Any]:
-    summary, plan = system.summary, system.plan
+    summary, plan, move, new = system.summary, system.plan, system.move, system.new
     result: dict[str, Any] = {
         "name": system.name,
-        "noise": dict(zip(plan.names, plan.noises, strict=True)),
-        "error": _finite(system.error),
-        "error_if_weighed": _finite(system.weighed),
-        "deviations": [[_finite(v) for v in row] for row in summary.deviations],
-        "position": [_finite(v) for v in summary.position],
-        "rotation": [_finite(v) for v in summary.rotation],
-        "tip": [_finite(v) for v in summary.tip],
-        "seen": dict(zip(plan.names, summary.seen.tolist(), strict=True)),
-        "of_sigma": dict(zip(plan.names, summary.narrow.tolist(), strict=True)),
-        "crowded": dict(zip(plan.names, summary.crowded.tolist(), strict=True)),
-        "undetermined": list(summary.undetermined),
+        "noise": _by_sensor(plan, plan.noises),
+        "error": system.error,
+        "error_if_weighed": system.weighed,
+        "deviations": summary.deviations,
+        "position": summary.position,
+        "rotation": summary.rotation,
+        "tip": summary.tip,
+        "seen": _by_sensor(plan, summary.seen),
+        "of_sigma": _by_sensor(plan, summary.narrow),
+        "crowded": _by_sensor(plan, summary.crowded),
+        "undetermined": summary.undetermined,
         "symmetries": summary.symmetries,
         "alike": [
             {"turn_deg": other.turn_deg, "deviations_apart": other.difference}
             for other in summary.alike
         ],
+        "weakest_position": summary.weakest_position and asdict(summary.weakest_position),
+        "weakest_rotation": summary.weakest_rotation and asdict(summary.weakest_rotation),
     }
-    for key, weakness in (
-        ("weakest_position", summary.weakest_position),
-        ("weakest_rotation", summary.weakest_rotation),
-    ):
-        result[key] = None if weakness is None else _weakness_json(weakness)
     if system.confirmation is not None:
         result["simulated"] = _confirmation_json(system.confirmation)
     if system.equal is not None:
         result["equals_first_with"] = _equal_json(system.equal, plan)
-    if system.move is not None:
-        move = system.move
-        result["move_marker"] = {
-            "marker": plan.body.labels[move.marker],
-            "shift": move.shift.tolist(),
-            "error": _finite(move.error),
-        }
-    if system.new is not None:
-        sensor = system.new.sensor
-        place: dict[str, Any] = {"like": system.new.like, "error": _finite(system.new.error)}
-        if isinstance(sensor, RangeSensor):
-            place["position"] = sensor.position.tolist()
-        else:
-            place["T_sensor_world"] = sensor.T_sensor_world.tolist()  # type: ignore[attr-defined]
-        result["new_sensor"] = place
+    if move is not None:
+        marker = plan.body.labels[move.marker]
+        result["move_marker"] = {"marker": marker, "shift": move.shift, "error": move.error}
+    if new is not None:
+        key = "position" if isinstance(new.sensor, RangeSensor) else "T_sensor_world"
+        place = {key: getattr(new.sensor, key)}
+        result["new_sensor"] = {"like": new.like, "error": new.error, **place}
     return result
 
 
-def _weakness_json(weakness: Weakness) -> dict[str, Any]:
-    return {
-        "pose": weakness.pose,
-        "deviation": weakness.deviation,
-        "direction": weakness.direction.tolist(),
-        "ratio": _finite(weakness.ratio),
-    }
+def _by_sensor(plan: Plan, values: Iterable[float]) -> dict[str, float]:
+    return dict(zip(plan.names, values, strict=True))
 
 
 def _confirmation_json(found: Confirmation) -> dict[str, Any]:
     names = ("position", "rotation", "tip")
-    return {
-        "frames": found.frames,
-        "statuses": found.statuses,
-        "ratios": [_finite(v) for v in found.ratios],
-        "overall": _finite(found.overall),
-        "chance": found.chance,
-        "predicted": dict(zip(names, found.predicted.tolist(), strict=True)),
-        "found": dict(zip(names, found.found.tolist(), strict=True)),
-    }
+    both = (dict(zip(names, part, strict=True)) for part in (found.predicted, found.found))
+    return asdict(found) | dict(zip(("predicted", "found"), both, strict=True))
 
 
 def _equal_json(equal: Equal, plan: Plan) -> dict[str, Any]:
-    result: dict[str, Any] = {"factor": equal.factor, "error": _finite(equal.wanted)}
+    result: dict[str, Any] = {"factor": equal.factor, "error": equal.wanted}
     if equal.factor is not None:
-        result["noise"] = dict(zip(plan.names, equal.noises, strict=True))
+        result["noise"] = _by_sensor(plan, equal.noises)
     if equal.confirmation is not None:
         result["simulated"] = _confirmation_json(equal.confirmation)
     return result
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from mixpose.importing.gather import Imported, gather
-from mixpose.importing.text import session_text
+from mixpose.importing.gather import Imported, gather, session_text
 
 __all__ = ["Imported", "gather", "session_text"]

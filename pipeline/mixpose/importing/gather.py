@@ -1,7 +1,9 @@
-"""Reading the files that a session is to be made from, and what is odd about them."""
+"""A session file from the files of other programs, and what is odd about these."""
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -17,45 +19,29 @@ from mixpose.session.messages import BadKeyError, one_line
 from mixpose.session.setup import Unit, scale_between
 
 _TABLES = (".csv", *READERS)
+_EXAMPLE_MM = [[0, 0, 0], [60, 0, 0], [0, 100, 0], [20, 30, 80]]
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What was read, in the unit of the session.
-
-    Attributes
-    ----------
-    unit : {"m", "cm", "mm", "um"}
-    cameras : tuple of CalibratedCamera
-        Names are unique; translations are in `unit`.
-    bodies : tuple of Path
-        Files of markers.
-    files : tuple of Path
-        All that was read.
-    remarks : tuple of str
-        What is known of units and worlds, for the head of the session file.
-    warnings : tuple of str
-        What a person should look at.
-    """
+    """What was read, in the unit of the session."""
 
     unit: Unit
-    cameras: tuple[CalibratedCamera, ...]
-    bodies: tuple[Path, ...]
-    files: tuple[Path, ...]
-    remarks: tuple[str, ...]
-    warnings: tuple[str, ...]
+    cameras: tuple[CalibratedCamera, ...]  # names are unique; translations are in `unit`
+    bodies: tuple[Path, ...]  # files of markers
+    files: tuple[Path, ...]  # all that was read
+    remarks: tuple[str, ...]  # what is known of units and worlds, for the head of the session file
+    warnings: tuple[str, ...]  # what a person should look at
 
 
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
-    """Read calibration files and files of bodies.
+    """Read calibration files and files of bodies, which are told by their ending.
 
     Parameters
     ----------
-    paths : sequence of Path
-        A body is told by its ending: .csv, .rom, .vsk or .obj.
-    unit : {"m", "cm", "mm", "um"}
+    unit : Unit
         Wanted.
-    lengths : {"m", "cm", "mm", "um"} or None
+    lengths : Unit or None
         Unit of translations in files whose format does not fix it; None where nobody says.
 
     Raises
@@ -82,33 +68,30 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             f"{placed[1].files[0]}: its cameras stand in another world than those of "
             f"{placed[0].files[0]}; import them one by one"
         )
-    cameras = _renamed([camera for rig in rigs for camera in rig.cameras])
-    stated = [_stated_unit(rig, unit, lengths) for rig in rigs]
-    remarks = [remark for _, remark, _ in stated if remark]
-    warnings = [warning for _, _, warning in stated if warning]
-    units = [each for (each, _, _), rig in zip(stated, rigs, strict=True) for _ in rig.cameras]
-    cameras = [
-        replace(camera, T_camera_rig=_scaled(camera.T_camera_rig, scale_between(own, unit)))
-        for camera, own in zip(cameras, units, strict=True)
-    ]
-    warnings += _odd(cameras)
+    cameras: list[CalibratedCamera] = []
+    remarks, warnings = [], []
+    for rig in rigs:
+        stated, remark, warning = _stated_unit(rig, unit, lengths)
+        remarks.append(remark)
+        warnings.append(warning)
+        factor = scale_between(stated, unit)
+        cameras += [replace(c, T_camera_rig=_scaled(c.T_camera_rig, factor)) for c in rig.cameras]
+    cameras = _renamed(cameras)
     return Imported(
-        unit=unit,
-        cameras=tuple(cameras),
-        bodies=tuple(bodies),
+        unit,
+        tuple(cameras),
+        tuple(bodies),
         files=tuple(paths),
-        remarks=tuple(remarks),
-        warnings=tuple(warnings),
+        remarks=tuple(filter(None, remarks)),
+        warnings=(*filter(None, warnings), *_odd(cameras)),
     )
 
 
 def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str, str]:
     """The unit of a rig's translations, with a remark and perhaps a warning about it."""
     name = " and ".join(Path(file).name for file in rig.files)
-    if not any(
-        camera.T_camera_rig is not None and camera.T_camera_rig[:3, 3].any()
-        for camera in rig.cameras
-    ):
+    poses = [camera.T_camera_rig for camera in rig.cameras]
+    if not any(T is not None and T[:3, 3].any() for T in poses):
         return unit, "", ""
     (fixed,) = {camera.unit for camera in rig.cameras}
     notes = "; ".join(dict.fromkeys(camera.note for camera in rig.cameras if camera.note))
@@ -187,3 +170,58 @@ def _same(a: CalibratedCamera, b: CalibratedCamera) -> bool:
         return False
     alike = np.array_equal(a.intrinsics.camera_matrix, b.intrinsics.camera_matrix)
     return bool(alike and np.allclose(a.T_camera_rig, b.T_camera_rig, rtol=1e-9, atol=1e-12))
+
+
+def session_text(imported: Imported, output: Path) -> str:
+    """The text of a session file; where it will be, as paths of bodies are relative to it."""
+    names = ", ".join(path.name for path in imported.files)
+    head = [f"# made by mixpose import from {names}"]
+    head += [f"# {remark}" for remark in imported.remarks]
+    parts = ["\n".join([*head, f'unit = "{imported.unit}"']), *_objects(imported, output)]
+    parts += [_sensor(camera) for camera in imported.cameras]
+    return "\n\n".join(parts) + "\n"
+
+
+def _objects(imported: Imported, output: Path) -> list[str]:
+    if not imported.bodies:
+        scale = scale_between("mm", imported.unit)
+        points = [[float(f"{value * scale:g}") for value in point] for point in _EXAMPLE_MM]
+        return [
+            '# an example: put in the places of your markers, or file = "markers.csv"\n'
+            f'[object]\nname = "example"\npoints = {points}'
+        ]
+    heading = "[object]" if len(imported.bodies) == 1 else "[[object]]"
+    stems = [path.stem for path in imported.bodies]
+    texts = []
+    for k, path in enumerate(imported.bodies):
+        name = stems[k] if stems.count(stems[k]) == 1 else f"{stems[k]}_{k + 1}"
+        file = json.dumps(_relative(path, output), ensure_ascii=False)
+        texts.append(f"{heading}\nname = {json.dumps(name, ensure_ascii=False)}\nfile = {file}")
+    return texts
+
+
+def _relative(path: Path, output: Path) -> str:
+    """A path as the session file is to name it."""
+    try:
+        return Path(os.path.relpath(path.resolve(), output.resolve().parent)).as_posix()
+    except ValueError:  # on another drive
+        return path.resolve().as_posix()
+
+
+def _sensor(camera: CalibratedCamera) -> str:
+    given = camera.intrinsics
+    lines = [
+        "[[sensor]]",
+        f"name = {json.dumps(camera.name, ensure_ascii=False)}",
+        f'model = "{given.model or "pinhole"}"',
+        f"# source = {json.dumps(f'{camera.name}/*.png', ensure_ascii=False)}",
+        f"camera_matrix = {given.camera_matrix.tolist()}",
+    ]
+    if given.distortion.size:
+        lines.append(f"distortion = {given.distortion.tolist()}")
+    if given.resolution is not None:
+        lines.append(f"resolution = {list(given.resolution)}")
+    if camera.T_camera_rig is not None:
+        rows = ",\n    ".join(str(row) for row in camera.T_camera_rig.tolist())
+        lines.append(f"T_sensor_world = [\n    {rows},\n]")
+    return "\n".join(lines)

@@ -10,16 +10,14 @@ import numpy as np
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame
 from mixpose.calibration.adjust import Adjusted, adjust
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.choice import informative
-from mixpose.calibration.gauge import Freedom, gauge_rows
-from mixpose.calibration.interpolation import neighbours
-from mixpose.calibration.matching import clock_of
-from mixpose.calibration.rig import blocks_of
-from mixpose.learning.growing import Found, only_once
+from mixpose.calibration.gauge import gauge_rows
+from mixpose.calibration.recorded import informative
+from mixpose.calibration.rig import State, blocks_of
+from mixpose.learning.growing import Found, only_once, usual_reach
 from mixpose.learning.placing import FEWEST
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
 from mixpose.sensors import Sensor
 
@@ -28,55 +26,28 @@ _MET = 0.2  # weight of a pair that counts as seen: within 2.5 deviations
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
-    """The sensors of a recording.
-
-    Attributes
-    ----------
-    names : tuple of str
-    sensors : tuple of Sensor
-    sigmas : (L,) float64
-        σ_ε of each.
-    """
+    """The sensors of a recording."""
 
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
-    sigmas: Floats
+    sigmas: Floats  # (L,): σ_ε of each
 
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A body as its recording shows it.
+    """A body as its recording shows it."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the markers.
-    points : (N, 3) float64
-    covariances : (N, 3, 3) float64
-        Of each marker, the body's frame being where its markers are on average.
-    frames : (N,) int
-        Frames in which two sensors or more saw it.
-    poses : (K, 4, 4) float64
-        T_world_object in the frames that were adjusted.
-    numbers : (K,) int
-        Of these frames; of congruent bodies each has its own pose.
-    count : int
-        Congruent bodies that were seen at a time.
-    residual : float
-        Deviation of detections, as a share of σ_ε.
-    spread : float
-        Standard deviation of markers about their places on the body, along an axis, beyond what
-        errors of detections explain; 0 of a rigid body.
-    """
-
-    names: tuple[str, ...]
-    points: Floats
+    names: tuple[str, ...]  # of the markers
+    points: Floats  # (N, 3)
+    # (N, 3, 3): of each marker, the body's frame being where its markers are on average
     covariances: Floats
-    frames: Indices
-    poses: Floats
-    numbers: Indices
-    count: int
-    residual: float
+    frames: Indices  # (N,): frames in which two sensors or more saw it
+    poses: Floats  # (K, 4, 4): T_world_object in the frames that were adjusted
+    numbers: Indices  # (K,): of these frames; of congruent bodies each has its own pose
+    count: int  # congruent bodies that were seen at a time
+    residual: float  # deviation of detections, as a share of σ_ε
+    # standard deviation of markers about their places on the body, along an axis, beyond what
+    # errors of detections explain; 0 of a rigid body
     spread: float
 
     @property
@@ -117,39 +88,35 @@ def adjusted(
             found = _adjusted(points, frames, poses, eyes)
             seen = _seen(found, len(points), len(frames))
             kept = seen >= max(rules.least_frames, rules.least_share * len(frames))
-            kept &= _are_single(found.rig.points, seen, body, clouds, rules)
+            near = rules.alike * rules.gate * usual_reach(body.places, clouds)
+            kept &= only_once(found.state.rig.points, seen, np.full(len(points), near))
             if kept.all():
-                learnt.append(_learnt(body, found, frames, seen, clouds, eyes))
+                rig, blocks = found.state.rig, found.covariance.reshape(len(points), 3, -1, 3)
+                one = Learnt(
+                    names=rig.labels,
+                    points=rig.points,
+                    covariances=np.array([blocks[k, :, k] for k in range(len(points))]),
+                    frames=seen,
+                    poses=found.state.poses,
+                    numbers=np.array([frame.number for frame in frames]),
+                    count=body.count,
+                    residual=float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2))),
+                    spread=_spread(body, clouds),
+                )
+                learnt.append(one)
                 break
             points = points[kept]
     return learnt
 
 
-def _are_single(
-    points: Floats,
-    seen: Indices,
-    body: Found,
-    clouds: Sequence[Cloud],
-    rules: LearningRules,
-) -> Mask:
-    """Which markers (N,) are not what another one is, once adjusted."""
-    reach = np.median([clouds[k].reach[one.met[one.met >= 0]].mean() for k, one in body.places])
-    near = np.full(len(points), rules.alike * rules.gate * float(reach))
-    return only_once(points, seen, near)
-
-
 def _frames_of(
-    body: Found,
-    bodies: Sequence[Found],
-    clouds: Sequence[Cloud],
-    eyes: Eyes,
-    rules: LearningRules,
+    body: Found, bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes, rules: LearningRules
 ) -> tuple[tuple[SeenFrame, ...], Floats]:
     """What sensors saw of a body in the frames that tell most of it; and its poses there."""
     taken: dict[int, list[tuple[object, Indices]]] = {}
     for each in bodies:
         for k, one in each.places:
-            own = clouds[k].detections[one.met[one.met >= 0]]
+            own = clouds[k].detections[one.there]
             taken.setdefault(k, []).append((one, own))
     frames, poses = list[SeenFrame](), dict[int, Floats]()
     for k, one in body.places:
@@ -173,49 +140,23 @@ def _left(seen: SeenFrame, others: Sequence[Indices]) -> SeenFrame:
 
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
-    rules, sensors = CalibrationRules(), len(eyes.sensors)
-    none = np.zeros(sensors)
+    rules, none = CalibrationRules(), np.zeros(len(eyes.sensors))
     labels = tuple(str(k + 1) for k in range(len(points)))
     rig = Rig(eyes.names, eyes.sensors, points, None, none, none, labels)
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
-    clock = clock_of(frames, neighbours([None] * len(frames), rules.gap), sensors)
     free = np.ones(6, dtype=np.bool_)
-    bundle = Bundle(frames, clock, blocks, free, rules.undetermined)
-    gauge, _ = gauge_rows(rig, blocks, Freedom(free, poses))
-    return adjust(bundle, rig, poses, lambda _: gauge, eyes.sigmas, rules)
+    state = State(rig, poses)
+    gauge, _ = gauge_rows(state, blocks, free)
+    return adjust(Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules), state)
 
 
 def _seen(found: Adjusted, markers: int, frames: int) -> Indices:
     """Frames (N,) in which two sensors or more met a marker."""
     met = np.zeros((frames, markers), dtype=np.intp)
-    for pairs, _, weight in found.weighted:
-        good = pairs.nearest & (weight > _MET)
-        np.add.at(met, (pairs.frame[good], pairs.feature[good]), 1)
+    for rows, weight in found.weighted:
+        good = rows.pairs.nearest & (weight > _MET)
+        np.add.at(met, (rows.pairs.frame[good], rows.pairs.feature[good]), 1)
     return np.asarray((met >= 2).sum(axis=0))
-
-
-def _learnt(
-    body: Found,
-    found: Adjusted,
-    frames: Sequence[SeenFrame],
-    seen: Indices,
-    clouds: Sequence[Cloud],
-    eyes: Eyes,
-) -> Learnt:
-    count = len(found.rig.points)
-    blocks = found.covariance.reshape(count, 3, count, 3)
-    residual = float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2)))
-    return Learnt(
-        names=found.rig.labels,
-        points=found.rig.points,
-        covariances=np.array([blocks[k, :, k] for k in range(count)]),
-        frames=seen,
-        poses=found.poses,
-        numbers=np.array([frame.number for frame in frames]),
-        count=body.count,
-        residual=residual,
-        spread=_spread(body, clouds),
-    )
 
 
 def _spread(body: Found, clouds: Sequence[Cloud]) -> float:
@@ -224,10 +165,8 @@ def _spread(body: Found, clouds: Sequence[Cloud]) -> float:
         return 0.0
     squared, expected, count = 0.0, 0.0, 0
     for k, one in body.places:
-        own = np.flatnonzero(one.met >= 0)
-        there = clouds[k].points[one.met[own]]
-        away = there - transform(one.T_world_shape, body.shape.points[own])
-        squared += float((away**2).sum())
-        expected += float((clouds[k].reach[one.met[own]] ** 2).sum())
-        count += 3 * len(own) - 6
+        shown = transform(one.T_world_shape, body.shape.points[one.own])
+        squared += float(((clouds[k].points[one.there] - shown) ** 2).sum())
+        expected += float((clouds[k].reach[one.there] ** 2).sum())
+        count += 3 * one.count - 6
     return float(np.sqrt(max(squared - expected, 0.0) / max(count, 1)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -42,28 +43,14 @@ def in_principal_axes(learnt: Learnt) -> Learnt:
         axes[k] *= 1.0 if skew >= 0 else -1.0
     axes[2] = np.cross(axes[0], axes[1])
     order = np.argsort(-(away @ axes[0]), kind="stable")
-    found = learnt.within(inverse(from_parts(axes.T, middle)), order)
-    return numbered(found)
-
-
-def numbered(learnt: Learnt) -> Learnt:
-    """The body with its markers called 1, 2, 3 ..."""
-    return replace(learnt, names=tuple(str(k + 1) for k in range(len(learnt.points))))
+    names = tuple(str(k + 1) for k in range(len(order)))
+    return replace(learnt.within(inverse(from_parts(axes.T, middle)), order), names=names)
 
 
 def by_markers(learnt: Learnt, words: str) -> Learnt:
     """The body with the origin in a marker, x to a second one, and a third in the x-y plane.
 
-    Parameters
-    ----------
-    learnt : Learnt
-    words : str
-        ``O,X,Y``: three markers by name.
-
-    Raises
-    ------
-    SessionError
-        If these are no three markers that span a plane.
+    They are named ``O,X,Y``.  Raises a SessionError if these are no three that span a plane.
     """
     wanted = [word.strip() for word in words.split(",")]
     if len(set(wanted)) != 3 or len(wanted) != 3 or not set(wanted) <= set(learnt.names):
@@ -91,15 +78,9 @@ class Likeness(NamedTuple):
 
 
 def like(learnt: Learnt, points: Floats, names: Sequence[str]) -> Likeness | None:
-    """The body in the frame, order and names of an older one; None where it is another.
+    """The body in the frame, order and names of an older one (M, 3); None where it is another.
 
-    Parameters
-    ----------
-    learnt : Learnt
-    points : (M, 3) array
-        Of the older body.
-    names : sequence of str
-        Of its markers; empty where they have none.
+    Names are empty where markers of the older body have none.
     """
     old, new = body_of("old", points), body_of("new", learnt.points)
     parts = congruent_parts(old, new, tolerance_of(old, new, ALIKE))
@@ -118,13 +99,5 @@ def like(learnt: Learnt, points: Floats, names: Sequence[str]) -> Likeness | Non
 
 def _called(partners: Sequence[int | None], known: Sequence[str]) -> tuple[str, ...]:
     """Names of markers: those of partners, else the next number that is no name."""
-    called, number = list[str](), len(known)
-    for partner in partners:
-        if partner is not None:
-            called.append(known[partner])
-            continue
-        number += 1
-        while str(number) in known:
-            number += 1
-        called.append(str(number))
-    return tuple(called)
+    others = (str(number) for number in count(len(known) + 1) if str(number) not in known)
+    return tuple(next(others) if partner is None else known[partner] for partner in partners)

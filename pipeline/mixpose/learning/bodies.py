@@ -1,4 +1,7 @@
-"""Bodies of a recording, one after the other."""
+"""Bodies of a recording, one after the other.
+
+Each begins with a shape: points of one frame that lie alike in others.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.calibration.task import Progress, silent
-from mixpose.learning.growing import Found, averaged, grown, placed, poses_apart
-from mixpose.learning.placing import FEWEST, Shape
+from mixpose.learning.growing import Found, averaged, grown, placed
+from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
-from mixpose.learning.seeds import seeds
+from mixpose.records import Floats, Mask
+from mixpose.rigid import transform
 
 _OF_COPY = 0.6  # of the points of a shape that another one of it must show
 _DECOYS = (0.8, 0.87, 0.93, 1.08, 1.16, 1.25)  # sizes of shapes that are not there
 _TRIED = 8  # seeds that may fail one after the other
+_OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those that show this
 
 
 def find_bodies(
@@ -27,17 +34,7 @@ def find_bodies(
 ) -> list[Found]:
     """Find what moves rigidly in clouds without what stands still; most points seen first.
 
-    Parameters
-    ----------
-    clouds : sequence of Cloud
-    rules : LearningRules
-    rng : Generator
-    progress : callable
-
-    Returns
-    -------
-    list of Found
-        Which points they meet is told by `Cloud.rows`.
+    Which points the bodies meet is told by `Cloud.rows`.
     """
     left, found = list(clouds), list[Found]()
     while len(found) < rules.most_bodies:
@@ -63,8 +60,8 @@ def _next(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generato
     """The most evident body of what is left."""
     for loose in rules.looser[:2]:
         looser = [cloud.loosened(loose) for cloud in clouds]
-        for seed in seeds(looser, rules, rng)[:_TRIED]:
-            body = _loose_enough(seed.shape, loose, clouds, rules)
+        for shape in _shapes(looser, rules, rng)[:_TRIED]:
+            body = _loose_enough(shape, loose, clouds, rules)
             if body is not None:
                 return body
     return None
@@ -112,7 +109,7 @@ def _with_copies(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> 
     often = _often(int((per_frame > 0).sum()), rules)
     count = max(n for n in range(1, rules.most_bodies) if n == 1 or (per_frame >= n).sum() >= often)
     shape = averaged(body.shape, places, clouds, rules)
-    return Found(shape, tuple(places), poses_apart(shape, places, clouds, rules), count)
+    return Found(shape, tuple(places), count)
 
 
 def _often(frames: int, rules: LearningRules) -> float:
@@ -124,7 +121,7 @@ def _left(clouds: Sequence[Cloud], body: Found) -> list[Cloud]:
     """Clouds without the points of a body, and without ghosts that its detections make."""
     left = list(clouds)
     for k, one in body.places:
-        left[k] = left[k].without(clouds[k].detections[one.met[one.met >= 0]])
+        left[k] = left[k].without(clouds[k].detections[one.there])
     return left
 
 
@@ -134,3 +131,86 @@ def _without(clouds: Sequence[Cloud], body: Found, rules: LearningRules) -> list
     looser = [cloud.loosened(body.loose) for cloud in left]
     rest = placed(body.shape, looser, rules, body.count, FEWEST)
     return _left(left, replace(body, places=tuple(rest)))
+
+
+def _shapes(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Shape]:
+    """Shapes that recur, the most promising first; where there are too many, triples are drawn."""
+    sizes = np.array([len(cloud) for cloud in clouds])
+    usable = np.flatnonzero(sizes >= FEWEST)
+    if len(usable) < rules.least_frames:
+        return []
+    some = np.linspace(0, len(usable) - 1, min(len(usable), rules.compared)).astype(np.intp)
+    compared = usable[np.unique(some)]
+    found = list[tuple[int, Shape]]()
+    for part in np.array_split(usable, min(rules.references, len(usable))):
+        reference = clouds[part[np.argmax(sizes[part])]]
+        others = [clouds[k] for k in compared if clouds[k] is not reference]
+        for triple in _near_triples(reference, rules, rng):
+            scored = _scored(reference, triple, others, rules)
+            if scored is not None:
+                found.append(scored)
+    return [shape for _, shape in sorted(found, key=lambda scored: -scored[0])]
+
+
+def _near_triples(
+    cloud: Cloud, rules: LearningRules, rng: np.random.Generator
+) -> list[tuple[int, int, int]]:
+    """Triples that are not on a line: of a point and two of its neighbours, and of any."""
+    reach = min(rules.neighbours + 1, len(cloud))
+    _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
+    found = set[tuple[int, int, int]]()
+    for row in near:
+        own = np.sort(row[triples_of(cloud.points[row], cloud.reach[row])], axis=1)
+        found |= {(a, b, c) for a, b, c in own.tolist()}
+    drawn = sorted(found)
+    if len(drawn) > rules.triples:
+        drawn = [drawn[k] for k in rng.choice(len(drawn), rules.triples, replace=False)]
+    for _ in range(rules.far_triples if len(cloud) > reach else 0):
+        a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
+        some = [a, b, c]
+        if (a, b, c) not in found and len(triples_of(cloud.points[some], cloud.reach[some])):
+            drawn.append((a, b, c))
+    return drawn
+
+
+def _scored(
+    reference: Cloud, triple: tuple[int, int, int], others: Sequence[Cloud], rules: LearningRules
+) -> tuple[int, Shape] | None:
+    """What goes along with a triple, and how many points other frames show alike beyond two."""
+    base = list(triple)
+    goes_along, matched, score = np.zeros(len(reference)), 0, 0
+    seen = [reference.points[base]]
+    far = rules.apart * rules.gate * reference.reach[base].max()
+    for other in others:
+        there = _goes_along(reference, base, other, rules)
+        if there is None:
+            continue
+        met, places = there
+        if min(np.abs(places - each).max() for each in seen) > far:
+            seen.append(places)
+            matched += 1
+            score += int(met.sum()) - FEWEST + 1
+            goes_along += met
+    chosen = np.flatnonzero(goes_along >= max(_OF_MATCHED * matched, 2.0))
+    if matched < FEWEST or len(chosen) < FEWEST:
+        return None
+    return score, Shape(reference.points[chosen], reference.reach[chosen])
+
+
+def _goes_along(
+    reference: Cloud, base: list[int], other: Cloud, rules: LearningRules
+) -> tuple[Mask, Floats] | None:
+    """Points (P,) of a cloud that lie in another as they do about a triple, and where this is."""
+    points = reference.points[base]
+    typical = np.hypot(np.median(other.reach), reference.reach[base].max())
+    triples = congruent_triples(points, other.points, rules.gate * np.sqrt(2.0) * typical)
+    if not len(triples):
+        return None
+    poses = motions(points, other.points[triples])
+    away, nearest = cKDTree(other.points).query(transform(poses, reference.points))
+    share = away / (2 * rules.gate * np.hypot(other.reach[nearest], reference.reach))
+    met = share < 1
+    met &= (share[:, base] < 1).all(axis=1)[:, None]
+    counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
+    best = int(np.argmax(counts))
+    return (met[best], other.points[triples[best]]) if met[best].any() else None

@@ -12,17 +12,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mixpose.learning.placing import (
-    FEWEST,
-    Placement,
-    Shape,
-    apart,
-    placements,
-    wide_triples,
-)
-from mixpose.learning.points import Cloud
+from mixpose.learning.placing import FEWEST, Placement, Shape, placements, wide_triples
+from mixpose.learning.points import Cloud, gathered_places
 from mixpose.learning.rules import LearningRules
-from mixpose.learning.still import gathered_places
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import inverse, transform
 
@@ -34,47 +26,18 @@ _SURER = 0.15  # of a point's reach: errors that many frames have in common
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A body, and where it is in which frames.
+    """A body, and where it is in which frames."""
 
-    Attributes
-    ----------
-    shape : Shape
-        In a frame of its own.
-    places : tuple of (int, Placement)
-        With the index of the cloud; of congruent bodies several of one.
-    apart : (K,) int
-        Numbers of the placements' poses, the same where the body is at the same place.
-    count : int
-        Congruent bodies that are seen at a time.
-    loose : float
-        Times the error of triangulation that its points may be off.
-    """
-
-    shape: Shape
+    shape: Shape  # in a frame of its own
+    # with the index of the cloud; of congruent bodies several of one
     places: tuple[tuple[int, Placement], ...]
-    apart: Indices
-    count: int = 1
-    loose: float = 1.0
+    count: int = 1  # congruent bodies that are seen at a time
+    loose: float = 1.0  # times the error of triangulation that its points may be off
 
     @property
     def met(self) -> int:
         """Points that are met, all frames together."""
         return sum(one.count for _, one in self.places)
-
-    @property
-    def different(self) -> int:
-        """Poses that are apart from each other."""
-        return int(self.apart.max(initial=-1)) + 1
-
-    @property
-    def poses(self) -> Floats:
-        """Poses (K, 4, 4) of all placements."""
-        return np.array([one.T_world_shape for _, one in self.places]).reshape(-1, 4, 4)
-
-
-def least_met(points: int) -> int:
-    """Points of a shape that must be met, so that no other points lie like them by chance."""
-    return FEWEST if points <= FEWEST + 1 else FEWEST + 1
 
 
 def placed(
@@ -84,25 +47,24 @@ def placed(
     most: int = 1,
     least: int | None = None,
 ) -> list[tuple[int, Placement]]:
-    """Where a shape is in all clouds, at most so many times in each."""
+    """Where a shape is in all clouds, at most so many times in each.
+
+    So many of its points must be met that no others lie like them by chance.
+    """
     bases = wide_triples(shape.points, shape.reach, rules.bases)
-    fewest = least_met(len(shape)) if least is None else least
+    if least is None:
+        least = FEWEST if len(shape) <= FEWEST + 1 else FEWEST + 1
     return [
         (k, one)
         for k, cloud in enumerate(clouds)
-        for one in placements(shape, bases, cloud, rules, most, fewest)
+        for one in placements(shape, bases, cloud, rules, most, least)
     ]
 
 
 def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found | None:
-    """Find a shape in all frames, and in these all that goes along; None where it does not recur.
+    """Find a shape of three points or more in all frames, and in these all that goes along.
 
-    Parameters
-    ----------
-    shape : Shape
-        Three points or more.
-    clouds : sequence of Cloud
-    rules : LearningRules
+    None where it does not recur.
     """
     for turn in range(rules.rounds):
         places = placed(shape, clouds, rules)
@@ -114,36 +76,50 @@ def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found 
         if turn + 1 == rules.rounds:
             break
         before = len(shape)
-        shape = with_hidden(shape, places, clouds, rules)
+        shape = _with_hidden(shape, places, clouds, rules)
         if len(shape) == before and turn:
             break
     if not len(wide_triples(shape.points, shape.reach, 1)):
         return None
     places = placed(shape, clouds, rules)
-    found = Found(shape, tuple(places), poses_apart(shape, places, clouds, rules))
-    return found if found.different >= rules.least_frames else None
+    _, different = _poses_apart(shape, places, clouds, rules)
+    return Found(shape, tuple(places)) if different >= rules.least_frames else None
 
 
-def poses_apart(
+def usual_reach(places: Places, clouds: Sequence[Cloud]) -> float:
+    """By how much points that are met are off, in most placements."""
+    return float(np.median([clouds[k].reach[one.there].mean() for k, one in places]))
+
+
+def _poses_apart(
     shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
-) -> Indices:
-    """Numbers (K,) of the poses of placements, the same where the body is at the same place."""
+) -> tuple[Indices, int]:
+    """Numbers (K,) of the poses of placements, from 0, and how many are apart from each other.
+
+    The number is the same where the body is at the same place: where no point of the shape is far
+    from where an earlier pose has it.
+    """
     if not places:
-        return np.zeros(0, dtype=np.intp)
-    poses = np.array([one.T_world_shape for _, one in places])
-    reach = np.median([clouds[k].reach[one.met[one.met >= 0]].mean() for k, one in places])
-    return apart(transform(poses, shape.points), rules.apart * rules.gate * float(reach))
+        return np.zeros(0, dtype=np.intp), 0
+    points = transform(np.array([one.T_world_shape for _, one in places]), shape.points)
+    far = rules.apart * rules.gate * usual_reach(places, clouds)
+    number, count = np.full(len(points), -1, dtype=np.intp), 0
+    for k in range(len(points)):
+        if number[k] < 0:
+            away = np.abs(points - points[k]).max(axis=(1, 2), initial=0.0)
+            number[(number < 0) & (away <= far)] = count
+            count += 1
+    return number, count
 
 
 def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules) -> Shape:
     """The shape as its frames show it on average, without points that few of them show."""
     weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
     counts, reach = np.zeros(len(shape)), np.zeros(len(shape))
-    number = poses_apart(shape, places, clouds, rules)
-    seen = np.zeros((len(shape), int(number.max(initial=-1)) + 1), dtype=np.bool_)
+    number, different = _poses_apart(shape, places, clouds, rules)
+    seen = np.zeros((len(shape), different), dtype=np.bool_)
     for n, (k, one) in zip(number.tolist(), places, strict=True):
-        own = np.flatnonzero(one.met >= 0)
-        there = one.met[own]
+        own, there = one.own, one.there
         w = 1 / clouds[k].reach[there] ** 2
         total[own] += w[:, None] * transform(inverse(one.T_world_shape), clouds[k].points[there])
         weight[own] += w
@@ -172,19 +148,19 @@ def _reach_of(reach: Floats, counts: Floats) -> Floats:
     return np.asarray(reach * np.maximum(1 / np.sqrt(counts), _SURER))
 
 
-def with_hidden(
+def _with_hidden(
     shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
 ) -> Shape:
     """The shape with points that are at one place of it at many poses."""
     points, reach, frame = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
-    number = poses_apart(shape, places, clouds, rules)
+    number, different = _poses_apart(shape, places, clouds, rules)
     for n, (k, one) in zip(number.tolist(), places, strict=True):
-        free = clouds[k].without(clouds[k].detections[one.met[one.met >= 0]])
+        free = clouds[k].without(clouds[k].detections[one.there])
         own = transform(inverse(one.T_world_shape), free.points)
         points.append(own)
         reach.append(rules.gate * free.reach * _lever(shape, own, one.count))
         frame.append(np.full(len(own), n))
-    least = max(rules.least_frames, rules.least_share * (int(number.max(initial=-1)) + 1))
+    least = max(rules.least_frames, rules.least_share * different)
     reaches = np.concatenate(reach)
     more = gathered_places(np.concatenate(points), reaches, np.concatenate(frame), least, rules)
     if not more:

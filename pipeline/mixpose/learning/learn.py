@@ -14,9 +14,8 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.learning.adjusting import Eyes, Learnt, adjusted
 from mixpose.learning.axes import in_principal_axes
 from mixpose.learning.bodies import find_bodies
-from mixpose.learning.points import Cloud, clouds_of
+from mixpose.learning.points import Cloud, clouds_of, without_still
 from mixpose.learning.rules import LearningRules
-from mixpose.learning.still import without_still
 from mixpose.records import Floats
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
@@ -24,34 +23,16 @@ from mixpose.threads import one_blas_thread
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """What a recording told.
+    """What a recording told."""
 
-    Attributes
-    ----------
-    bodies : tuple of Learnt
-        In their principal axes, those of which most was seen first.
-    still : int
-        Other things that were seen and stood still all the time.
-    frames : int
-        That were read.
-    noise : float
-        Deviation of detections as a share of σ_ε, by how closely lines of sight meet.
-    """
-
-    bodies: tuple[Learnt, ...]
-    still: int
-    frames: int
-    noise: float
+    bodies: tuple[Learnt, ...]  # in their principal axes, those of which most was seen first
+    still: int  # other things that were seen and stood still all the time
+    frames: int  # that were read
+    noise: float  # deviation of detections as a share of σ_ε, by how closely lines of sight meet
 
 
 def eyes_of(session: Session) -> Eyes:
-    """The sensors of a session.
-
-    Raises
-    ------
-    SessionError
-        If fewer than two of them have lines of sight.
-    """
+    """The sensors of a session; a SessionError if fewer than two have lines of sight."""
     setups = session.sensors
     seeing = [one.name for one in setups if one.sensor.dimension == 2]
     if len(seeing) < 2:
@@ -75,14 +56,7 @@ def learn(
 ) -> Lesson:
     """Learn the bodies that move in a session's recording.
 
-    Parameters
-    ----------
-    session : Session
-        Its own bodies are not looked at.
-    sources : dict of str to str or None
-        Recordings in place of the session's, by sensor.
-    rules : LearningRules
-    progress : callable
+    The session's own bodies are not looked at; `sources` stand in place of its recordings.
 
     Raises
     ------
@@ -108,21 +82,9 @@ def learn_from(
     *,
     name: str = "recording",
 ) -> Lesson:
-    """Learn bodies from detections.
+    """Learn bodies from detections of a recording, which messages call by a name.
 
-    Parameters
-    ----------
-    frames : sequence of SeenFrame
-    eyes : Eyes
-    rules : LearningRules
-    progress : callable
-    name : str
-        What messages call the recording.
-
-    Raises
-    ------
-    RecordingError
-        If no body is seen to move.
+    Raises a RecordingError if no body is seen to move.
     """
     progress("triangulating", 0, 1)
     clouds, noise = clouds_of(frames, eyes.sensors, eyes.sigmas, rules)

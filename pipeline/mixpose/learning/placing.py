@@ -17,52 +17,44 @@ from mixpose.rigid import from_parts, transform
 
 FEWEST = 3
 _HEIGHT = 4.0  # deviations of a point above the longest side: less fixes no turn
-_REFINED = 3  # fits to all that is met, of which later ones reach farther from the first three
+# gates within which points are met before and after each fit to all that is met; later fits reach
+# farther from the first three
+_WIDE = (2.0, 2.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Points of a body, as far as it is known.
+    """Points of a body, as far as it is known."""
 
-    Attributes
-    ----------
-    points : (N, 3) float64
-    reach : (N,) float64
-        Standard deviation of each, as of `Cloud`.
-    """
-
-    points: Floats
-    reach: Floats
+    points: Floats  # (N, 3)
+    reach: Floats  # (N,): standard deviation of each, as of `Cloud`
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def only(self, chosen: Indices) -> Shape:
-        """Some of the points."""
-        return Shape(self.points[chosen], self.reach[chosen])
-
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a shape is in a frame.
+    """Where a shape is in a frame."""
 
-    Attributes
-    ----------
-    T_world_shape : (4, 4) float64
-    met : (N,) int
-        The point of the cloud that each point of the shape is; -1 for none.
-    off : float
-        Root mean square distance of the two, by what they may be off.
-    """
+    T_world_shape: Floats  # (4, 4)
+    met: Indices  # (N,): the point of the cloud that each point of the shape is; -1 for none
+    off: float  # root mean square distance of the two, by what they may be off
 
-    T_world_shape: Floats
-    met: Indices
-    off: float
+    @property
+    def own(self) -> Indices:
+        """Points of the shape that are met."""
+        return np.flatnonzero(self.met >= 0)
+
+    @property
+    def there(self) -> Indices:
+        """Points of the cloud that they meet."""
+        return self.met[self.own]
 
     @property
     def count(self) -> int:
         """How many points are met."""
-        return int((self.met >= 0).sum())
+        return len(self.own)
 
 
 def triples_of(points: Floats, reach: Floats) -> Indices:
@@ -91,36 +83,20 @@ def wide_triples(points: Floats, reach: Floats, most: int) -> Indices:
 
 
 def placements(
-    shape: Shape,
-    bases: Indices,
-    cloud: Cloud,
-    rules: LearningRules,
-    most: int,
-    least: int = FEWEST,
+    shape: Shape, bases: Indices, cloud: Cloud, rules: LearningRules, most: int, least: int
 ) -> list[Placement]:
     """Placements of a shape in a cloud, of which no two have a point in common; the best first.
 
-    Parameters
-    ----------
-    shape : Shape
-    bases : (B, 3) int
-        Triples of it that are looked for.
-    cloud : Cloud
-    rules : LearningRules
-    most : int
-        Placements that are wanted.
-    least : int
-        Points that must be met.
+    At most so many, by the triples (B, 3) of it that are looked for, and with at least so many
+    points met.
     """
     if len(cloud) < least or not len(bases):
         return []
     typical = np.hypot(np.median(cloud.reach), np.median(shape.reach))
-    candidates = []
-    for base in bases:
-        triples = congruent_triples(
-            shape.points[base], cloud.points, rules.gate * np.sqrt(2.0) * typical
-        )
-        candidates.append(motions(shape.points[base], cloud.points[triples]))
+    off, candidates = rules.gate * np.sqrt(2.0) * typical, []
+    for base in shape.points[bases]:
+        triples = congruent_triples(base, cloud.points, off)
+        candidates.append(motions(base, cloud.points[triples]))
     poses = np.concatenate(candidates)
     if not len(poses):
         return []
@@ -140,7 +116,7 @@ def placements(
     good.sort(key=lambda each: (-each.count, each.off))
     kept, taken = list[Placement](), set[int]()
     for each in good:
-        own = set(each.met[each.met >= 0].tolist())
+        own = set(each.there.tolist())
         if not own & taken:
             kept.append(each)
             taken |= own
@@ -153,34 +129,33 @@ def _refined(
     shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, rules: LearningRules
 ) -> Placement:
     """Fit a pose to all points that it meets."""
-    met, off = np.full(len(shape), -1), np.inf
-    for turn in range(_REFINED + 1):
-        met, off = meetings(shape, T, cloud, tree, rules, 2.0 if turn < _REFINED - 1 else 1.0)
-        own = np.flatnonzero(met >= 0)
-        if len(own) < FEWEST or turn == _REFINED:
+    found = _placement(shape, T, cloud, tree, rules, _WIDE[0])
+    for wide in _WIDE[1:]:
+        if found.count < FEWEST:
             break
-        T = weighted_motion(shape.points[own], cloud.points[met[own]], cloud.reach[met[own]])
-    return Placement(T, met, off)
+        there = found.there
+        T = _weighted_motion(shape.points[found.own], cloud.points[there], cloud.reach[there])
+        found = _placement(shape, T, cloud, tree, rules, wide)
+    return found
 
 
-def meetings(
+def _placement(
     shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, rules: LearningRules, wide: float
-) -> tuple[Indices, float]:
-    """Which point of a cloud each point of a shape (N,) is at a pose, one to one; and the RMS."""
+) -> Placement:
+    """Which point of a cloud each point of a shape is at a pose, one to one."""
     away, nearest = tree.query(transform(T, shape.points))
     share = away / (rules.gate * wide * np.hypot(cloud.reach[nearest], shape.reach))
     met = np.full(len(shape), -1, dtype=np.intp)
-    taken = set[int]()
-    for k in np.argsort(share, kind="stable"):
-        if share[k] < 1 and int(nearest[k]) not in taken:
-            met[k] = nearest[k]
-            taken.add(int(nearest[k]))
-    found = met >= 0
-    off = float(np.sqrt(np.mean(share[found] ** 2))) if found.any() else np.inf
-    return met, off
+    order = np.argsort(share, kind="stable")
+    order = order[share[order] < 1]
+    _, first = np.unique(nearest[order], return_index=True)
+    found = np.sort(order[first])
+    met[found] = nearest[found]
+    off = float(np.sqrt(np.mean(share[found] ** 2))) if len(found) else np.inf
+    return Placement(T, met, off)
 
 
-def weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
+def _weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
     """The motion (4, 4) of points (n, 3) onto others, those that are known better counting more."""
     weight = 1 / reach**2
     weight = weight / weight.sum()
@@ -188,19 +163,3 @@ def weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
     turn, _ = Rotation.align_vectors(target - b, source - a, weights=weight)
     R = turn.as_matrix()
     return from_parts(R, b - R @ a)
-
-
-def apart(points: Floats, far: float) -> Indices:
-    """Which of the poses that put a shape to points (K, N, 3) are new (K,): numbers from 0.
-
-    Poses in which no point of the shape is farther away than `far` from where an earlier pose has
-    it have the number of that.
-    """
-    number = np.full(len(points), -1, dtype=np.intp)
-    count = 0
-    for k in range(len(points)):
-        if number[k] < 0:
-            away = np.abs(points - points[k]).max(axis=(1, 2), initial=0.0)
-            number[(number < 0) & (away <= far)] = count
-            count += 1
-    return number

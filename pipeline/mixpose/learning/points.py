@@ -1,10 +1,12 @@
-"""Points in space of each frame, where lines of sight of two sensors or more meet."""
+"""Points in space of each frame, where lines of sight of two sensors or more meet.
+
+And what of them does not move: points that are at one place of the world in most frames.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,44 +24,16 @@ _SHARES = np.logspace(-2.5, 0.3, 60)  # deviations that are tried, by the gate
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points in space that one frame shows, some of which are ghosts: rays that meet by chance.
+    """Points in space that one frame shows, some of which are ghosts: rays that meet by chance."""
 
-    Attributes
-    ----------
-    number : int
-        Of the frame.
-    points : (P, 3) float64
-        In the world.
-    reach : (P,) float64
-        Standard deviation of a point along the axis in which it is known worst.
-    detections : (P, L) int
-        Of each sensor the detection that it is seen as, or -1.
-    rows : (P,) int
-        Which points these are of all that the frame shows.
-    seen : SeenFrame
-        All detections of the frame.
-    """
-
-    number: int
-    points: Floats
-    reach: Floats
-    detections: Indices
-    rows: Indices
-    seen: SeenFrame
+    points: Floats  # (P, 3): in the world
+    reach: Floats  # (P,): standard deviation of a point along the axis in which it is known worst
+    detections: Indices  # (P, L): of each sensor the detection that it is seen as, or -1
+    rows: Indices  # (P,): which points these are of all that the frame shows
+    seen: SeenFrame  # all detections of the frame
 
     def __len__(self) -> int:
         return len(self.points)
-
-    def only(self, chosen: Any) -> Cloud:
-        """Some of the points."""
-        return Cloud(
-            self.number,
-            self.points[chosen],
-            self.reach[chosen],
-            self.detections[chosen],
-            self.rows[chosen],
-            self.seen,
-        )
 
     def loosened(self, times: float) -> Cloud:
         """The cloud with points that are known less well."""
@@ -71,35 +45,24 @@ class Cloud:
         for sensor in range(self.detections.shape[1]):
             taken = detections[:, sensor]
             left &= ~np.isin(self.detections[:, sensor], taken[taken >= 0])
-        return self.only(left)
+        return replace(
+            self,
+            points=self.points[left],
+            reach=self.reach[left],
+            detections=self.detections[left],
+            rows=self.rows[left],
+        )
 
 
 def clouds_of(
     frames: Sequence[SeenFrame], sensors: Sequence[Sensor], sigmas: Floats, rules: LearningRules
 ) -> tuple[list[Cloud], float]:
-    """Triangulate every frame.
-
-    Parameters
-    ----------
-    frames : sequence of SeenFrame
-    sensors : sequence of Sensor
-    sigmas : (L,) array
-        Largest error σ_ε of detections by sensor.
-    rules : LearningRules
-
-    Returns
-    -------
-    list of Cloud
-    float
-        Standard deviation of detections, as a share of σ_ε.
-    """
+    """Triangulate every frame; and the deviation of detections, as a share of their σ_ε (L,)."""
     told = [_seen(frame, sensors) for frame in frames]
     wide = rules.widest * sigmas
     some = np.linspace(0, len(told) - 1, min(len(told), rules.probes)).astype(int)
-    gaps = [np.zeros(0)]
-    for k in np.unique(some):
-        gaps.append(_meetings(told[k][1], wide, rules)[2])
-    noise = max(rules.widest * _deviation(np.concatenate(gaps)), rules.quietest)
+    gaps = [_meetings(told[k][1], wide, rules)[2] for k in np.unique(some)]
+    noise = max(rules.widest * _deviation(np.concatenate([np.zeros(0), *gaps])), rules.quietest)
     gates = min(rules.gate * noise, rules.widest) * sigmas
     return [_cloud(*each, sensors, noise * sigmas, gates, rules) for each in told], noise
 
@@ -164,12 +127,12 @@ def _cloud(
     points, detections, gaps = _meetings(rays, gates, rules)
     if len(rays) > 2 and len(points):
         detections = _supported(points, detections, gaps, frame, sensors, gates)
-        points = points[(detections >= 0).any(axis=1)]
-        detections = detections[(detections >= 0).any(axis=1)]
+        kept = (detections >= 0).any(axis=1)
+        points, detections = points[kept], detections[kept]
     points, reach = _refined(points, detections, frame, sensors, noise)
     fine = np.isfinite(np.column_stack([points, reach])).all(axis=1)
     rows = np.arange(np.count_nonzero(fine))
-    return Cloud(frame.number, points[fine], reach[fine], detections[fine], rows, frame)
+    return Cloud(points[fine], reach[fine], detections[fine], rows, frame)
 
 
 def _supported(
@@ -208,11 +171,7 @@ def _supported(
 
 
 def _refined(
-    points: Floats,
-    detections: Indices,
-    frame: SeenFrame,
-    sensors: Sequence[Sensor],
-    noise: Floats,
+    points: Floats, detections: Indices, frame: SeenFrame, sensors: Sequence[Sensor], noise: Floats
 ) -> tuple[Floats, Floats]:
     """Points (P, 3) by least squares over all their detections, and their deviations (P,)."""
     information = np.zeros((len(points), 3, 3))
@@ -243,3 +202,67 @@ def _are_fixed(information: Floats) -> Mask:
     finite: Mask = np.asarray(np.isfinite(information).all(axis=(1, 2)))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))
     return np.asarray(values[:, 0] > 1e-12 * values[:, 2])
+
+
+def gathered_places(
+    points: Floats, reach: Floats, frame: Indices, least: float, rules: LearningRules
+) -> list[tuple[Floats, Indices]]:
+    """Places (3,) at which points (n, 3) of many frames are, and which; most frames first.
+
+    Points may be off by their reach (n,), standard deviations times the gate.  Frames (n,) that
+    tell the same have one number, and at least so many must show a place.  Of each frame at most
+    one point is there, the nearest; those within three gates are left out of later places.
+    """
+    found: list[tuple[Floats, Indices]] = []
+    if len(points) < least:
+        return found
+    typical = float(np.median(reach))
+    allowed = np.maximum(reach, typical)
+    tree = cKDTree(points)
+    near = tree.query_ball_point(points, 2 * typical)
+    counts = np.array([len(np.unique(frame[each])) for each in near])
+    left = np.ones(len(points), dtype=np.bool_)
+    for k in np.argsort(-counts, kind="stable"):
+        if counts[k] < least:
+            break
+        if not left[k]:
+            continue
+        place = points[k]
+        for _ in range(3):
+            there = np.array(tree.query_ball_point(place, 3 * typical), dtype=np.intp)
+            away = np.linalg.norm(points[there] - place, axis=1)
+            inside = there[away <= allowed[there]]
+            if not len(inside):
+                break
+            weight = 1 / reach[inside] ** 2
+            place = weight @ points[inside] / weight.sum()
+        away = np.linalg.norm(points[there] - place, axis=1)
+        left[there] = False
+        left[k] = False
+        near_by = len(np.unique(frame[there]))
+        chosen = there[np.argsort(away, kind="stable")]
+        chosen = chosen[np.sort(away) <= allowed[chosen]]
+        _, first = np.unique(frame[chosen], return_index=True)
+        chosen = chosen[np.sort(first)]
+        if len(chosen) >= max(least, rules.gathered * near_by):
+            found.append((place, chosen))
+    return found
+
+
+def without_still(
+    clouds: Sequence[Cloud], rules: LearningRules
+) -> tuple[list[Cloud], list[Floats]]:
+    """Clouds without what stands still, and where that is.
+
+    A body that rests in most of the frames is lost from these alone.
+    """
+    points = np.concatenate([cloud.points for cloud in clouds])
+    reach = rules.gate * np.concatenate([cloud.reach for cloud in clouds])
+    frame = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+    filled = sum(len(cloud) > 0 for cloud in clouds)
+    least = max(rules.still_share * filled, rules.least_frames)
+    still = gathered_places(points, reach, frame, least, rules)
+    detections = np.concatenate([cloud.detections for cloud in clouds])
+    taken = np.concatenate([np.zeros(0, dtype=np.intp), *(chosen for _, chosen in still)])
+    left = [cloud.without(detections[taken[frame[taken] == k]]) for k, cloud in enumerate(clouds)]
+    return left, [place for place, _ in still]

@@ -1,7 +1,9 @@
-"""What was learnt, for people: a table of each body, and what to know of it."""
+"""What was learnt: a table of each body, for people and for a session, and what to know of it."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,12 +14,16 @@ from mixpose.learning.adjusting import Learnt
 from mixpose.learning.axes import body_of
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats
+from mixpose.session.markers import LEARNT_COLUMNS
+
+MARK = ",".join(LEARNT_COLUMNS)
+"""By which mixpose knows the tables that it wrote."""
 
 _ALIKE = 0.03  # of the radius: markers nearer are in one place to those who tell poses apart
 _ONE_AXIS = 0.2  # of the turn about the main axis that there is about any other
 
 
-def digits_of(learnt: Learnt) -> int:
+def _digits_of(learnt: Learnt) -> int:
     """Decimals that tell a tenth of the smallest deviation of a marker."""
     least = float(np.linalg.norm(learnt.deviations, axis=1).min())
     return int(np.clip(1 - np.floor(np.log10(max(least, 1e-12))), 0, 12))
@@ -26,7 +32,7 @@ def digits_of(learnt: Learnt) -> int:
 def lines_of(learnt: Learnt, name: str, unit: str) -> list[str]:
     """A table of markers."""
     turns = _turns(learnt)
-    digits = digits_of(learnt)
+    digits = _digits_of(learnt)
     width = max(10, digits + 7)
     head = "".join(f"{word:>{width}}" for word in ("x", "y", "z", "deviation"))
     alike = f", {learnt.count} alike at a time" if learnt.count > 1 else ""
@@ -43,6 +49,20 @@ def lines_of(learnt: Learnt, name: str, unit: str) -> list[str]:
         numbers = "".join(f"{value + 0.0:>{width}.{digits}f}" for value in (*point, size))
         rows.append(f"{label:<8}{numbers}{frames:>8}")
     return rows
+
+
+def table_text(learnt: Learnt) -> str:
+    """A row per marker: name, coordinates, their deviations, and frames in which it was seen."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", "x", "y", "z", *LEARNT_COLUMNS])
+    digits = _digits_of(learnt)
+    for name, point, deviation, frames in zip(
+        learnt.names, learnt.points, learnt.deviations, learnt.frames, strict=True
+    ):
+        numbers = [f"{value + 0.0:.{digits}f}" for value in (*point, *deviation)]
+        writer.writerow([name, *numbers, int(frames)])
+    return stream.getvalue()
 
 
 def doubts_of(learnt: Learnt, name: str, unit: str, rules: LearningRules) -> list[str]:

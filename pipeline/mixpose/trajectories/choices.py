@@ -1,58 +1,44 @@
-"""Which hypothesis of an ambiguous frame the track supports.
+"""Which of its poses a frame shows: of hypotheses, and of those that look the same.
 
 Every choice of hypotheses is a path of its own, followed by a Kalman filter; the likeliest few are
 followed side by side, so that a choice is made by what comes after it as well as by what was before
-(multiple hypothesis tracking, D. B. Reid, 1979).
+(multiple hypothesis tracking, D. B. Reid, 1979).  Of poses of a symmetric body one follows from the
+one before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mixpose import rigid
+from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, foretold, updated
 from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_part
 
-NONE = -1
-"""A choice: the frame shows something else."""
+_NONE = -1  # a choice: the frame shows something else
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What a frame may show.
+    """What a frame may show."""
 
-    Attributes
-    ----------
-    poses : (n, 4, 4) float64
-    weights : (n,) float64
-        Sum of at most 1.
-    may_be_none : bool
-        Whether it may be none of them.
-    """
-
-    poses: Floats
-    weights: Floats
-    may_be_none: bool
+    poses: Floats  # (n, 4, 4)
+    weights: Floats  # (n,): sum of at most 1
+    may_be_none: bool  # whether it may be none of them
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a frame shows, most likely.
+    """What a frame shows, most likely."""
 
-    Attributes
-    ----------
-    which : int
-        Of its alternatives, or `NONE`.
-    probabilities : (n,) float64
-        Of each of them.
-    """
-
-    which: int
-    probabilities: Floats
+    which: int  # of its alternatives, or -1: something else
+    pose: Floats | None  # (4, 4): that of the alternative
+    probabilities: Floats  # (n,): of each of them
 
 
 def choices(
@@ -69,9 +55,11 @@ def choices(
     for k, one in enumerate(alternatives):
         probabilities = np.zeros(len(one.weights))
         for path, share in zip(paths, shares.tolist(), strict=True):
-            if path[k] != NONE:
+            if path[k] != _NONE:
                 probabilities[path[k]] += share
-        found.append(Choice(paths[int(np.argmax(logs))][k], probabilities))
+        which = paths[int(np.argmax(logs))][k]
+        pose = None if which == _NONE else one.poses[which]
+        found.append(Choice(which, pose, probabilities))
     return found
 
 
@@ -81,10 +69,7 @@ def _followed(
     """The likeliest paths, each a choice per time, and their log likelihoods."""
     first, white = alternatives[0], np.array([model.white])
     noise = noise_of(track, model.intensities[None])
-    at_first = [
-        begun(_with_pose(track, pose), 0, model.order, white, track.moved) for pose in first.poses
-    ]
-    states = _joined(at_first)
+    states = begun(track, model.order, white.repeat(len(first.poses)))._replace(poses=first.poses)
     paths: list[tuple[int, ...]] = [(k,) for k in range(len(first.poses))]
     logs: Floats = np.log(first.weights)
     for k, elapsed in enumerate(np.diff(track.times).tolist(), 1):
@@ -102,26 +87,49 @@ def _followed(
             all_logs += (logs + own + np.log(weight)).tolist()
         if one.may_be_none:
             found.append(ahead)
-            all_paths += [(*path, NONE) for path in paths]
+            all_paths += [(*path, _NONE) for path in paths]
             all_logs += (logs + off_track).tolist()
         logs = np.array(all_logs)
         kept = np.argsort(-logs, kind="stable")[: rules.paths]
         kept = kept[logs[kept] > logs.max() - 2 * rules.none]
-        states, paths, logs = _joined(found).of(kept), [all_paths[i] for i in kept], logs[kept]
+        joined = States(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        states, paths, logs = joined.of(kept), [all_paths[i] for i in kept], logs[kept]
     return paths, logs
 
 
-def _with_pose(track: Track, pose: Floats) -> Track:
-    """The first time of a track, with another pose."""
-    one = track.part(slice(0, None))
-    poses = one.poses.copy()
-    poses[0] = pose
-    return Track(one.times, poses, one.covariances, one.measured, one.free)
+def unfolded(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseLine]:
+    """Of poses that look the same by motions (n, 4, 4) those turned least from the one before."""
+    if symmetries is None or len(symmetries) < 2:
+        return list(lines)
+    before: Floats | None = None
+    found = []
+    for line in lines:
+        if line.T_world_object is None:
+            found.append(line)
+            continue
+        before = line.T_world_object if before is None else before
+        found.append(_turned(line, line.T_world_object, before, symmetries))
+        if line.status == "ok":
+            before = found[-1].T_world_object
+    return found
 
 
-def _joined(states: Sequence[States]) -> States:
-    return States(
-        np.concatenate([one.poses for one in states]),
-        np.concatenate([one.rates for one in states]),
-        np.concatenate([one.covariances for one in states]),
+def _turned(line: PoseLine, T: Floats, before: Floats, symmetries: Floats) -> PoseLine:
+    """A line at T whose poses are turned least against another pose."""
+    S, C = _nearest(T, before, symmetries), line.covariance
+    rivals = []
+    for each in line.hypotheses:
+        rival = each.T_world_object
+        turned = rival @ _nearest(rival, before, symmetries)
+        rivals.append(replace(each, T_world_object=turned))
+    return replace(
+        line,
+        T_world_object=T @ S,
+        covariance=None if C is None else rigid.covariance_at(C, T[:3, :3] @ S[:3, 3]),
+        hypotheses=tuple(rivals),
     )
+
+
+def _nearest(T: Floats, before: Floats, symmetries: Floats) -> Floats:
+    angles = rigid.rotation_angle_deg(np.broadcast_to(before, symmetries.shape), T @ symmetries)
+    return np.asarray(symmetries[int(np.argmin(angles))])

@@ -21,20 +21,11 @@ _FLAT = 1e-6  # of the largest distance: points on a line span no plane
 
 @dataclass(frozen=True)
 class Floor:
-    """A frame for the world.
+    """A frame for the world."""
 
-    Attributes
-    ----------
-    T_old_new : (4, 4) float64
-        Maps coordinates of the new world to those of the old one.
-    by : str
-        What it was found by.
-    off : float or None
-        Root mean square distance of the points from the floor; None where any would fit.
-    """
-
-    T_old_new: Floats
-    by: str
+    T_old_new: Floats  # (4, 4): maps coordinates of the new world to those of the old one
+    by: str  # what it was found by
+    # root mean square distance of the points from the floor; None where any would fit
     off: float | None = None
 
 
@@ -48,8 +39,6 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
 
     Parameters
     ----------
-    estimates : sequence of Estimate
-        That have a pose.
     up : {"x", "y", "z"}
         The axis of the world that points up; of a body, its own.
     sensors : (n, 3) array
@@ -60,12 +49,14 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     RecordingError
         If the poses tell no floor.
     """
-    bodies = {label: [e for e in estimates if e.label == label] for label in _labels(estimates)}
-    rests = [_rests(each) for each in bodies.values()]
+    bodies: dict[str, list[Estimate]] = {}
+    for each in estimates:
+        bodies.setdefault(each.label, []).append(each)
+    rests = [_rests(own) for own in bodies.values()]
     if len(bodies) == 1 and (len(estimates) == 1 or (rests[0] and len(estimates) != 3)):
         return Floor(_mean_pose(estimates), f"the body {estimates[0].label!r}")
     if all(rests):
-        points = np.stack([np.mean([_point(e) for e in each], axis=0) for each in bodies.values()])
+        points = np.stack([np.mean([_point(e) for e in own], axis=0) for own in bodies.values()])
     if not all(rests) or len(points) < 3:
         points = np.stack([_point(each) for each in estimates])
     if len(points) == 3:
@@ -76,10 +67,6 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
         )
     T, off = _plane(points, up, sensors)
     return Floor(T, f"a plane through {len(points)} points", off)
-
-
-def _labels(estimates: Sequence[Estimate]) -> list[str]:
-    return list(dict.fromkeys(each.label for each in estimates))
 
 
 def _point(one: Estimate) -> Floats:

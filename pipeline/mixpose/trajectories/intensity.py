@@ -13,14 +13,7 @@ import numpy as np
 from mixpose.constants import constant
 from mixpose.records import Floats
 from mixpose.trajectories.motion import ORDERS, foretold, updated
-from mixpose.trajectories.track import (
-    MotionModel,
-    Track,
-    begun,
-    noise_of,
-    smooth_track,
-    white_part,
-)
+from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, smooth_track, white_part
 
 
 @dataclass(frozen=True)
@@ -58,15 +51,9 @@ class SmoothingRules:
 
 
 def fitted_model(track: Track, rules: SmoothingRules, motion: str | None = None) -> MotionModel:
-    """The model of which a track is likeliest.
+    """The model of which a track is likeliest, among all `ORDERS` where no motion is asked for.
 
-    Parameters
-    ----------
-    track : Track
-        Times without a pose are left out.
-    rules : SmoothingRules
-    motion : str or None
-        Of `ORDERS`; else the likeliest.
+    Times without a pose are left out.
     """
     blocks = _blocks(track, rules)
     x, best = np.zeros(3), (-np.inf, 0, np.zeros(3))
@@ -169,7 +156,7 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
     white = np.exp(x[:, 2])
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
     moved = track.moved
-    states = begun(track, 0, order, white, moved)
+    states = begun(track, order, white)
     steps = np.diff(track.times).tolist()
     total, was_wrong = np.zeros(len(x)), np.zeros(len(x), bool)
     for k, elapsed in enumerate(steps, 1):

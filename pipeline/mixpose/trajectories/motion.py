@@ -17,9 +17,9 @@ take many states at once, along the leading axes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
@@ -41,21 +41,13 @@ _ACROSS = np.array(
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 
-@dataclass(frozen=True)
-class States:
-    """States of a body at one time, as G filters that run side by side know them.
+class States(NamedTuple):
+    """States of a body at one time, as G filters that run side by side know them."""
 
-    Attributes
-    ----------
-    poses : (G, 4, 4) float64
-    rates : (G, p - 1, 6) float64
-        Derivatives of the pose, lengths and radians per second to the power of 1 to p - 1.
-    covariances : (G, 6 p, 6 p) float64
-        Of the pose and of its derivatives, in this order, six numbers of each.
-    """
-
-    poses: Floats
+    poses: Floats  # (G, 4, 4)
+    # (G, p - 1, 6): derivatives of the pose, lengths and radians per second to the power of 1 on
     rates: Floats
+    # (G, 6 p, 6 p): of the pose and of its derivatives, in this order, six numbers of each
     covariances: Floats
 
     @property
@@ -76,28 +68,18 @@ class States:
 
     def mixed(self, others: States, is_other: Mask) -> States:
         """These states, and others where (G,) says so."""
-        pairs = zip(
-            (self.poses, self.rates, self.covariances),
-            (others.poses, others.rates, others.covariances),
-            strict=True,
-        )
-        return States(*[np.where(is_other[:, None, None], b, a) for a, b in pairs])
+        which = is_other[:, None, None]
+        return States(*(np.where(which, b, a) for a, b in zip(self, others, strict=True)))
 
     def of(self, which: Indices | list[int]) -> States:
         """Some of the states."""
-        return States(self.poses[which], self.rates[which], self.covariances[which])
+        return States(*(each[which] for each in self))
 
 
 def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Floats]:
-    """The states some seconds later, and derivatives (G, 6 p, 6 p) by the states.
+    """The states `elapsed` seconds later, and derivatives (G, 6 p, 6 p) by the states.
 
-    Parameters
-    ----------
-    states : States
-    elapsed : float
-        s.
-    noise : (G, 6) array
-        Intensities q of the noise, one per coordinate of a pose.
+    Noise are the intensities q (G, 6), one per coordinate of a pose.
     """
     p = states.order
     powers = np.array([elapsed**j / factorial(j) for j in range(p + 1)])
@@ -114,13 +96,7 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
 
 
 def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, Floats, Floats]:
-    """The states with measured poses.
-
-    Parameters
-    ----------
-    states : States
-    pose : (4, 4) or (G, 4, 4) array
-    covariance : (6, 6) or (G, 6, 6) array
+    """The states with measured poses, (4, 4) or (G, 4, 4), and their covariances.
 
     Returns
     -------
@@ -158,19 +134,14 @@ def _solved(S: Floats, cross: Floats, rest: Floats) -> tuple[Floats, Floats, Flo
     )
 
 
-@dataclass(frozen=True)
-class Passage:
-    """What all poses say of the time between two of them.
+class Passage(NamedTuple):
+    """What all poses say of the time between two of them, of lengths and of turns.
 
-    Attributes
-    ----------
-    squared, degrees : (2,) float64
-        bᵀQb and tr NQ, of lengths and of turns: how large the noise was, in standard deviations,
-        and how many numbers of it are known.  In the mean they are equal.
+    In the mean the two are equal.
     """
 
-    squared: Floats
-    degrees: Floats
+    squared: Floats  # (2,): bᵀQb, how large the noise was, in standard deviations
+    degrees: Floats  # (2,): tr NQ, how many numbers of it are known
 
 
 def smoothed(
@@ -178,18 +149,8 @@ def smoothed(
 ) -> tuple[States, Passage]:
     """A state with all that is known later (H. E. Rauch, F. Tung and C. T. Striebel, 1965).
 
-    Parameters
-    ----------
-    here : States
-        With all that is known up to it; one.
-    ahead, later : States
-        The next one as it was foretold, and with all poses.
-    F : (1, 6 p, 6 p) array
-        Derivative of `ahead` by `here`.
-    elapsed : float
-        s.
-    noise : (1, 6) array
-        Intensities.
+    `here` is one state, with all that is known up to it; `ahead` the next one as it was foretold,
+    with its derivative F by `here`, and `later` the same with all poses.
     """
     P, foretold_ = here.covariances[0], ahead.covariances[0]
     scale = 1 / np.sqrt(foretold_.diagonal())
@@ -203,10 +164,10 @@ def smoothed(
     Q = _process_noise(elapsed, here.order, noise)[0]
     is_turn = np.arange(len(b)) % 6 >= 3
     # the noise that followed has the mean Q b and the covariance Q - Q N Q
-    squared = b * (Q @ b), (N * Q).sum(axis=1)
-    kinds = [np.array([each[~is_turn].sum(), each[is_turn].sum()]) for each in squared]
+    told = b * (Q @ b), (N * Q).sum(axis=1)
+    passage = Passage(*(np.array([n[~is_turn].sum(), n[is_turn].sum()]) for n in told))
     state = here.moved((gain @ b)[None], ((covariance + covariance.T) / 2)[None])
-    return state, Passage(*kinds)
+    return state, passage
 
 
 def _turned(rates: Floats, elapsed: float) -> Floats:

@@ -11,7 +11,8 @@ equation is weighed by the covariance of its poses at the tip.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -38,77 +39,43 @@ class PivotRules:
     )
 
 
-@dataclass(frozen=True)
-class Pivoting:
-    """Poses of a body whose tip stays where it is.
+class Pivoting(NamedTuple):
+    """Poses of a body whose tip stays where it is."""
 
-    Attributes
-    ----------
-    poses, covariances : (N, 4, 4) and (N, 6, 6) float64
-        Of the body.
-    references, reference_covariances : (N, 4, 4) and (N, 6, 6) float64
-        Of the body that the point is fixed in; identity and zero: of the world.
-    """
-
-    poses: Floats
-    covariances: Floats
+    poses: Floats  # (N, 4, 4): of the body
+    covariances: Floats  # (N, 6, 6)
+    # (N, 4, 4): of the body that the point is fixed in; of the world these are the identity, and
+    # their covariances zero
     references: Floats
-    reference_covariances: Floats
+    reference_covariances: Floats  # (N, 6, 6)
 
     def part(self, some: Mask) -> Pivoting:
         """Some of the poses."""
-        return Pivoting(
-            self.poses[some],
-            self.covariances[some],
-            self.references[some],
-            self.reference_covariances[some],
-        )
+        return Pivoting(*(each[some] for each in self))
 
 
 @dataclass(frozen=True)
 class Tip:
-    """A tip.
+    """A tip."""
 
-    Attributes
-    ----------
-    place : (3,) float64
-        In the coordinates of the body.
-    covariance : (3, 3) float64
-    pivot : (3,) float64
-        The point that it stays at, in the world or in the reference body.
-    residual, expected, held_out : float
-        Root mean square distances of tip and point: of these poses, by their covariances, and of
-        poses that were held out.
-    scale : float
-        Squared residuals by their covariances; what is above 1 is in the covariance of the tip.
-    frames, left_out : int
-        Poses that count, and that lie too far off.
-    turns_deg : (3,) float64
-        Root mean square turns across the three directions, least first.
-    directions : (3, 3) float64
-        Of the body, a row each.
-    """
-
-    place: Floats
-    covariance: Floats
-    pivot: Floats
-    residual: float
-    expected: float
-    held_out: float
+    place: Floats  # (3,): in the coordinates of the body
+    covariance: Floats  # (3, 3)
+    pivot: Floats  # (3,): the point that it stays at, in the world or in the reference body
+    residual: float  # root mean square distance of tip and point
+    expected: float  # the same by the covariances of the poses
+    held_out: float  # and of poses that were held out
+    # squared residuals by their covariances; what is above 1 is in the covariance of the tip
     scale: float
-    frames: int
-    left_out: int
-    turns_deg: Floats
-    directions: Floats
+    frames: int  # poses that count
+    left_out: int  # those that lie too far off
+    turns_deg: Floats  # (3,): root mean square turns across the three directions, least first
+    directions: Floats  # (3, 3): of the body, a row each
 
 
 def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
     """Find the tip of a body that turns about it.
 
-    Raises
-    ------
-    RecordingError
-        If there are too few poses, or turns are missing; it says which.
+    Raises a RecordingError if there are too few poses, or says which turns are missing.
     """
     rules = rules or PivotRules()
     if len(pivoting.poses) < rules.fewest:
@@ -238,4 +205,4 @@ def fixed_in_world(poses: Floats, covariances: Floats) -> Pivoting:
 
 def fixed_in(pivoting: Pivoting, references: Floats, covariances: Floats) -> Pivoting:
     """The same, of which the point is fixed in another body with these poses."""
-    return replace(pivoting, references=references, reference_covariances=covariances)
+    return pivoting._replace(references=references, reference_covariances=covariances)

@@ -20,48 +20,32 @@ from mixpose.errors import RecordingError
 from mixpose.poses.estimates import estimate_of
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
-from mixpose.trajectories.choices import NONE, Alternatives, Choice, choices
+from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
 from mixpose.trajectories.intensity import SmoothingRules, fitted_model, local_scales
 from mixpose.trajectories.track import (
     MotionModel,
     SmoothedTrack,
     Track,
+    of_free,
     smooth_track,
     track_of,
     without,
 )
-from mixpose.trajectories.unfolding import unfolded
 
 _ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
 
 
 @dataclass(frozen=True)
 class SmoothedBody:
-    """The poses of a body, smoothed.
+    """The poses of a body, smoothed."""
 
-    Attributes
-    ----------
-    estimates : tuple of Estimate
-        One per line, and one per frame that was filled, by frame number.
-    model : MotionModel or None
-        None where there were too few poses.
-    smoothed, filled : int
-        How many poses there are that were smoothed and filled in.
-    decided : int
-        Ambiguous frames that are ok now.
-    refused : tuple of int
-        Frames whose poses were ok and lie far off those around them.
-    timed : bool
-        Whether the model goes by seconds; else by numbers of frames.
-    """
-
-    estimates: tuple[Estimate, ...]
-    model: MotionModel | None
-    smoothed: int
-    filled: int
-    decided: int
-    refused: tuple[int, ...]
-    timed: bool
+    estimates: tuple[Estimate, ...]  # of each line and each frame that was filled, by number
+    model: MotionModel | None  # None where there were too few poses
+    smoothed: int  # poses
+    filled: int  # frames in which no pose was
+    decided: int  # ambiguous frames that are ok now
+    refused: tuple[int, ...]  # frames whose poses were ok and lie far off those around them
+    timed: bool  # whether the model goes by seconds; else by numbers of frames
 
 
 @dataclass(frozen=True)
@@ -81,19 +65,16 @@ def smooth_body(
     motion: str | None = None,
     rules: SmoothingRules | None = None,
 ) -> SmoothedBody:
-    """Smooth the poses of one body.
+    """Smooth the poses of one body, a line per frame.
 
     Parameters
     ----------
-    lines : sequence of PoseLine
-        Of one body, a line per frame.
     symmetries : (n, 4, 4) array or None
         Of the body: poses that look the same are one.
     fill_s : float
         Gaps of at most so many seconds from pose to pose are filled.
     motion : str or None
         What takes white noise, of `mixpose.trajectories.motion.ORDERS`; else the likeliest.
-    rules : SmoothingRules or None
 
     Raises
     ------
@@ -119,18 +100,21 @@ def smooth_body(
         whole = tuple(estimate_of(line) for line in ordered)
         return SmoothedBody(whole, None, 0, 0, 0, (), times is not None)
     model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
-    segments = _segments(ordered, at, posed, fill_s, rules)
-    done: dict[int, Estimate] = {line.frame: estimate_of(line) for line in ordered}
-    counts = [0, 0, 0]
-    refused: list[int] = []
-    for segment in segments:
-        found, own, foreign = _smoothed(segment, model, rules)
-        done.update(found)
-        counts = [a + b for a, b in zip(counts, own, strict=True)]
-        refused += foreign
-    estimates = tuple(done[frame] for frame in sorted(done))
+    found: dict[int, Estimate] = {}
+    for segment in _segments(ordered, at, posed, fill_s, rules):
+        found.update(_smoothed(segment, model, rules))
+    met = [ordered[k] for k in posed if ordered[k].frame in found]
+    changed = [line for line in met if found[line.frame].status != line.status]
+    refused = tuple(line.frame for line in changed if line.status == "ok")
+    done = {line.frame: estimate_of(line) for line in ordered} | found
     return SmoothedBody(
-        estimates, model, counts[0], counts[1], counts[2], tuple(refused), times is not None
+        estimates=tuple(done[frame] for frame in sorted(done)),
+        model=model,
+        smoothed=len(met),
+        filled=len(found) - len(met),
+        decided=len(changed) - len(refused),
+        refused=refused,
+        timed=times is not None,
     )
 
 
@@ -176,6 +160,7 @@ def _segments(
     segments = []
     for part in np.split(np.array(posed), cuts):
         own: list[PoseLine | None] = []
+        known: list[PoseLine] = []  # the one before in place of those that are not there
         frames: list[int] = []
         moments: list[float] = []
         for k in part.tolist():
@@ -184,81 +169,54 @@ def _segments(
                 between = range(frames[-1] + step, line.frame, max(step, 1))
                 share = (np.array(between, float) - frames[-1]) / (line.frame - frames[-1])
                 own += [None] * len(between)
+                known += [known[-1]] * len(between)
                 moments += (moments[-1] + share * (times[k] - moments[-1])).tolist()
                 frames += between
             own.append(line)
+            known.append(line)
             frames.append(line.frame)
             moments.append(float(times[k]))
-        segments.append(_Segment(tuple(own), tuple(frames), _sparse(own, np.array(moments))))
+        measured = np.array([each is not None for each in own])
+        track = replace(_track(known, np.array(moments)), measured=measured)
+        segments.append(_Segment(tuple(own), tuple(frames), track))
     return segments
 
 
-def _sparse(lines: Sequence[PoseLine | None], times: Floats) -> Track:
-    """A track of lines, with the pose before in place of those that are not there."""
-    last = next(line for line in lines if line is not None)
-    known = []
-    for line in lines:
-        last = last if line is None else line
-        known.append(last)
-    whole = _track(known, times)
-    measured = np.array([line is not None for line in lines])
-    return replace(whole, measured=measured)
-
-
-def _smoothed(
-    segment: _Segment, model: MotionModel, rules: SmoothingRules
-) -> tuple[dict[int, Estimate], tuple[int, int, int], list[int]]:
-    """Estimates by frame; how many are smoothed, filled and decided; frames that were refused."""
+def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Estimate]:
+    """Estimates by frame."""
     chosen = _chosen(segment, model, rules)
     poses = segment.track.poses.copy()
     measured = segment.track.measured.copy()
     for k, made in chosen.items():
-        line = segment.lines[k]
-        assert line is not None
-        measured[k] = made.which != NONE
-        if measured[k]:
-            poses[k] = _alternatives(line).poses[made.which]
+        measured[k] = made.pose is not None
+        if made.pose is not None:
+            poses[k] = made.pose
     track = replace(segment.track, poses=poses, measured=measured)
     inside = np.flatnonzero(measured)
     if len(inside) < 2:
-        return {}, (0, 0, 0), []
+        return {}
     first, last = int(inside[0]), int(inside[-1]) + 1
     lines, frames = segment.lines[first:last], segment.frames[first:last]
-    track = track.part(slice(first, last))
-    track, result = _without_foreign(track, model, rules)
-    spare = max(0.0, 1.0 - model.white) * _held_out(track)
-    found, counts, refused = {}, np.zeros(3, int), []
+    track, result = _without_foreign(track.part(slice(first, last)), model, rules)
+    spare = max(0.0, 1.0 - model.white) * of_free(track.covariances, track.free)
+    found = {}
     for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
         T, covariance = result.poses[k], result.covariances[k] + spare[k]
         choice = chosen.get(first + k)
         if line is None:
             found[frame] = _filled(frame, float(track.times[k]), lines, T, covariance)
-            counts[1] += 1
-        elif choice is None or choice.which != NONE:
-            found[frame] = one = _estimate(
-                line, T, covariance, choice, bool(track.measured[k]), rules
-            )
-            counts += [1, 0, one.status == "ok" != line.status]
-            if line.status == "ok" and one.status != "ok":
-                refused.append(frame)
-    return found, (int(counts[0]), int(counts[1]), int(counts[2])), refused
-
-
-def _held_out(track: Track) -> Floats:
-    covariances = track.covariances.copy()
-    covariances[:, ~track.free] = 0.0
-    covariances[:, :, ~track.free] = 0.0
-    return covariances
+        elif choice is None or choice.pose is not None:
+            is_met = bool(track.measured[k])
+            found[frame] = _estimate(line, T, covariance, choice, is_met, rules)
+    return found
 
 
 def _alternatives(line: PoseLine) -> Alternatives:
     """What a frame may show: of an ambiguous one its hypotheses."""
     T = line.T_world_object
     assert T is not None
-    if line.status == "ok":
-        return Alternatives(T[None], np.ones(1), may_be_none=False)
-    if not line.hypotheses:
-        return Alternatives(T[None], np.ones(1), may_be_none=True)
+    if line.status == "ok" or not line.hypotheses:
+        return Alternatives(T[None], np.ones(1), may_be_none=line.status != "ok")
     weights = np.array([max(rival.weight, 1e-6) for rival in line.hypotheses])
     poses = np.stack([rival.T_world_object for rival in line.hypotheses])
     return Alternatives(poses, weights / max(weights.sum(), 1.0), may_be_none=True)
@@ -266,17 +224,13 @@ def _alternatives(line: PoseLine) -> Alternatives:
 
 def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Choice]:
     """What each ambiguous frame of a segment shows, by its place."""
-    there = [k for k, line in enumerate(segment.lines) if line is not None]
-    lines = [line for line in segment.lines if line is not None]
-    if all(line.status == "ok" for line in lines):
+    lines = [(k, line) for k, line in enumerate(segment.lines) if line is not None]
+    if all(line.status == "ok" for _, line in lines):
         return {}
     track = segment.track.part(segment.track.measured)
-    found = choices(track, [_alternatives(line) for line in lines], model, rules)
-    return {
-        k: choice
-        for k, line, choice in zip(there, lines, found, strict=True)
-        if line.status != "ok"
-    }
+    found = choices(track, [_alternatives(line) for _, line in lines], model, rules)
+    both = zip(lines, found, strict=True)
+    return {k: choice for (k, line), choice in both if line.status != "ok"}
 
 
 def _without_foreign(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,39 +16,22 @@ _FLOOR = 1e-9  # of the largest variance: what float64 can tell apart
 
 @dataclass(frozen=True)
 class Track:
-    """Poses of one body at ascending times.
+    """Poses of one body at ascending times."""
 
-    Attributes
-    ----------
-    times : (N,) float64
-        s, or numbers of frames.
-    poses : (N, 4, 4) float64
-    covariances : (N, 6, 6) float64
-        As `mixpose.rigid` has them; of directions that are held, any.
-    measured : (N,) bool
-        Whether there is a pose at that time; what stands in `poses` does not count where not.
-    free : (6,) bool
-        Directions of the world in which the body is estimated.
-    """
-
-    times: Floats
-    poses: Floats
-    covariances: Floats
+    times: Floats  # (N,): s, or numbers of frames
+    poses: Floats  # (N, 4, 4)
+    covariances: Floats  # (N, 6, 6): as `mixpose.rigid` has them; of directions that are held, any
+    # (N,): whether there is a pose at that time; what stands in `poses` does not count where not
     measured: Mask
-    free: Mask
+    free: Mask  # (6,): directions of the world in which the body is estimated
 
     def __len__(self) -> int:
         return len(self.times)
 
     def part(self, some: slice | Mask) -> Track:
         """A part of the track."""
-        return Track(
-            self.times[some],
-            self.poses[some],
-            self.covariances[some],
-            self.measured[some],
-            self.free,
-        )
+        poses, covariances = self.poses[some], self.covariances[some]
+        return Track(self.times[some], poses, covariances, self.measured[some], self.free)
 
     @property
     def interval(self) -> float:
@@ -65,6 +47,11 @@ class Track:
         return np.asarray(np.sqrt((twists**2).mean(axis=(0, 2))).repeat(3))
 
 
+def of_free(covariances: Floats, free: Mask) -> Floats:
+    """Covariances (N, 6, 6) with zero for directions that are held."""
+    return np.where(free[:, None] & free, covariances, 0.0)
+
+
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
     """A track whose covariances can be inverted; directions without variance are held.
 
@@ -75,9 +62,7 @@ def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) 
     variances = np.diagonal(seen, axis1=1, axis2=2).max(axis=0)
     kinds = variances.reshape(2, 3).max(axis=1).repeat(3)
     free = variances > 1e-12 * np.where(kinds > 0, kinds, np.inf)
-    covariances = covariances.copy()
-    covariances[:, ~free] = 0.0
-    covariances[:, :, ~free] = 0.0
+    covariances = of_free(covariances, free)
     typical = np.diagonal(seen, axis1=1, axis2=2).mean(axis=0)
     for kind in (slice(0, 3), slice(3, 6)):
         own = free[kind]
@@ -89,27 +74,18 @@ def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """How a body moves, and how far its poses are off.
+    """How a body moves, and how far its poses are off."""
 
-    Attributes
-    ----------
-    order : int
-        p, of the derivative that takes white noise.
-    intensities : (2,) float64
-        q, of lengths and of turns.
-    white : float
-        Share of the covariances that is independent from frame to frame; above 1 where poses
-        scatter more than their covariances say.
-    """
-
-    order: int
-    intensities: Floats
+    order: int  # p, of the derivative that takes white noise
+    intensities: Floats  # (2,): q, of lengths and of turns
+    # share of the covariances that is independent from frame to frame; above 1 where poses scatter
+    # more than their covariances say
     white: float = 1.0
 
 
 def noise_of(track: Track, intensities: Floats) -> Floats:
     """Intensities (G, 6) of each coordinate, from those (G, 2) of lengths and turns."""
-    held = _held_intensity(track, 2)
+    held = np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** 3
     return np.where(track.free, intensities.repeat(3, axis=1), held)
 
 
@@ -119,58 +95,39 @@ def white_part(track: Track, k: int, white: Floats) -> Floats:
     return np.asarray(track.covariances[k] * scale[:, :, None] * scale[:, None])
 
 
-def _held_intensity(track: Track, order: int) -> Floats:
-    return np.asarray(
-        np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** (2 * order - 1)
-    )
-
-
-def begun(track: Track, first: int, order: int, white: Floats, moved: Floats) -> States:
+def begun(track: Track, order: int, white: Floats) -> States:
     """G states at the first pose, of whose rates nothing is known."""
-    covariances = white_part(track, first, white)
+    covariances = white_part(track, 0, white)
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    widths = _DIFFUSE * (moved + deviation)
+    widths = _DIFFUSE * (track.moved + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
     G = len(white)
     P = np.zeros((G, 6 * order, 6 * order))
     P[:, range(6 * order), range(6 * order)] = np.concatenate([deviation, *rates], axis=1) ** 2
     P[:, :6, :6] = covariances
-    poses = np.broadcast_to(track.poses[first], (G, 4, 4))
+    poses = np.broadcast_to(track.poses[0], (G, 4, 4))
     return States(poses, np.zeros((G, order - 1, 6)), P)
 
 
 @dataclass(frozen=True)
 class SmoothedTrack:
-    """A track with all that all its poses say.
+    """A track with all that all its poses say."""
 
-    Attributes
-    ----------
-    poses : (N, 4, 4) float64
-    covariances : (N, 6, 6) float64
-    passages : tuple of Passage
-        What happened between each two times.
-    """
-
-    poses: Floats
-    covariances: Floats
-    passages: tuple[Passage, ...]
+    poses: Floats  # (N, 4, 4)
+    covariances: Floats  # (N, 6, 6)
+    passages: tuple[Passage, ...]  # what happened between each two times
 
 
 def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
     """Smooth a track whose first time has a pose.
 
-    Parameters
-    ----------
-    track : Track
-    model : MotionModel
-    scales : (N - 1, 2) array or None
-        By how much more noise there is between each two times than the model says.
+    `scales` (N - 1, 2) is how much more noise there is between each two times than the model says.
     """
     white = np.array([model.white])
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
     noises = [noise_of(track, (model.intensities * scale)[None]) for scale in scales]
-    states = [begun(track, 0, model.order, white, track.moved)]
+    states = [begun(track, model.order, white)]
     ahead: list[tuple[States, Floats]] = []
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
         ahead.append(foretold(states[-1], elapsed, noise))
@@ -180,24 +137,15 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
         states.append(state)
     passages: list[Passage] = []
     for k in range(len(steps) - 1, -1, -1):
-        states[k], passage = smoothed(
-            states[k], *_after(ahead[k], states[k + 1]), steps[k], noises[k]
-        )
+        foreseen, F = ahead[k]
+        states[k], passage = smoothed(states[k], foreseen, states[k + 1], F, steps[k], noises[k])
         passages.append(passage)
-    return _without_held(track, states, tuple(reversed(passages)))
-
-
-def _after(ahead: tuple[States, Floats], later: States) -> tuple[States, States, Floats]:
-    return ahead[0], later, ahead[1]
-
-
-def _without_held(
-    track: Track, states: Sequence[States], passages: tuple[Passage, ...]
-) -> SmoothedTrack:
     covariances = np.stack([one.covariances[0][:6, :6] for one in states])
-    covariances[:, ~track.free] = 0.0
-    covariances[:, :, ~track.free] = 0.0
-    return SmoothedTrack(np.concatenate([one.poses for one in states]), covariances, passages)
+    return SmoothedTrack(
+        np.concatenate([one.poses for one in states]),
+        of_free(covariances, track.free),
+        tuple(reversed(passages)),
+    )
 
 
 def without(track: Track, bad: Mask) -> Track:

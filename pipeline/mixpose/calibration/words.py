@@ -1,0 +1,181 @@
+"""What a user's words say: what is free, a known length, and in whose frame to tell.
+
+What is free is ``SENSOR:WHAT``, ``WHAT`` for all sensors, or ``body``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mixpose.calibration.result import Calibration
+from mixpose.calibration.rig import KINDS, Kind, Rig, centre_of, kinds_of
+from mixpose.errors import SessionError
+from mixpose.records import Floats
+from mixpose.rigid import inverse
+from mixpose.sensors import CalibrationError, RangeSensor
+
+ALLOWED = ", ".join(KINDS)
+_FREES: dict[Kind, tuple[str, ...]] = {
+    "pose": ("rotation_deg", "position"),
+    "position": ("position",),
+    "focal": ("focal",),
+    "principal_point": ("principal_point",),
+    "range_bias": ("range_bias",),
+}
+
+
+def free_parameters(
+    rig: Rig, words: Sequence[str], *, poses_known: bool
+) -> tuple[dict[int, tuple[Kind, ...]], bool]:
+    """Kinds that are free, by sensor, and whether the body is.
+
+    Without words: where all cameras but the first stand, or all where poses are known, and
+    positions of range sensors.  Raises a SessionError if a word names no sensor, or nothing that
+    the sensor has.
+    """
+    if not words:
+        return _default(rig, poses_known=poses_known), False
+    found: dict[int, list[Kind]] = {}
+    body = False
+    for word in words:
+        sensor, colon, kinds = word.rpartition(":")
+        for what in kinds.split(","):
+            if what == "body" and not colon:
+                body = True
+                continue
+            kind = _kind(word, what)
+            for index in _sensors(rig, word, sensor, kind, every=not colon):
+                own = found.setdefault(index, [])
+                if kind not in own:
+                    own.append(kind)
+    return {index: tuple(kinds) for index, kinds in sorted(found.items())}, body
+
+
+def _default(rig: Rig, *, poses_known: bool) -> dict[int, tuple[Kind, ...]]:
+    free: dict[int, tuple[Kind, ...]] = {}
+    posed = [k for k, sensor in enumerate(rig.sensors) if "pose" in kinds_of(sensor)]
+    for index, sensor in enumerate(rig.sensors):
+        if isinstance(sensor, RangeSensor):
+            free[index] = ("position",)
+        elif index in (posed if poses_known else posed[1:]):
+            free[index] = ("pose",)
+    return free
+
+
+def _kind(word: str, what: str) -> Kind:
+    if what in KINDS:
+        return what
+    near = difflib.get_close_matches(what, KINDS, 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise SessionError(f"--free {word}: found {what!r}; allowed: {ALLOWED}, or body{hint}")
+
+
+def _sensors(rig: Rig, word: str, name: str, kind: Kind, *, every: bool) -> list[int]:
+    if every or name == "*":
+        found = [k for k, sensor in enumerate(rig.sensors) if kind in kinds_of(sensor)]
+        if not found:
+            raise SessionError(f"--free {word}: no sensor of the session has a {kind}")
+        return found
+    if name not in rig.names:
+        raise SessionError(
+            f"--free {word}: no such sensor; allowed: {', '.join(rig.names)}, or no name for all"
+        )
+    index = rig.names.index(name)
+    has = kinds_of(rig.sensors[index])
+    if kind not in has:
+        raise SessionError(f"--free {word}: sensor {name!r} has none; it has {', '.join(has)}")
+    return [index]
+
+
+def error_of_held(error: CalibrationError, kinds: Sequence[Kind]) -> CalibrationError:
+    """How far a sensor may be off in what is not free."""
+    free = {name: 0.0 for kind in kinds for name in _FREES.get(kind, ())}
+    return replace(error, **free)
+
+
+def words_of(names: Sequence[str], free: Mapping[int, Sequence[Kind]], body: bool) -> str:
+    """What is free, for people."""
+    parts = [f"{names[k]}:{','.join(kinds)}" for k, kinds in free.items()]
+    return " ".join(parts + ["body"] * body) or "nothing"
+
+
+def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
+    """Scale rig and body so that two sensors are as far apart as ``SENSOR:SENSOR=LENGTH`` says.
+
+    Raises a SessionError if the words are no two sensors and a length.
+    """
+    names, _, value = words.partition("=")
+    first, _, second = names.partition(":")
+    try:
+        length = float(value)
+    except ValueError:
+        length = 0.0
+    if first not in rig.names or second not in rig.names or first == second or not length > 0:
+        raise SessionError(
+            f"--length {words}: allowed: SENSOR:SENSOR=LENGTH with two of {', '.join(rig.names)} "
+            "and a length above 0"
+        )
+    pair = (rig.names.index(first), rig.names.index(second))
+    centres = [centre_of(rig.sensors[k]) for k in pair]
+    apart = float(np.linalg.norm(centres[1] - centres[0]))
+    if apart == 0:
+        raise SessionError(f"--length {words}: the session has both at one place")
+    factor = length / apart
+    sensors = tuple(_scaled(sensor, factor) for sensor in rig.sensors)
+    return replace(rig, sensors=sensors, points=rig.points * factor), pair
+
+
+def _scaled(sensor: Any, factor: float) -> Any:
+    if hasattr(sensor, "T_sensor_world"):
+        T = sensor.T_sensor_world.copy()
+        T[:3, 3] *= factor
+        return replace(sensor, T_sensor_world=T)
+    return replace(sensor, position=sensor.position * factor)
+
+
+def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
+    """Refuse words that name no frame: a sensor's, or ``body@FRAME`` of a frame of the recording.
+
+    So that nothing is searched in vain.  Raises a SessionError.
+    """
+    if _frame_number(words, numbers) is None and words not in _with_a_frame(rig):
+        frames = ", ".join(f"body@{n}" for n in sorted(numbers)[:3])
+        raise SessionError(
+            f"--world {words}: allowed: {', '.join(_with_a_frame(rig))}, or the body in a frame, "
+            f"whatever it is called: {frames}, ..."
+        )
+
+
+def in_world(found: Calibration, words: str) -> Calibration:
+    """The calibration in another frame, named as for `check_world`."""
+    check_world(found.after, words, found.poses)
+    number = _frame_number(words, found.poses)
+    if number is None:
+        T_new_world = _with_a_frame(found.after)[words]
+    else:
+        T_new_world = inverse(found.poses[number])
+    moved = tuple(sensor.moved(inverse(T_new_world)) for sensor in found.after.sensors)
+    return replace(
+        found,
+        after=replace(found.after, sensors=moved),
+        poses={number: T_new_world @ T for number, T in found.poses.items()},
+        gauge=(*found.gauge, f"the world is that of {words}"),
+    )
+
+
+def _frame_number(words: str, numbers: Collection[int]) -> int | None:
+    """The frame of ``body@FRAME``; None where the words are no frame of the recording."""
+    body, _, number = words.partition("@")
+    known = body == "body" and number.isdecimal() and int(number) in numbers
+    return int(number) if known else None
+
+
+def _with_a_frame(rig: Rig) -> dict[str, Floats]:
+    """T_sensor_world of sensors that have a frame of their own, by name."""
+    both = zip(rig.names, rig.sensors, strict=True)
+    return {n: s.T_sensor_world for n, s in both if hasattr(s, "T_sensor_world")}
