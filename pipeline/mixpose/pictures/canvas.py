@@ -63,12 +63,9 @@ def cross(picture: Picture, place: Floats, inner: float, outer: float, colour: C
 def words(
     picture: Picture, text: str, place: tuple[float, float], colour: Colour, *, size: float = 1.0
 ) -> float:
-    """Write text whose baseline begins at a place; `size` 1 is for captions.
+    """Write text from a place on its baseline on, and return where it ends, u in px.
 
-    Returns
-    -------
-    float
-        Where it ends, u in px.
+    `size` 1 is for captions.
     """
     pixels = max(round(_TEXT_PX * stroke(picture) * size), 9)
     rim = max(round(pixels / 14), 1)

@@ -35,17 +35,10 @@ _MARGIN = 4  # widest blurs around the body
 
 @dataclass(frozen=True)
 class Panel:
-    """A density on a picture.
-
-    Attributes
-    ----------
-    title : str
-    values : (H, W) float64
-        In 1/px², of each pixel the largest.
-    """
+    """A density on a picture."""
 
     title: str
-    values: Floats
+    values: Floats  # (H, W) in 1/px², of each pixel the largest
 
 
 def densities_picture(
@@ -58,19 +51,9 @@ def densities_picture(
 ) -> Picture:
     """A row of g at the blurs of a fit, a row of C, and the scale of each below it.
 
-    Parameters
-    ----------
-    view : View
-        Of a camera.
-    body : Body
-    T : (4, 4) array or None
-        The pose, about which is shown what there is; None: about all that was found.
-    sigmas : sequence of float
-        Standard deviations of a feature in px, in the order of the fit, the last σ_ε or less.
-    options : EstimatorOptions
-        Of the session: the objective and its samples.
-    room : (int, int)
-        Of a panel, in px.
+    `sigmas` are standard deviations of a feature in px, in the order of the fit, the last σ_ε or
+    less. What there is about the pose is shown, in panels of a size `room`; without a pose, what is
+    about all that was found.
     """
     box = shown_box(view, body, T, _MARGIN * max(sigmas))
     part, size = fitted(box, room)

@@ -20,17 +20,9 @@ _SAMPLES = 200_000
 
 
 def displayable(image: NDArray[Any]) -> Picture:
-    """Stretch the contrast of a grey image, and brighten it where most of it is dark.
+    """A grey image (H, W), finite, of any type as a picture, brightened where most of it is dark.
 
-    Parameters
-    ----------
-    image : (H, W) array
-        Finite grey values of any type.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        Blue, green and red alike.
+    Its contrast is stretched; blue, green and red are alike.
     """
     low, high, exponent = _stretch(image)
 

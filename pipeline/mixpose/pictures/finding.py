@@ -40,13 +40,13 @@ class Expectation:
         Whether the estimate is "ok": what its features meet are markers then, and not clutter.
     """
 
-    y: Floats
-    seen: Mask
-    met: Mask
-    unexplained: Mask
-    explained: float
-    rms: float | None
-    sure: bool
+    y: Floats  # (N, m), where the features are expected
+    seen: Mask  # (N,), which of them are in view and face the sensor
+    met: Mask  # (N,), which of those were found there
+    unexplained: Mask  # (M,), which of the found points (if points they are) belong to no feature
+    explained: float  # share of the sensor's density that the pose accounts for
+    rms: float | None  # residual of the met features, sensor units
+    sure: bool  # whether it is "ok": what its features meet are markers then, and not clutter
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class Finding:
     """
 
     setup: SensorSetup
-    frame: RawFrame | None
-    view: View | None
-    points: Floats | None
-    count: float
-    expectation: Expectation | None
+    frame: RawFrame | None  # None where the sensor has no frame of this number
+    view: View | None  # None where it has no frame
+    points: Floats | None  # (M, m), where the extraction gives points
+    count: float  # points found, or points of light with the energy of a grid
+    expectation: Expectation | None  # None without a pose or without features
 
     @property
     def name(self) -> str:

@@ -40,13 +40,7 @@ class Sink(Protocol):
 class Overlay:
     """Draws every frame of a run and hands the pictures on; a context for ``run(watch=...)``.
 
-    Parameters
-    ----------
-    session : Session
-    path : Path
-        A video by its extension (.mp4, .mkv, .avi), else a folder.
-    resume : bool
-        Go on in a folder.
+    It goes into a video by the extension of its path, else into a folder, in which it can `resume`.
 
     Raises
     ------

@@ -57,18 +57,10 @@ _LEAST_ELLIPSE_PX = 3.0  # of the larger half-axis; smaller ones hide behind the
 
 @dataclass(frozen=True)
 class Part:
-    """What a picture shows of a sensor: pixels from `corner` on, `zoom` times as large.
+    """What a picture shows of a sensor: pixels from `corner` on, `zoom` times as large."""
 
-    Attributes
-    ----------
-    zoom : float
-        Pixels of the picture per pixel of the sensor.
-    corner : (float, float)
-        The sensor's pixel (u, v) in the upper left.
-    """
-
-    zoom: float = 1.0
-    corner: tuple[float, float] = (0.0, 0.0)
+    zoom: float = 1.0  # pixels of the picture per pixel of the sensor
+    corner: tuple[float, float] = (0.0, 0.0)  # the sensor's pixel (u, v) in the upper left
 
     def places(self, y: Floats) -> Floats:
         """Places on the picture of sensor coordinates (..., 2)."""
@@ -93,39 +85,25 @@ def draw_pose(
     colour: Colour | None = None,
     named: bool = True,
 ) -> Picture:
-    """Draw a pose on a camera's frame.
+    """Draw a pose on a camera's frame, and return a new picture.
 
     Parameters
     ----------
     image_bgr : (H, W, 3) uint8
-        The frame, as of `mixpose.pictures.displayable`; it is left as it is.
-    sensor : Sensor
-        A camera.
-    body : Body
+        The frame, as of `mixpose.pictures.displayable`.
     T_world_object : (4, 4) array or None
         None draws no pose, as for a lost frame.
     covariance : (6, 6) array or None
         Of the pose, order of `mixpose.rigid`; draws the ellipse that holds a feature's place with
-        95 %, where it is large enough to be seen.
-    status : {"ok", "ambiguous", "lost"} or None
-        Written in the corner, and the colour of the features.
-    frame : int or None
-        Number of the frame, written in the corner.
+        95 %, where it is large enough to be seen, `magnified` by a factor.
+    status, frame
+        Written in the corner; the status is the colour of the features, too, unless `colour` is.
     part : Part
         What the picture shows of the sensor, where the frame was cut or resized.
     found : (M, 2) array or None
         Features found in the frame, in pixels of the sensor; marked too.
-    magnified : float
-        Factor by which ellipses are drawn larger than they are.
-    colour : Colour or None
-        Of the features, where the status does not give it.
     named : bool
         Whether names stand beside features.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        A new picture.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
     radius = _MARK_PX * stroke(picture)
@@ -147,13 +125,7 @@ def projected_features(
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Where a sensor has the features of a body.
 
-    Returns
-    -------
-    y : (N, m) float64
-    inside : (N,) bool
-        Whether the sensor can measure there.
-    seen : (N,) bool
-        Whether the feature also faces the sensor.
+    Their places (N, m), whether it can measure there (N,), and whether they also face it (N,).
     """
     points = transform(T_world_object, body.means)
     y, inside = sensor.project(points)

@@ -31,13 +31,7 @@ _PLACES = 600  # at which C is drawn
 
 
 def require_matplotlib() -> None:
-    """Make sure that plots can be made.
-
-    Raises
-    ------
-    SessionError
-        If matplotlib is not installed.
-    """
+    """Make sure that plots can be made, else raise a `SessionError`."""
     try:
         import matplotlib.figure  # noqa: F401, PLC0415
     except ImportError as error:
@@ -57,17 +51,8 @@ def ranges_picture(
 ) -> Picture:
     """Range sensors one below the other: measurement, densities g and C, the ranges of the pose.
 
-    Parameters
-    ----------
-    findings : sequence of Finding
-        Of range sensors.
-    sigmas : sequence of sequence of float
-        Blurs of each sensor whose density is drawn, coarse to fine.
-    body, estimate
-    unit : str
-        Of lengths.
-    width, row_height : int
-        Of the picture and of a sensor, in px.
+    Of each sensor the densities of some blurs `sigmas` are drawn, coarse to fine; `unit` is of
+    lengths, `row_height` that of a sensor in px.
     """
     figure = _figure(width, row_height * len(findings))
     rows = figure.subplots(len(findings), 1, squeeze=False)[:, 0]
@@ -85,20 +70,10 @@ def objective_picture(
     unit: str,
     width: int,
 ) -> Picture:
-    """Slices and maps of the objective.
+    """Slices and maps of the objective as of `objective_around`, a picture of some width in px.
 
-    Parameters
-    ----------
-    slices, maps
-        As of `objective_around`.
-    levels : sequence of float
-        Blur of each level in σ_ε.
-    covariance : (6, 6) array or None
-        Its 95 % ellipses are drawn on the maps.
-    unit : str
-        Of lengths.
-    width : int
-        In px.
+    `levels` are the blurs in σ_ε; 95 % ellipses of the covariance (6, 6) are drawn on the maps;
+    `unit` is of lengths.
     """
     import matplotlib as mpl  # noqa: PLC0415 - heavy
 

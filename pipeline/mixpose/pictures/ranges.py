@@ -37,22 +37,9 @@ def draw_ranges(
     *,
     size: tuple[int, int] = STRIP_SIZE,
 ) -> Picture:
-    """Draw the measurement of a range sensor with the ranges that a pose has.
+    """Draw what a range sensor measured, None where it has no frame, with the ranges of a pose.
 
-    Parameters
-    ----------
-    name : str
-        Of the sensor.
-    pattern : PointPattern, GridPattern or None
-        Unlabelled ranges or a profile; None where the sensor has no frame.
-    sensor, body, T_world_object, covariance, status
-        As for `mixpose.pictures.draw_pose`.
-    size : (int, int)
-        Width and height in px.
-
-    Returns
-    -------
-    (H, W, 3) uint8
+    `size` is width and height in px; all else is as for `mixpose.pictures.draw_pose`.
     """
     picture = np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     expected = np.zeros(0)

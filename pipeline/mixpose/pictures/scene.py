@@ -41,21 +41,10 @@ _DETECTION_PX = 2.5
 
 
 def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> Picture:
-    """Draw the frames of all sensors with the poses that were estimated from them.
+    """Draw the frames of all sensors with the poses estimated from them, one of each body.
 
-    Cameras stand side by side, range sensors are strips below them.
-
-    Parameters
-    ----------
-    session : Session
-    frame_set : FrameSet
-    *estimates : Estimate
-        Of these frames, one per body; each of several has a colour of its own.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        The same size for every frame, as long as the frames are.
+    Cameras stand side by side, range sensors are strips below them; each of several bodies has a
+    colour of its own. The picture is of the same size for every frame, as long as the frames are.
     """
     posed = with_bodies(session, estimates)
     cameras = [setup for setup in session.sensors if setup.sensor.dimension == 2]
@@ -123,9 +112,7 @@ def backdrop(
 ) -> tuple[Picture, Part]:
     """A camera's frame as a picture that fits into some room, before anything is drawn on it.
 
-    Without a room it keeps its size.
-
-    Where the camera has detections in place of images they are dots on a dark ground.
+    Without a room it keeps its size. Detections in place of images are dots on a dark ground.
     """
     data = None if frame is None else frame.data
     if data is None or isinstance(data, PointPattern | GridPattern):

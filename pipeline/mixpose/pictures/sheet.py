@@ -36,20 +36,9 @@ _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 def inspection_pictures(
     session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
-    """Make all pictures of one body in one frame.
+    """All pictures of one body in one frame, of which there is a finding per sensor.
 
-    Parameters
-    ----------
-    session : Session
-    body : Body
-    findings : sequence of Finding
-        One per sensor.
-    estimate : Estimate
-
-    Returns
-    -------
-    dict of str to (H, W, 3) uint8
-        By file name, ``sheet.png`` first.
+    By file name, ``sheet.png`` first.
     """
     views = [
         finding.view

@@ -26,39 +26,20 @@ _SAMPLES = 200  # per feature: enough to look at
 
 @dataclass(frozen=True)
 class Slice:
-    """The objective along one direction.
+    """The objective along one direction."""
 
-    Attributes
-    ----------
-    direction : int
-        Of `mixpose.rigid.TWIST_NAMES`.
-    offsets : (n,) float64
-        Lengths or radians from the pose.
-    values : (levels, n) float64
-        Per level of blur, the largest of each level 1.
-    """
-
-    direction: int
-    offsets: Floats
-    values: Floats
+    direction: int  # of `mixpose.rigid.TWIST_NAMES`
+    offsets: Floats  # (n,) lengths or radians from the pose
+    values: Floats  # (levels, n) per level of blur, the largest of each level 1
 
 
 @dataclass(frozen=True)
 class Map:
-    """The objective at the finest blur over two directions.
+    """The objective at the finest blur over two directions."""
 
-    Attributes
-    ----------
-    directions : (int, int)
-        Across and up.
-    offsets : ((n,) float64, (n,) float64)
-    values : (n, n) float64
-        Rows along the second direction; the largest is 1.
-    """
-
-    directions: tuple[int, int]
-    offsets: tuple[Floats, Floats]
-    values: Floats
+    directions: tuple[int, int]  # across and up
+    offsets: tuple[Floats, Floats]  # (n,), (n,)
+    values: Floats  # (n, n), rows along the second direction; the largest is 1
 
 
 def objective_around(
@@ -71,17 +52,9 @@ def objective_around(
 ) -> tuple[list[Slice], list[Map]]:
     """Cut the objective along every free direction, and over the pairs that depend most.
 
-    Parameters
-    ----------
-    views : sequence of View
-        At least one, none with an empty observation.
-    body : Body
-    T_world_object : (4, 4) array
-    covariance : (6, 6) array or None
-        Chooses the pairs by their correlation; without it they are the first.
-    options : EstimatorOptions
-    levels : sequence of sequence of float
-        Blurs per level and view, coarse to fine.
+    There is at least one view, and none with an empty observation. Pairs are chosen by their
+    correlation in the covariance (6, 6); without it they are the first. `levels` are the blurs per
+    level and view, coarse to fine.
     """
     free = np.flatnonzero(free_mask(options)).tolist()
     unit = _one_blur(views, body, T_world_object, levels[-1])
