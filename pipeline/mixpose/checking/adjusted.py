@@ -25,33 +25,17 @@ _FEWEST = 4  # coordinates beyond those of poses and values that are asked for
 
 @dataclass(frozen=True)
 class Unknown:
-    """Values of a session that may be other than it says, 0 where it is right.
+    """Values of a session that may be other than it says, 0 where it is right."""
 
-    Attributes
-    ----------
-    what : str
-        What is wrong, as in `Change`.
-    remedy : callable
-        What values (k,) explain the frames by, in words.
-    deviations : (k,) array
-        How far off they may be.
-    points : callable
-        Points (N, 3) of the body by those given and values (k,).
-    sensor : callable
-        A sensor by its name, the one given and values (k,).
-    feature : int or None
-        The only one that is changed.
-    cost : float
-        Nats against it, beside what its values cost.
-    """
-
-    what: str
-    remedy: Callable[[Floats], str]
-    deviations: Floats
+    what: str  # is wrong, as in `Change`
+    remedy: Callable[[Floats], str]  # what values (k,) explain the frames by
+    deviations: Floats  # (k,), how far off they may be
+    # points (N, 3) of the body by those given and values (k,)
     points: Callable[[Floats, Floats], Floats] = lambda points, _: points
+    # a sensor by its name, the one given and values (k,)
     sensor: Callable[[str, Any, Floats], Any] = lambda _, sensor, __: sensor
-    feature: int | None = None
-    cost: float = 0.0
+    feature: int | None = None  # the only one that is changed
+    cost: float = 0.0  # nats against it, beside what its values cost
 
 
 @dataclass(frozen=True)

@@ -37,22 +37,11 @@ def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
 def advice(
     session: Session, setup: SensorSetup, number: int, image: Image | None, expected: int
 ) -> str:
-    """What to change so that about as many features are found as the body has.
+    """What to change so that about as many features are found as the sensor should see of the body.
 
     Each key is tried by itself on one image, and the body is looked for in what is found then: as
-    many features as it has may be clutter that is larger or brighter than it.
-
-    Parameters
-    ----------
-    session : Session
-    setup : SensorSetup
-        The sensor, with its options so far.
-    number : int
-        Of the frame.
-    image : image or None
-        None where the sensor has detections only: then nothing can be tried.
-    expected : int
-        Features that the sensor should see.
+    many features as it has may be clutter that is larger or brighter than it. Where the sensor has
+    detections and no image, nothing can be tried.
     """
     options = setup.extract
     if image is None:

@@ -24,33 +24,16 @@ from mixpose.session import SensorSetup, Session
 
 @dataclass(frozen=True)
 class Change:
-    """A change of a session, and what it would mean.
+    """A change of a session, and what it would mean."""
 
-    Attributes
-    ----------
-    what : str
-        What is wrong, with a verb that "may be" can replace in ``{is}`` or ``{are}``.
-    remedy : str
-        What explains the frames: "with ...".
-    views : callable
-        What is seen, and by which sensors, by what is given.
-    body : callable
-        The body by the one given.
-    cost : float
-        Nats that the choice of its values costs.
-    values : int
-        How many are chosen.
-    feature : int or None
-        The only one that is changed.
-    """
-
-    what: str
-    remedy: str
+    what: str  # is wrong, with a verb that "may be" can replace in ``{is}`` or ``{are}``
+    remedy: str  # what explains the frames: "with ..."
+    # what is seen, and by which sensors, by what is given
     views: Callable[[Views], Views] = lambda views: views
-    body: Callable[[Body], Body] = lambda body: body
-    cost: float = 0.0
-    values: int = 0
-    feature: int | None = None
+    body: Callable[[Body], Body] = lambda body: body  # by the one given
+    cost: float = 0.0  # nats that the choice of its values costs
+    values: int = 0  # how many are chosen
+    feature: int | None = None  # the only one that is changed
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:

@@ -40,12 +40,7 @@ _FIRST = 40  # frames of videos among which they are: to get far into one takes 
 class Doubts:
     """What frames tell of a session.
 
-    Attributes
-    ----------
-    warnings : tuple of str
-    explains : bool
-        Whether a change was found with which frames are explained: numbers of features that are
-        unlike what the body has are no more odd then.
+    With a change that `explains` them numbers of features unlike those of the body are not odd.
     """
 
     warnings: tuple[str, ...] = ()
@@ -58,14 +53,6 @@ def geometry_doubts(
     """What of a session is most likely wrong, by a few frames of its recording.
 
     Nothing is said of several bodies, and of streams, which are read once.
-
-    Parameters
-    ----------
-    session : Session
-    sources : mapping of str to Source
-        By sensor name.
-    surveys : mapping of str to Survey
-        What their frames hold.
     """
     streams = any(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)

@@ -27,39 +27,18 @@ _COUNTED = 20
 
 @dataclass(frozen=True)
 class Survey:
-    """What the frames of one sensor hold.
+    """What the frames of one sensor hold."""
 
-    Attributes
-    ----------
-    numbers : tuple of int
-        Frames that could be read, ascending.
-    counted : tuple of int
-        Those of them in which features were looked for.
-    counts : tuple of int or None
-        Features found in each of these; None where frames are grey values or profiles, in which
-        nothing is counted.
-    empty : tuple of int
-        Those of them without any feature, or of one value all over.
-    size : (int, int) or None
-        Width and height of the images in px.
-    damage : tuple of str
-        Why a frame could not be read, a line each.
-    damaged : tuple of int
-        Their numbers, as far as known.
-    is_whole : bool
-        Whether all frames were looked at.
-    found : mapping of int to RawFrame
-        Frames that were counted, with the points found in place of an image.
-    """
-
-    numbers: tuple[int, ...]
-    counted: tuple[int, ...]
+    numbers: tuple[int, ...]  # frames that could be read, ascending
+    counted: tuple[int, ...]  # those of them in which features were looked for
+    # features found in each of these; None of grey values or profiles, which are not counted
     counts: tuple[int, ...] | None
-    empty: tuple[int, ...]
-    size: tuple[int, int] | None = None
-    damage: tuple[str, ...] = ()
-    damaged: tuple[int, ...] = ()
-    is_whole: bool = True
+    empty: tuple[int, ...]  # those of them without any feature, or of one value all over
+    size: tuple[int, int] | None = None  # width and height of the images in px
+    damage: tuple[str, ...] = ()  # why a frame could not be read, a line each
+    damaged: tuple[int, ...] = ()  # their numbers, as far as known
+    is_whole: bool = True  # whether all frames were looked at
+    # frames that were counted, with the points found in place of an image
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
     @property
@@ -82,23 +61,9 @@ def survey(
 ) -> Survey:
     """Read the frames of a sensor as a run would, past damaged images.
 
-    Parameters
-    ----------
-    session : Session
-    setup : SensorSetup
-    source : Source
-        The sensor's recording.
-    quick : bool
-        Look at a few frames only, as is always done of a stream, which has no end.
-    looked_at : collection of int or None
-        Frames whose images are searched for features; None for all that are read.
-    done : callable
-        Called after each frame.
-
-    Raises
-    ------
-    SessionError
-        If a function of the user's that extracts features fails.
+    `quick` looks at a few frames only, as is always done of a stream, which has no end. Features
+    are searched for in the images of frames `looked_at`, None for all. `done` is called after each
+    frame. A `SessionError` if a function of the user's that extracts features fails.
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: list[tuple[int | None, str]] = []

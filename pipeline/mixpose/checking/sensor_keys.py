@@ -13,10 +13,7 @@ _OFF_CENTRE = 0.25  # of the image: lenses are centred better, crops and other s
 def key_warnings(session: Session) -> list[str]:
     """What is most likely wrong about calibrations and widths, a line each.
 
-    Parameters
-    ----------
-    session : Session
-        With the sizes of the recorded images.
+    The session knows the sizes of the recorded images.
     """
     return _off_centre(session) + _too_wide(session)
 

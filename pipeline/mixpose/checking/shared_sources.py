@@ -14,11 +14,7 @@ from mixpose.session import Session
 def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> list[str]:
     """Pairs of sensors that read the same files, the same camera or the same stream.
 
-    Parameters
-    ----------
-    session : Session
-    replaced : mapping of str to str
-        Recordings in place of the session's, by sensor name.
+    Recordings are `replaced` by sensor name.
     """
     read = {
         setup.name: {

@@ -39,21 +39,12 @@ from mixpose.session import Session
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a few frames say of a session.
+    """What a few frames say of a session."""
 
-    Attributes
-    ----------
-    change : str
-        What is wrong, and with what change frames are explained; empty where nothing is.
-    gain : str
-        What is explained by it.
-    good : int
-        How many frames are explained as the session is.
-    """
-
+    # what is wrong, and with what change frames are explained; empty where nothing is
     change: str = ""
-    gain: str = ""
-    good: int = 0
+    gain: str = ""  # what is explained by it
+    good: int = 0  # how many frames are explained as the session is
 
 
 @dataclass
@@ -95,18 +86,11 @@ def diagnosis(
     others: Sequence[tuple[Change, Frames]] = (),
     further: Callable[[], Frames] = lambda: (),
 ) -> Diagnosis:
-    """What is most likely wrong with a session, by frames of its recording.
+    """What is most likely wrong with a session of one body, by frames of its recording.
 
-    Parameters
-    ----------
-    session : Session
-        Of one body.
-    frames : sequence of (int, sequence of View)
-        By number; those that show most first.
-    others : sequence of (Change, sequence of (int, sequence of View))
-        Changes of how features are extracted, with what is extracted then.
-    further : callable
-        Frames that are looked at, too, where these leave a change by values undecided.
+    Frames are by number, those that show most first. `others` are changes of how features are
+    extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
+    change by values undecided.
     """
     rules, began = DiagnosisRules(), time.process_time()
 
@@ -136,13 +120,8 @@ def diagnosis(
 def explanation(session: Session, frames: Frames) -> str | None:
     """The change that explains frames, in words; None where none of those tried does.
 
-    Parameters
-    ----------
-    session : Session
-        Of one body.
-    frames : sequence of (int, sequence of View)
-        Frames, by number, that are not explained as they are; three in a row tell of a sensor that
-        is one late.
+    The frames, by number, of a session of one body are not explained as they are; three in a row
+    tell of a sensor that is one late.
     """
     return late_sensor(session, frames) or diagnosis(session, frames).change or None
 

@@ -18,14 +18,10 @@ _TRIED = 64
 
 
 def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | None]) -> Session:
-    """A session whose cameras know the size of their images.
+    """A session whose cameras know the size of their images, as the recordings have them by name.
 
-    Parameters
-    ----------
-    session : Session
-    sizes : mapping of str to (width, height) or None
-        As the recordings have them, by sensor name.  Where neither the session nor the recording
-        says, the optical axis is taken to meet the middle of the image.
+    Where neither the session nor the recording says, the optical axis is taken to meet the middle
+    of the image.
     """
     setups = [_with_size(setup, sizes.get(setup.name)) for setup in session.sensors]
     return replace(session, sensors=tuple(setups))
@@ -54,22 +50,10 @@ def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:
 def typical_poses(
     session: Session, count: int, *, away: float = 1.0, seed: int = 0
 ) -> list[Floats]:
-    """Poses T_world_object in the sensors' common view, those that show most features.
+    """Poses T_world_object in the sensors' common view, if any, those that show most features.
 
-    Parameters
-    ----------
-    session : Session
-        Every camera with a resolution.
-    count : int
-    away : float
-        For one camera: how many times as far away as where the body fills half of the image's
-        smaller side.
-    seed : int
-
-    Returns
-    -------
-    list of (4, 4) array
-        Empty where no place is in view of the sensors.
+    Every camera has a resolution. One alone is `away` times as far away as where the body fills
+    half of the image's smaller side.
     """
     rotations = Rotation.random(_TRIED, rng=np.random.default_rng(seed)).as_matrix()
     pivot = pivot_of(session.body)

@@ -43,9 +43,7 @@ def small_box(
 
 
 def enlarged(whole: Picture | None, picture: Picture, box: Box) -> tuple[Picture, Part]:
-    """A box of a sensor, by a picture of all its pixels if any, as large as an inset of another
-    one.
-    """
+    """A box of a sensor, by a picture of all its pixels if any, as large as an inset is."""
     size = round(_SIDE * min(picture.shape[:2]))
     part = Part(size / box[1], (float(box[0][0]), float(box[0][1])))
     if whole is None:

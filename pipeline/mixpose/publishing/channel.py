@@ -18,15 +18,7 @@ _REMEMBERED = 10_000  # latencies: a live source may run for days
 
 
 class Channel:
-    """Sends messages to one receiver, and counts what becomes of them.
-
-    Parameters
-    ----------
-    address : Address
-    sender : Sender
-    tell : callable
-        Says a line to people.
-    """
+    """Sends messages to one receiver, and counts and tells what becomes of them."""
 
     def __init__(
         self,

@@ -15,22 +15,13 @@ from mixpose.records import Estimate, Moment
 
 @dataclass(frozen=True)
 class Message:
-    """An estimate on its way.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    moment : Moment or None
-        When its frame was taken, by `time.monotonic`; None of a recording.
-    ahead_s : float
-        How much later the pose is foretold for.
-    unix_s : float or None
-        The moment that the pose is of, in seconds since 1970; None of a recording.
-    """
+    """An estimate on its way."""
 
     estimate: Estimate
+    # when its frame was taken, by `time.monotonic`; None of a recording
     moment: Moment | None = None
-    ahead_s: float = 0.0
+    ahead_s: float = 0.0  # how much later the pose is foretold for
+    # the moment of the pose, s since 1970, the same for all receivers; None of a recording
     unix_s: float | None = field(init=False, default=None)  # the same for all receivers
 
     def __post_init__(self) -> None:

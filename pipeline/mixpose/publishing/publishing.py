@@ -25,16 +25,12 @@ class Publishing:
 
     Parameters
     ----------
-    urls : sequence of str
-    header : Header
-        Of the run.
     tell : callable
         Says a line to people.
     foresee : mapping of str to callable
         By label of a body; where there is none, estimates are published as they are.
     ahead_s : float
         What these callables look ahead.
-    rules : PublishingRules
 
     Raises
     ------
@@ -81,10 +77,7 @@ class Publishing:
     def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
         """Publish an estimate of a frame; to be given to `mixpose.run`.
 
-        Raises
-        ------
-        SessionError
-            If it is to be foretold, and the frame has no time.
+        A `SessionError` if it is to be foretold, and the frame has no time.
         """
         require_finite(estimate)
         # what tells its offsets holds all that the frame was made from

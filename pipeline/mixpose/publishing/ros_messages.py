@@ -34,10 +34,7 @@ class RosMessage(NamedTuple):
 def topics(address: Address, header: Header) -> Topics:
     """``ros2://topic`` is the topic of a body; of several, each has its own below that.
 
-    Raises
-    ------
-    SessionError
-        If the address names no topic.
+    A `SessionError` if the address names no topic.
     """
     names = address.name.split("/")
     if not all(part == path_word(part) and part for part in names):

@@ -24,10 +24,7 @@ SENDERS: Mapping[str, str] = {
 def sender_for(address: Address, header: Header) -> Sender:
     """What sends the poses of a run to an address.
 
-    Raises
-    ------
-    SessionError
-        If the address is not one of its protocol, or its package is not installed.
+    A `SessionError` if that is not one of its protocol, or its package is not installed.
     """
     module, _, name = SENDERS[address.scheme].partition(":")
     make: Callable[[Address, Header], Sender] = getattr(

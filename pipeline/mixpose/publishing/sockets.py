@@ -10,13 +10,7 @@ from mixpose.publishing.backlog import PublishingRules
 
 
 def connected(place: tuple[str, int]) -> socket.socket:
-    """A connection to a host and a port, on which little waits and nothing is held back.
-
-    Raises
-    ------
-    OSError
-        If nobody answers there in time.
-    """
+    """A connection to a host and a port, on which little waits and nothing is held back."""
     connection = socket.create_connection(place, PublishingRules.connect_s)
     connection.settimeout(None)  # whoever is slow is waited for: half a line helps nobody
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -44,24 +38,12 @@ class Datagrams:
         self._to: tuple[Any, ...] = ()
 
     def connect(self) -> None:
-        """Look up the host.
-
-        Raises
-        ------
-        OSError
-            If it is not known.
-        """
+        """Look up the host."""
         kind, _, _, _, self._to = socket.getaddrinfo(*self._place, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(kind, socket.SOCK_DGRAM)
 
     def put(self, data: bytes) -> None:
-        """Send one datagram.
-
-        Raises
-        ------
-        OSError
-            If it is too long, or there is no way to the host.
-        """
+        """Send one datagram."""
         assert self._socket is not None
         self._socket.sendto(data, self._to)
 

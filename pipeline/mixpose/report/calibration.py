@@ -20,22 +20,9 @@ _LONG = 0.05  # of an image's width: the arrow of a residual of three standard d
 
 
 def render_calibration(found: Calibration, name: str, unit: str, version: str) -> str:
-    """The page of a calibration, without anything outside it.
+    """The page of a calibration of a session by its name, without anything outside it.
 
-    Parameters
-    ----------
-    found : Calibration
-    name : str
-        Of the session.
-    unit : str
-        Of lengths.
-    version : str
-        Of mixpose.
-
-    Raises
-    ------
-    SessionError
-        If a library is missing.
+    `unit` is of lengths, `version` of mixpose. A `SessionError` where a library is missing.
     """
     environment = page_templates()
     sensors = range(len(found.after.names))

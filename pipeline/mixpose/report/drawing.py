@@ -90,15 +90,7 @@ def _figure(height: float, shares: tuple[float, ...]) -> tuple[Figure, list[Axes
 
 
 class TimeAxes:
-    """Axes over the frames of a run.
-
-    Parameters
-    ----------
-    axes : Axes
-    series : Series
-    jumps : (n,) bool, optional
-        Frames before which a value steps by no motion: lines break there.
-    """
+    """Axes over the frames of a run; lines break at `jumps` (n,), which are no motion."""
 
     def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
         self._axes, self._series = axes, series

@@ -36,21 +36,11 @@ _BINS = 40
 
 @dataclass(frozen=True)
 class Chart:
-    """One figure of the page.
+    """One figure of the page."""
 
-    Attributes
-    ----------
-    title : str
-        May hold names that people gave; the page escapes it.
-    alt : str
-        What is seen, for those who do not see it.
-    svg : str
-        An ``<svg>`` element.
-    """
-
-    title: str
-    alt: str
-    svg: str
+    title: str  # may hold names that people gave; the page escapes it
+    alt: str  # what is seen, for those who do not see it
+    svg: str  # an ``<svg>`` element
 
 
 def trajectory(series: Series, errors: Errors | None) -> list[Chart]:
@@ -83,14 +73,7 @@ _MOST_ROWS = 60  # features of a sensor that are drawn
 
 
 def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
-    """Residual and explained share of each sensor over time.
-
-    Parameters
-    ----------
-    series : Series
-    unit_of : callable
-        Unit of a sensor's residuals, by its name.
-    """
+    """Residual and explained share of each sensor over time; `unit_of` residuals by its name."""
     charts = []
     for name, rms in series.rms.items():
         explained = series.explained[name]
@@ -113,14 +96,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
 
 
 def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
-    """How far off each sensor met each feature over time, a row per feature.
-
-    Parameters
-    ----------
-    series : Series
-    unit_of : callable
-        Unit of a sensor's residuals, by its name.
-    """
+    """How far off each sensor met each feature over time, a row per feature."""
     charts = []
     for name, residuals in series.residuals.items():
         if not residuals:

@@ -15,26 +15,13 @@ _LARGEST = 2_000_000  # bytes; no session file is near it
 
 @dataclass(frozen=True)
 class Origin:
-    """What is known of the session file.
+    """What is known of the session file."""
 
-    Attributes
-    ----------
-    named : str or None
-        Path in the header of the poses.
-    path : Path or None
-        Where it was found.
-    text : str or None
-        Its text.
-    notice : str or None
-        What is wrong: missing, changed, no session any more.
-    session : Session or None
-        Only if the file is the very one that the poses were estimated with.
-    """
-
-    named: str | None = None
-    path: Path | None = None
-    text: str | None = None
-    notice: str | None = None
+    named: str | None = None  # path in the header of the poses
+    path: Path | None = None  # where it was found
+    text: str | None = None  # its text
+    notice: str | None = None  # what is wrong: missing, changed, no session any more
+    # only if the file is the very one that the poses were estimated with
     session: Session | None = None
 
 

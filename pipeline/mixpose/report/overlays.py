@@ -33,27 +33,15 @@ _LARGEST_ZOOM = 4.0
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera's frame with the pose on it.
-
-    Attributes
-    ----------
-    sensor : str
-    uri : str
-        Holds the whole JPEG.
-    width, height : int
-        Of the JPEG in px.
-    zoom : float
-        Pixels of the JPEG per pixel of the camera.
-    is_part : bool
-        Whether it shows only the surroundings of the object.
-    """
+    """A camera's frame with the pose on it."""
 
     sensor: str
-    uri: str
+    uri: str  # holds the whole JPEG
+    # of the JPEG in px
     width: int
     height: int
-    zoom: float
-    is_part: bool
+    zoom: float  # pixels of the JPEG per pixel of the camera
+    is_part: bool  # whether it shows only the surroundings of the object
 
 
 @dataclass(frozen=True)
@@ -71,12 +59,8 @@ def overlay_frames(
 ) -> tuple[list[OverlayFrame], list[str]]:
     """Read a few frames again and draw their poses.
 
-    Returns
-    -------
-    frames : list of OverlayFrame
-        Ascending; empty where no camera's recording can be read.
-    notices : list of str
-        What could not be read, a sentence each.
+    The frames are ascending, and none where no camera's recording can be read; beside them stands
+    what could not be read, a sentence each.
     """
     setups, opened, notices = _open(session)
     chosen = chosen_frames(series, errors)

@@ -51,10 +51,7 @@ class SensorRow:
 def page_templates() -> Environment:
     """The templates of pages, once what a page is made with is found to be installed.
 
-    Raises
-    ------
-    SessionError
-        Naming the extra that brings it.
+    Else a `SessionError` names the extra that brings it.
     """
     try:
         import matplotlib  # noqa: F401, PLC0415
@@ -76,14 +73,7 @@ def page_templates() -> Environment:
 def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
     """The report of a run as one HTML page without anything outside it.
 
-    Parameters
-    ----------
-    poses : PoseFile
-    truth : PoseFile or None
-    cut : bool
-        Whether the last line of the poses was cut off.
-    version : str
-        Of mixpose, which makes the page.
+    `cut` says whether the last line of the poses was cut off; `version` is of mixpose.
 
     Raises
     ------

@@ -28,13 +28,9 @@ _ORIENTATIONS = 64
 def central_pose(session: Session, seed: int) -> Floats:
     """T_world_object (4, 4) that a simulated motion swings about.
 
-    That is ``[start]`` where the session has one.  Else the place follows from the sensors, and
-    the orientation is drawn by chance: the one of several that shows most features.
-
-    Raises
-    ------
-    SessionError
-        If no sensor sees any feature of the body there.
+    That is ``[start]`` where the session has one. Else the place follows from the sensors, and the
+    orientation is drawn by chance: the one of several that shows most features. A `SessionError` if
+    no sensor sees any feature of the body there.
     """
     if session.start is not None:
         T = session.start.T_world_object

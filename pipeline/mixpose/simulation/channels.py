@@ -40,35 +40,18 @@ _PEAK_REACH = 5.0  # standard deviations of a peak that still fit into a profile
 
 @dataclass(frozen=True)
 class Channel:
-    """One sensor of a recording.
-
-    Attributes
-    ----------
-    files : SourceFiles
-    view : View
-    options : SimulationOptions
-        As they hold for this sensor.
-    open : callable
-        Takes the recording's folder and starts to write there.
-    step_s : float
-        Seconds by which its frames are later than those of the first sensor, as its times say.
-    """
+    """One sensor of a recording."""
 
     files: SourceFiles
     view: View
-    options: SimulationOptions
-    open: Callable[[Path], SensorWriter]
+    options: SimulationOptions  # as they hold for this sensor
+    open: Callable[[Path], SensorWriter]  # takes the recording's folder and starts to write there
+    # seconds by which its frames are later than those of the first sensor, as its times say
     step_s: float = 0.0
 
 
 def check_setup(session: Session) -> None:
-    """See that every sensor states what drawing needs.
-
-    Raises
-    ------
-    SessionError
-        If a camera has no resolution, or looks for something else than spots.
-    """
+    """Raise a `SessionError` for a camera without a resolution, or that looks for no spots."""
     for setup in session.sensors:
         where = f"{session.path}: sensor {setup.name!r}"
         if setup.extract.method == "corners":
@@ -94,29 +77,10 @@ def plan_channel(
     scenery: Scenery = Scenery(),
     step_s: float = 0.0,
 ) -> Channel:
-    """Prepare one sensor.
+    """Prepare one sensor of a session that `check_setup` has passed.
 
-    Parameters
-    ----------
-    setup : SensorSetup
-        Of a session that `check_setup` has passed.
-    files : SourceFiles
-    body : Body
-    motion : Motion
-    options : SimulationOptions
-    fps : float
-        Frames per second.
-    index : int
-        The sensor's place in the session, which keys its random numbers.
-    scenery : Scenery
-        What else cameras see.
-    step_s : float
-        Seconds by which the sensor is later than the first, and says so.
-
-    Raises
-    ------
-    SessionError
-        If the sensor cannot be simulated.
+    Its place in the session, `index`, keys its random numbers; it is `step_s` later than the first,
+    and says so; cameras see `scenery`, too. A `SessionError` if it cannot be simulated.
     """
     shutter = shutter_of(setup, options, step_s)
     if setup.sensor.dimension == 1:

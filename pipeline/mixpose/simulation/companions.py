@@ -46,10 +46,7 @@ def plan_companions(
 ) -> tuple[Companion, ...]:
     """Place and move the bodies beside the first.
 
-    Raises
-    ------
-    SessionError
-        If there are some, and a sensor is no camera, or no place is left in view.
+    A `SessionError` if there are some, and a sensor is no camera, or no place is left in view.
     """
     members = [(one, i) for one in session.objects for i in one.instances][1:]
     if not members:

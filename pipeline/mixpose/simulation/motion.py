@@ -19,17 +19,11 @@ _FIRST = 0.07
 
 @dataclass(frozen=True)
 class Swing:
-    """Sums of sinusoids, one sum per world axis.
+    """Sums of K sinusoids, one sum per world axis."""
 
-    Attributes
-    ----------
-    amplitudes, frequencies_hz, phases : (K, 3) float64
-        Of K sinusoids per axis; phases in radians.
-    """
-
-    amplitudes: Floats
+    amplitudes: Floats  # (K, 3), as all of them
     frequencies_hz: Floats
-    phases: Floats
+    phases: Floats  # in radians
 
     def at(self, times_s: Floats) -> Floats:
         """Values (..., 3) at times (...)."""
@@ -39,24 +33,12 @@ class Swing:
 
 @dataclass(frozen=True)
 class Motion:
-    """A body that swings and turns about a central pose.
+    """A body that swings and turns about a central pose."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        The central pose.
-    pivot : (3,) float64
-        The point of the object, in its own frame, about which it turns.
-    shift : Swing
-        Displacement of the pivot, length units.
-    turn : Swing
-        Rotation vector in world axes, radians.
-    """
-
-    T_world_object: Floats
-    pivot: Floats
-    shift: Swing
-    turn: Swing
+    T_world_object: Floats  # (4, 4), the central pose
+    pivot: Floats  # (3,), the point of the object, in its own frame, about which it turns
+    shift: Swing  # displacement of the pivot, length units
+    turn: Swing  # rotation vector in world axes, radians
 
     def poses(self, times_s: Floats) -> Floats:
         """The poses T_world_object (..., 4, 4) at times (...) in seconds."""
@@ -81,22 +63,11 @@ def plan_motion(
     free: tuple[str, ...] = TWIST_NAMES,
     seed: int = 0,
 ) -> Motion:
-    """Choose a motion about a central pose.
+    """Choose a motion about a central pose (4, 4) and the pivot (3,) in the object's frame.
 
-    Parameters
-    ----------
-    T_world_object : (4, 4) array
-        The central pose.
-    pivot : (3,) array
-        Where the object turns about, in its frame.  With fewer than six directions free it turns
-        about its origin instead, as a turn about any other point would move the origin.
-    translation, rotation_deg : float
-        Largest displacement and turn per world axis.
-    period_s : float
-        About the time of one slow swing.
-    free : tuple of str
-        World-frame directions that change, names of `mixpose.rigid.TWIST_NAMES`.
-    seed : int
+    With fewer than six of the world-frame directions `free` it turns about its origin instead, as a
+    turn about any other point would move the origin. `translation` and `rotation_deg` are largest
+    per world axis; a slow swing takes about `period_s`.
     """
     rng = generator(seed, Purpose.MOTION)
     is_free = np.array([name in free for name in TWIST_NAMES], dtype=np.float64)

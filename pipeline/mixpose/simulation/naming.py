@@ -28,32 +28,16 @@ _FEWEST_DIGITS = 4
 
 @dataclass(frozen=True)
 class SourceFiles:
-    """The files of one sensor, relative to the recording's folder.
+    """The files of one sensor, relative to the recording's folder."""
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor.
-    kind : {"images", "video", "profiles", "detections"}
-    path : str
-        The one file of a video or table; for images what comes before the frame number.
-    ending : str
-        For images: what comes after the frame number.
-    digits : int
-        For images: how many digits the frame number has at least.
-    listed : dict of int to str
-        For images of a list: the name of each frame.
-    pattern : str
-        The glob that the session reads the images by; empty for all other sources.
-    """
-
-    sensor: str
+    sensor: str  # its name
     kind: Kind
-    path: str
-    ending: str = ""
-    digits: int = 0
+    path: str  # the one file of a video or table; for images what comes before the frame number
+    ending: str = ""  # for images: what comes after the frame number
+    digits: int = 0  # for images: how many digits the frame number has at least
+    # for images of a list: the name of each frame
     listed: dict[int, str] = field(default_factory=dict)
-    pattern: str = ""
+    pattern: str = ""  # the glob that the session reads the images by; empty for all other sources
 
     def name(self, number: int) -> str:
         """The file that holds a frame."""
@@ -97,25 +81,10 @@ Sources: TypeAlias = Sequence[tuple[SensorSetup, str | tuple[str, ...]]]
 
 
 def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[SourceFiles, ...]]:
-    """Choose the files of a recording.
+    """Choose the files of a recording, for sources inside its folder.
 
-    Parameters
-    ----------
-    sources : sequence of (SensorSetup, str or tuple of str)
-        The sensors with their sources, these inside the recording's folder.
-    frames : int
-        How many frames there are to be.
-
-    Returns
-    -------
-    numbers : sequence of int
-        Frame numbers, ascending: those that lists of images say, else from 0.
-    files : tuple of SourceFiles
-
-    Raises
-    ------
-    SessionError
-        If no files that can be written would be read by these sources.
+    The frame numbers, ascending, are those that lists of images say, else from 0. A `SessionError`
+    if no files that can be written would be read by these sources.
     """
     single = [(setup, _unlisted(source)) for setup, source in sources]
     numbers = _frame_numbers(single, frames)

@@ -18,24 +18,10 @@ _CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=-1)
 def outline(
     sensor: Sensor, body: Body, feature: int, T_world_object: Floats, mirror: Floats | None = None
 ) -> Floats | None:
-    """Where the edge of a sphere or disk is seen; None where not all of it is.
+    """Where the edge (CORNERS, 2) of a sphere or disk is seen, px; None where not all of it is.
 
-    `sensor` should have no bounds: what lies beyond an image has no place in it.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    body : Body
-        Of spheres or disks.
-    feature : int
-    T_world_object : (4, 4) array
-    mirror : (4, 4) array, optional
-        A reflection of the world, in which the marker is seen.
-
-    Returns
-    -------
-    (CORNERS, 2) array or None
-        In px, in order.
+    `sensor` should have no bounds: what lies beyond an image has no place in it. Through a `mirror`
+    (4, 4) that is a reflection of the world.
     """
     assert body.radii is not None, "a body of points has no outlines"
     radius = float(body.radii[feature])
@@ -70,19 +56,10 @@ def centroid(polygon: Floats) -> Floats:
 
 
 def coverage(polygon: Floats, shape: tuple[int, int]) -> tuple[slice, slice, Floats]:
-    """Share of every pixel that a convex polygon covers, in a box of an image of some shape.
+    """Share of every pixel that a convex polygon covers, in a box of an image of a shape (H, W).
 
-    Parameters
-    ----------
-    polygon : (n, 2) array
-        Corners (u, v) in order, pixel centres at integers.
-    shape : (H, W)
-
-    Returns
-    -------
-    rows, columns : slice
-        The box; empty where the polygon is outside of the image.
-    shares : (h, w) array
+    The corners (n, 2) are (u, v) in order, pixel centres at integers. Rows and columns of the box
+    are empty where the polygon is outside of the image.
     """
     low = np.clip(np.floor(polygon.min(axis=0) + 0.5).astype(int), 0, shape[::-1])
     high = np.clip(np.ceil(polygon.max(axis=0) + 0.5).astype(int), 0, shape[::-1])

@@ -61,25 +61,13 @@ def simulate(
 ) -> None:
     """Write a recording that the session plays, with the true poses beside it.
 
-    The folder then holds ``session.toml``, the marker and calibration files that it names,
-    frames for the source of each sensor, and ``truth.jsonl``.  The same session, options and
-    seed give the same bytes.
+    The folder, made if it is not there, then holds ``session.toml``, the marker and calibration
+    files that it names, frames for the source of each sensor, and ``truth.jsonl``. The same
+    session, options and seed give the same bytes. `progress` is called with the number of frames
+    done, after each.
 
-    Parameters
-    ----------
-    session : Session
-    folder : path
-        Made if it is not there.
-    options : SimulationOptions
-    overwrite : bool
-        Whether a recording in the folder is replaced.
-    progress : callable, optional
-        Called with the number of frames done, after each.
-
-    Raises
-    ------
-    SessionError
-        If the session cannot be simulated, or the folder holds a recording or cannot be written.
+    A `SessionError` if the session cannot be simulated, or the folder holds a recording that is not
+    to be overwritten, or cannot be written.
     """
     folder = Path(folder)
     plan = _plan(session, options)

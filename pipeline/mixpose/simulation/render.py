@@ -26,17 +26,10 @@ _RED, _GREEN, _BLUE = 1.0, 0.8, 0.6
 
 
 def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma: float) -> None:
-    """Add Gaussian spots to an image, in place.
+    """Add Gaussian spots at centres (M, 2) to an image (H, W), in place.
 
-    Parameters
-    ----------
-    image : (H, W) array
-    points : (M, 2) array
-        Centres in px, u right and v down, pixel centres at integers.
-    peaks : (M,) array
-        Density at the centre; a spot adds ``peak · 2π σ²`` in all.
-    sigma : float
-        Standard deviation in px.
+    Centres are in px, u right and v down, pixel centres at integers; a spot of a `peak` adds ``peak
+    · 2π σ²`` in all.
     """
     height, width = image.shape
     for (u, v), peak in zip(points, peaks):
@@ -48,17 +41,9 @@ def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma
 
 
 def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -> None:
-    """Add Gaussian peaks to a profile (B,), in place.
+    """Add Gaussian peaks at `places` (M,), in bins, to a profile (B,), in place.
 
-    Parameters
-    ----------
-    profile : (B,) array
-    places : (M,) array
-        Centres in bins, bin centres at integers.
-    peaks : (M,) array
-        Density at the centre; a peak adds ``peak · √(2π) σ`` in all.
-    sigma : float
-        Standard deviation in bins.
+    Bin centres are at integers; a peak adds ``peak · √(2π) σ`` in all.
     """
     for place, peak in zip(places, peaks):
         bins = _cells(place, sigma, len(profile))
@@ -68,40 +53,21 @@ def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """How a camera's images are drawn.
+    """How a camera's images are drawn."""
 
-    Attributes
-    ----------
-    resolution : (int, int)
-        Width and height, px.
-    spot_sigma : float
-        Standard deviation of a spot, px.
-    polarity : {"bright", "dark"}
-        "dark" is the negative of "bright".
-    """
-
-    resolution: tuple[int, int]
-    spot_sigma: float
-    polarity: Literal["bright", "dark"] = "bright"
+    resolution: tuple[int, int]  # width and height, px
+    spot_sigma: float  # standard deviation of a spot, px
+    polarity: Literal["bright", "dark"] = "bright"  # "dark" is the negative of "bright"
 
 
 @dataclass(frozen=True)
 class ProfileFormat:
-    """How a range sensor's profiles are drawn.
-
-    Attributes
-    ----------
-    bins : int
-    range_min, bin_size : float
-        Range of the first bin, and from bin to bin.
-    width : float
-        Standard deviation of a feature's peak, length units.
-    """
+    """How a range sensor's profiles are drawn."""
 
     bins: int
-    range_min: float
-    bin_size: float
-    width: float
+    range_min: float  # of the first bin
+    bin_size: float  # from bin to bin
+    width: float  # standard deviation of a feature's peak, length units
 
 
 def render_image(
@@ -110,23 +76,7 @@ def render_image(
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """The image that a camera takes.
-
-    Parameters
-    ----------
-    visible : VisibleSpots
-        In px.
-    form : ImageFormat
-    options : SimulationOptions
-        Of which `brightness`, `background`, `noise` and `shot_noise` count here.
-    rng : Generator
-        For the noise.
-
-    Returns
-    -------
-    (H, W) uint8 array
-        Grey levels; what is brighter than 255 is 255.
-    """
+    """The image (H, W) that a camera takes of spots in px; what is brighter than 255 is 255."""
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
     draw_light(image, visible, options.brightness, form.spot_sigma)
@@ -191,22 +141,9 @@ def render_profile(
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """The profile that a range sensor records.
+    """The profile (bins,) that a range sensor records of spots in length units.
 
-    Parameters
-    ----------
-    visible : VisibleSpots
-        In length units.
-    form : ProfileFormat
-    options : SimulationOptions
-        Of which `range_snr` counts here.
-    rng : Generator
-        For the noise.
-
-    Returns
-    -------
-    (bins,) float32 array
-        1 at the peak of a mean feature; never below 0, as amplitudes are not.
+    It is 1 at the peak of a mean feature; never below 0, as amplitudes are not.
     """
     profile = np.zeros(form.bins)
     places = (visible.points[:, 0] - form.range_min) / form.bin_size

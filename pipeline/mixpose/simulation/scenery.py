@@ -38,51 +38,25 @@ _ARM_PERIOD = 0.8  # of that of the body
 
 @dataclass(frozen=True)
 class Actor:
-    """Markers that are no part of the body.
-
-    Attributes
-    ----------
-    body : Body
-    pose : callable
-        From seconds to T_world_object (4, 4).
-    levels : (N,) float64
-        Brightness.
-    mirror : (4, 4) float64 or None
-        Reflection of the world in which they are seen.
-    is_image : bool
-        Whether they are a mirror image of the body, and gone when it is.
-    is_body : bool
-        Whether they are another body of the session: solid, and hidden by others now and then.
-    """
+    """Markers that are no part of the body."""
 
     body: Body
-    pose: PoseAt
-    levels: Floats
-    mirror: Floats | None = None
-    is_image: bool = False
-    is_body: bool = False
+    pose: PoseAt  # from seconds to T_world_object (4, 4)
+    levels: Floats  # (N,) of brightness
+    mirror: Floats | None = None  # reflection (4, 4) of the world in which they are seen
+    is_image: bool = False  # whether they are a mirror image of the body, and gone when it is
+    is_body: bool = False  # another body of the session: solid, and hidden by others now and then
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A straight dark bar that swings before the body.
+    """A straight dark bar that swings before the body."""
 
-    Attributes
-    ----------
-    ends : (2, 3) float64
-        At rest, in the world.
-    swing : (3,) float64
-        Farthest displacement.
-    period_s, phase : float
-    radius : float
-        Half its width.
-    """
-
-    ends: Floats
-    swing: Floats
+    ends: Floats  # (2, 3), at rest, in the world
+    swing: Floats  # (3,), farthest displacement
     period_s: float
     phase: float
-    radius: float
+    radius: float  # half its width
 
     def outline(self, sensor: Sensor, time_s: float) -> Floats:
         """Corners (4, 2) of the bar in a sensor without bounds, px; none where it is not seen."""

@@ -27,24 +27,13 @@ _Place: TypeAlias = tuple[Any, str | int, Role, str]
 
 @dataclass(frozen=True)
 class SessionCopy:
-    """What a recording takes over from a session.
+    """What a recording takes over from a session."""
 
-    Attributes
-    ----------
-    content : bytes
-        The session file.
-    sources : tuple of (str or tuple of str)
-        Sources of the sensors in `content`, in order.
-    times : mapping of str to str
-        Tables of frame times that it names, with the first sensor of each.
-    files : tuple of (Path, str)
-        Marker and calibration files and the user's own extraction: where they are, and their
-        paths in the recording.
-    """
-
-    content: bytes
-    sources: tuple[str | tuple[str, ...], ...]
-    times: Mapping[str, str]
+    content: bytes  # the session file
+    sources: tuple[str | tuple[str, ...], ...]  # sources of the sensors in `content`, in order
+    times: Mapping[str, str]  # tables of frame times that it names, with the first sensor of each
+    # marker and calibration files and the user's own extraction: where they are, and their paths in
+    # the recording
     files: tuple[tuple[Path, str], ...]
 
     def write(self, folder: Path) -> None:
@@ -59,10 +48,8 @@ class SessionCopy:
 def copy_session(session: Session) -> SessionCopy:
     """Read a session file for a recording.
 
-    Raises
-    ------
-    SessionError
-        If it cannot be read, or leads out of its folder in a way that cannot be changed.
+    A `SessionError` if it cannot be read, or leads out of its folder in a way that cannot be
+    changed.
     """
     try:
         content = session.path.read_bytes()

@@ -23,24 +23,12 @@ _BLUR_STEPS = 9  # positions of a moving marker whose light a frame adds up
 
 @dataclass(frozen=True)
 class Shutter:
-    """The timing of a sensor.
+    """The timing of a sensor."""
 
-    Attributes
-    ----------
-    late_s : float
-        Seconds after the common time.
-    readout_s : float
-        Seconds from the first row to the last.
-    exposure_s : float
-        Seconds for which a row collects light.
-    rows : int
-        Rows of an image; 0 where there are none.
-    """
-
-    late_s: float = 0.0
-    readout_s: float = 0.0
-    exposure_s: float = 0.0
-    rows: int = 0
+    late_s: float = 0.0  # seconds after the common time
+    readout_s: float = 0.0  # from the first row to the last
+    exposure_s: float = 0.0  # for which a row collects light
+    rows: int = 0  # of an image; 0 where there are none
 
     @property
     def is_ideal(self) -> bool:

@@ -32,27 +32,14 @@ _PIECES = 32  # in which a line's image is measured
 
 @dataclass(frozen=True)
 class VisibleSpots:
-    """Spots in sensor coordinates.
+    """Spots in sensor coordinates."""
 
-    Attributes
-    ----------
-    points : (M, m) float64
-        Places of the spots.
-    levels : (M,) float64
-        Their brightness; 1 for the mean feature.
-    features : (M,) int
-        The feature that a spot belongs to; numbers from N on are false features.
-    outlines : mapping of int to (K, 2) float64
-        Edges of those spots that have a size.
-    covers : tuple of (4, 2) float64
-        Corners of what is dark before all spots.
-    """
-
-    points: Floats
-    levels: Floats
-    features: NDArray[np.intp]
+    points: Floats  # (M, m), places of the spots
+    levels: Floats  # (M,), their brightness; 1 for the mean feature
+    features: NDArray[np.intp]  # (M,), that spots belong to; numbers from N on are false features
+    # edges (K, 2) of those spots that have a size
     outlines: Mapping[int, Floats] = field(default_factory=dict)
-    covers: tuple[Floats, ...] = ()
+    covers: tuple[Floats, ...] = ()  # corners (4, 2) of what is dark before all spots
 
     def __len__(self) -> int:
         return len(self.points)
@@ -60,29 +47,15 @@ class VisibleSpots:
 
 @dataclass(frozen=True)
 class View:
-    """How one sensor looks at the body throughout a recording.
-
-    Attributes
-    ----------
-    sensor : Sensor
-    lowest, highest : (m,) float64
-        Bounds of false features.
-    levels : (N,) float64
-        Brightness of the features.
-    spacing : float
-        Distance of the spots of which a line consists, sensor units.
-    ridge : float
-        Brightness of each of these spots; 0 shares that of one feature among them.
-    shutter : Shutter
-    scenery : Scenery
-    """
+    """How one sensor looks at the body throughout a recording."""
 
     sensor: Sensor
+    # bounds (m,) of false features
     lowest: Floats
     highest: Floats
-    levels: Floats
-    spacing: float
-    ridge: float = 0.0
+    levels: Floats  # (N,), brightness of the features
+    spacing: float  # distance of the spots of which a line consists, sensor units
+    ridge: float = 0.0  # brightness of each of these spots; 0 shares that of one feature among them
     shutter: Shutter = Shutter()
     scenery: Scenery = Scenery()
 
@@ -105,26 +78,11 @@ def look(
     time_s: float = 0.0,
     is_away: bool = False,
 ) -> VisibleSpots:
-    """Decide what a sensor sees of a body.
+    """Decide what a sensor sees of a body at T_world_object (4, 4) at the frame's time.
 
-    Parameters
-    ----------
-    view : View
-    body : Body
-    T_world_object : (4, 4) array
-        At the frame's time.
-    options : SimulationOptions
-        Of which `hidden`, `hidden_count`, `clutter` and `brightness_spread` count here.
-    rng : Generator
-        For what is hidden and what is false.
-    offsets : (N, 3) array, optional
-        Displacements of the features in the object's frame.
-    pose_after : callable, optional
-        Poses later than the frame's time by some seconds; without it the body stands still.
-    time_s : float
-        Since the motion began, for what else moves.
-    is_away : bool
-        Whether the body is gone.
+    Features are displaced by `offsets` (N, 3) in the object's frame; without `pose_after`, poses
+    later by some seconds, the body stands still; `time_s` since the motion began is for what else
+    moves.
     """
     count = len(body)
     false = _false_features(options.clutter, view, rng)

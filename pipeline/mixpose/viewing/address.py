@@ -22,18 +22,10 @@ _TEXT = re.compile(r"(?:(?P<host>[^:\[\]\s]+|\[[0-9A-Fa-f:.]+\]):)?(?P<port>[0-9
 
 @dataclass(frozen=True)
 class Place:
-    """A listening socket, and who may open what it serves.
+    """A listening socket, and who may open what it serves."""
 
-    Attributes
-    ----------
-    socket : socket.socket
-        Bound and listening: a browser that is early waits.
-    token : str or None
-        What the address has to hold; None where only this machine can open it.
-    """
-
-    socket: socket.socket
-    token: str | None
+    socket: socket.socket  # bound and listening: a browser that is early waits
+    token: str | None  # what the address has to hold; None where only this machine can open it
 
     @property
     def port(self) -> int:
@@ -52,18 +44,10 @@ class Place:
 
 
 def listen(text: str) -> Place:
-    """Listen where ``--view`` says.
+    """Listen where ``--view`` says: at ``PORT`` or ``HOST:PORT``.
 
-    Parameters
-    ----------
-    text : str
-        ``PORT`` or ``HOST:PORT``; empty: `USUAL_PORT` of the loopback interface, or any that is
-        free where that one is taken.
-
-    Raises
-    ------
-    SessionError
-        If the text is neither, or nothing can listen there.
+    Empty, that is `USUAL_PORT` of the loopback interface, or any that is free where that one is
+    taken. A `SessionError` if it is neither, or nothing can listen there.
     """
     if not text:
         try:

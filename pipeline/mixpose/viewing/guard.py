@@ -28,28 +28,15 @@ class Answer:
 
 @dataclass(frozen=True)
 class Guard:
-    """Tells requests that may pass from others.
+    """Tells requests that may pass from others."""
 
-    Attributes
-    ----------
-    port : int
-        Of the page; cookies do not tell ports apart.
-    token : str or None
-        None: only this machine can open it.
-    """
-
-    port: int
-    token: str | None
+    port: int  # of the page; cookies do not tell ports apart
+    token: str | None  # None: only this machine can open it
 
     def answer(self, target: str, headers: Mapping[str, str]) -> Answer | None:
         """What a request gets in place of the page; None where it may pass.
 
-        Parameters
-        ----------
-        target : str
-            Path and query.
-        headers : mapping of str to str
-            Those of `ASKED_FOR` that the request has, each once.
+        Its target is path and query, its headers those of `ASKED_FOR` that it has, each once.
         """
         host = headers.get("Host", "")
         if self.token is None and not _is_loopback(host):

@@ -20,19 +20,12 @@ _UPRIGHT = np.cos(np.deg2rad(30.0))  # an axis of the world that is nearer than 
 
 @dataclass(frozen=True)
 class Outline:
-    """A sensor in space.
-
-    Attributes
-    ----------
-    name : str
-    places : (n, 3) float64
-        Where it stands; of parallel beams the corners of the image on the sensor's plane.
-    border : Rays or None
-        Lines of sight around the edge of the image, in order; None of a range sensor.
-    """
+    """A sensor in space."""
 
     name: str
+    # (n, 3), where it stands; of parallel beams the corners of the image on the sensor's plane
     places: Floats
+    # lines of sight around the edge of the image, in order; None of a range sensor
     border: Rays | None
 
     @property

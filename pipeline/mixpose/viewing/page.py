@@ -27,17 +27,7 @@ _JPEG_QUALITY = 80
 
 
 class Page:
-    """The page of a run.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    session : Session
-    wish : callable or None
-        Asks the run to pause, go on or step; None where it cannot.
-    paused : bool
-        Whether the run is paused to begin with.
-    """
+    """The page of a run; `wish` asks that to pause, go on or step, and is None where it cannot."""
 
     def __init__(
         self,

@@ -54,13 +54,7 @@ class _BodyNodes:
 
 
 class Scene:
-    """The scene of a run.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    session : Session
-    """
+    """The scene of a run."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server = server

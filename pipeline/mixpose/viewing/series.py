@@ -19,14 +19,7 @@ _INK = "#bbbbbb"
 
 
 class Series:
-    """Plots that go along with a run.
-
-    Parameters
-    ----------
-    gui : viser.GuiApi
-    session : Session
-        Residuals of sensors that measure lengths have a plot of their own.
-    """
+    """Plots that go along with a run; residuals that are lengths have one of their own."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._rows: deque[Row] = deque(maxlen=PACE.history)

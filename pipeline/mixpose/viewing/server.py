@@ -29,14 +29,7 @@ class _Server(viser.ViserServer):  # type: ignore[misc]
 
 @contextmanager
 def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.ViserServer]:
-    """A server that answers on a socket.
-
-    Parameters
-    ----------
-    place : Place
-    on_viewers : callable
-        Called with the number of browsers whenever it changes.
-    """
+    """A server that answers on a socket, and tells the number of browsers whenever it changes."""
     # a browser that breaks off, or one that is refused, is nothing to report
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     ready = threading.Event()
@@ -59,13 +52,9 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
     """Let a server that begins here use the socket of a place, and ask its guard first.
 
-    viser offers neither, so what it serves with is replaced while it begins.  The socket takes
-    browsers from the start, viser only once it is made: they are held until it is `ready`.
-
-    Raises
-    ------
-    RuntimeError
-        If it began otherwise, and the guard was not asked.
+    viser offers neither, so what it serves with is replaced while it begins. The socket takes
+    browsers from the start, viser only once it is made: they are held until it is `ready`. A
+    `RuntimeError` if it began otherwise, and the guard was not asked.
     """
     usual = websockets.asyncio.server.serve
     guard = Guard(place.port, place.token)

@@ -43,7 +43,6 @@ class Viewer:
 
     Parameters
     ----------
-    session : Session
     text : str
         Where the page is, as of `mixpose.viewing.address.listen`.
     say : callable
