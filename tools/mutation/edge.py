@@ -28,7 +28,7 @@ _SIMULATION = (
     ),
     Mutant(
         "simulation-one-generator-for-all-frames",
-        "simulation/draws.py",
+        "simulation/options.py",
         "[seed, int(purpose), *key]",
         "[seed, int(purpose)]",
         "every frame has the same noise",
@@ -252,7 +252,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-middle-at-the-corner",
-        "checking/sensor_keys.py",
+        "checking/keys.py",
         "np.abs((cx, cy) - (size - 1) / 2)",
         "np.abs((cx, cy) - (size - 1))",
         "every good calibration is doubted",
@@ -335,14 +335,14 @@ _RUNNER = (
 _PUBLISHING = (
     Mutant(
         "publishing-newest-goes",
-        "publishing/backlog.py",
+        "publishing/channel.py",
         "self._messages.popleft()\n                self.dropped += 1",
         "self._messages.pop()\n                self.dropped += 1",
         "a receiver that was away gets what is old",
     ),
     Mutant(
         "publishing-put-back-at-the-end",
-        "publishing/backlog.py",
+        "publishing/channel.py",
         "self._messages.appendleft(message)",
         "self._messages.append(message)",
         "poses arrive out of their order after a receiver was away",

@@ -23,9 +23,9 @@ from mixpose.checking.placement import (
     placement_warnings,
 )
 from mixpose.checking.recordings import Survey, image_of, numbers_of, some_of, survey
-from mixpose.checking.sensor_keys import key_warnings
-from mixpose.checking.shared_parts import shared_part_warnings
-from mixpose.checking.shared_sources import shared_source_warnings
+from mixpose.checking.keys import key_warnings
+from mixpose.checking.keys import shared_part_warnings
+from mixpose.checking.keys import shared_source_warnings
 from mixpose.checking.trials import explanation
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mixpose.pictures.display import displayable
+from mixpose.pictures.canvas import displayable
 from mixpose.pictures.overlay import Part, draw_pose
 
 __all__ = ["Part", "displayable", "draw_pose"]

@@ -18,8 +18,7 @@ from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, matched_objective
 from mixpose.objective.paper import sampled_terms
-from mixpose.pictures.canvas import WHITE, Picture, line_height, words
-from mixpose.pictures.layout import in_grid, stacked
+from mixpose.pictures.canvas import WHITE, Picture, in_grid, line_height, stacked, words
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.stages import fitted, shown_box, titled
 from mixpose.records import Floats

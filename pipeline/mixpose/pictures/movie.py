@@ -11,8 +11,7 @@ import cv2
 
 from mixpose.errors import SessionError
 from mixpose.objective import View
-from mixpose.pictures.canvas import Picture
-from mixpose.pictures.layout import fit_into
+from mixpose.pictures.canvas import Picture, fit_into
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours, refuse_foreign, sign_video, write_png
 from mixpose.records import Estimate, FrameSet

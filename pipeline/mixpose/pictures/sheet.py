@@ -9,10 +9,9 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.objective import View
-from mixpose.pictures.canvas import WHITE, Picture, words
+from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
 from mixpose.pictures.densities import densities_picture
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.layout import in_grid, stacked
 from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
 from mixpose.pictures.plots import objective_picture, ranges_picture
 from mixpose.pictures.slices import objective_around

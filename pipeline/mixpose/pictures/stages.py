@@ -18,11 +18,11 @@ from mixpose.pictures.canvas import (
     Colour,
     Picture,
     cross,
+    displayable,
     line_height,
     stroke,
     words,
 )
-from mixpose.pictures.display import displayable
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import (
     FOUND,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import Message, header_text, path_word
 from mixpose.publishing.sockets import force_down, keep_little
 

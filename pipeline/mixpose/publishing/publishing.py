@@ -5,13 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import TracebackType
 
 from mixpose.poses.header import Header
 from mixpose.poses.plain import require_finite
 from mixpose.publishing.address import parse
-from mixpose.publishing.backlog import PublishingRules
-from mixpose.publishing.channel import Channel
+from mixpose.publishing.channel import Channel, PublishingRules
 from mixpose.publishing.message import Message
 from mixpose.publishing.senders import SENDERS, sender_for
 from mixpose.records import Estimate, FrameSet
@@ -58,12 +56,7 @@ class Publishing:
             channel.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for channel in self._channels:
             channel.end()
         closing = [threading.Thread(target=channel.close) for channel in self._channels]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import Message, header_text
 from mixpose.publishing.sockets import keep_little
 

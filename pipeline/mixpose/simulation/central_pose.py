@@ -17,7 +17,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.draws import Purpose, generator
+from mixpose.simulation.options import Purpose, generator
 from mixpose.simulation.visible_spots import facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area

@@ -13,13 +13,11 @@ from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.motion import Motion
+from mixpose.simulation.motion import Motion, Shutter
 from mixpose.simulation.naming import SourceFiles
-from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
 from mixpose.simulation.render import ImageFormat, ProfileFormat
 from mixpose.simulation.scenery import Scenery
-from mixpose.simulation.shutter import Shutter
 from mixpose.simulation.visible_spots import View, brightness_levels
 from mixpose.simulation.writers import (
     DetectionWriter,

@@ -17,9 +17,8 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.session import Session
 from mixpose.simulation.central_pose import central_pose, count_seen, pivot_of
-from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.motion import Motion, plan_motion
-from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
 from mixpose.simulation.scenery import Actor, motion_pose
 from mixpose.simulation.visible_spots import brightness_levels
 

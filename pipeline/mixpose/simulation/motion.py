@@ -1,20 +1,33 @@
-"""How a simulated body moves: smoothly, never the same way twice, and known exactly."""
+"""How a simulated body moves, and when a sensor sees it.
+
+It moves smoothly, never the same way twice, and is known exactly.  Sensors may be late, and cameras
+read their rows one after the other: a frame's time is that at which its middle row is read, in the
+middle of the row's exposure.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, from_parts, rotation_matrix
-from mixpose.simulation.draws import Purpose, generator
+from mixpose.sensors import Sensor
+from mixpose.simulation.options import Purpose, generator
 
 # A slow swing and a faster, smaller one on top of it, per axis.
 _SHARES = np.array([0.7, 0.3])
 _FREQUENCIES = np.array([[0.6, 1.1], [1.5, 2.3]])  # from, to; in swings per period
 # Every axis begins a little off the centre: near a session's [start], not on it.
 _FIRST = 0.07
+# The pose (4, 4) so many seconds after the common time of the frame.
+PoseAfter: TypeAlias = Callable[[float], Floats]
+
+_ROUNDS = 6  # each leaves the share of a readout in which a feature crosses a row: a thousandth
+_BLUR_STEPS = 9  # positions of a moving marker whose light a frame adds up
 
 
 @dataclass(frozen=True)
@@ -91,3 +104,41 @@ def _swing(amplitudes: Floats, period_s: float, rng: np.random.Generator) -> Swi
         frequencies_hz=(low + (high - low) * rng.random((len(_SHARES), 3))) / period_s,
         phases=np.where(falling, np.pi - first, first),
     )
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """The timing of a sensor."""
+
+    late_s: float = 0.0  # seconds after the common time
+    readout_s: float = 0.0  # from the first row to the last
+    exposure_s: float = 0.0  # for which a row collects light
+    rows: int = 0  # of an image; 0 where there are none
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether all is seen at the common time."""
+        return not (self.late_s or self.readout_s or self.exposure_s)
+
+    def poses(self, sensor: Sensor, point: Floats, pose_after: PoseAfter) -> list[Floats]:
+        """The poses at which a point (3,) of a body is seen, one for each part of the exposure."""
+        if self.is_ideal:
+            return [pose_after(0.0)]
+        steps = _BLUR_STEPS if self.exposure_s else 1
+        shares = (np.arange(steps) + 0.5) / steps - 0.5
+        return [
+            pose_after(self._moment(sensor, point, pose_after, share * self.exposure_s))
+            for share in shares.tolist()
+        ]
+
+    def _moment(self, sensor: Sensor, point: Floats, pose_after: PoseAfter, within: float) -> float:
+        first = moment = self.late_s + within
+        if not self.readout_s:
+            return moment
+        for _ in range(_ROUNDS):
+            T = pose_after(moment)
+            y, visible = sensor.project(T[:3, :3] @ point + T[:3, 3])
+            if not visible:
+                break
+            moment = first + self.readout_s * (float(y[1]) / (self.rows - 1) - 0.5)
+        return moment

@@ -1,11 +1,14 @@
-"""What to simulate, beyond what the session file says."""
+"""What to simulate beyond what the session file says, and random numbers keyed by purpose."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from enum import IntEnum
 from typing import Any, TypeAlias
+
+import numpy as np
 
 from mixpose.errors import SessionError
 
@@ -107,3 +110,21 @@ class SimulationOptions:
             is_allowed, allowed = one.metadata["rule"]
             if not (math.isfinite(value) and is_allowed(value)):
                 raise SessionError(f"simulate: {one.name}: found {value}; allowed: {allowed}")
+
+
+class Purpose(IntEnum):
+    """What random numbers decide."""
+
+    MOTION = 1
+    ORIENTATION = 2
+    BRIGHTNESS = 3
+    FRAME = 4
+    MISSING = 5
+    DEFORMATION = 6
+    SCENERY = 7
+    TURNED = 8
+
+
+def generator(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:
+    """The generator for one purpose; `key` tells frames and sensors apart."""
+    return np.random.default_rng([seed, int(purpose), *key])

@@ -19,13 +19,11 @@ from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import central_pose, pivot_of
 from mixpose.simulation.channels import Channel, check_setup, plan_channel
 from mixpose.simulation.companions import Companion, moved, plan_companions
-from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.motion import Motion, PoseAfter, plan_motion
 from mixpose.simulation.naming import plan_files
-from mixpose.simulation.options import DEFAULT_FPS, SimulationOptions
+from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
 from mixpose.simulation.scenery import motion_pose, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
-from mixpose.simulation.shutter import PoseAfter
 from mixpose.simulation.visible_spots import VisibleSpots, displacements, look
 from mixpose.simulation.writers import SensorWriter
 

@@ -16,9 +16,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import Sensor
-from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.motion import Motion, plan_motion
-from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
 
 PoseAt: TypeAlias = Callable[[float], Floats]
 

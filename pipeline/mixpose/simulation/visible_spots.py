@@ -20,10 +20,10 @@ from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import CloudSensor, Sensor
+from mixpose.simulation.motion import PoseAfter, Shutter
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.outlines import centroid, outline
 from mixpose.simulation.scenery import PoseAt, Scenery
-from mixpose.simulation.shutter import PoseAfter, Shutter
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
 _CORE = 0.45  # of a body's radius: what others are hidden behind

@@ -14,8 +14,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers, MultipleValuesError
 from websockets.http11 import Request, Response
 
-from mixpose.viewing.address import LOOPBACK, Place
-from mixpose.viewing.guard import ASKED_FOR, Answer, Guard
+from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Answer, Guard, Place
 
 _MADE_S = 0.01  # between two looks at whether the server is made
 
