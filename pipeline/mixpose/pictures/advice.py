@@ -71,14 +71,13 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
 
 def _threshold(image: Image, options: ExtractOptions) -> str:
     """The threshold that was used, in the grey levels of the image."""
-    if options.method == "corners":
+    if options.method in ("corners", "log"):
+        thing, step = "corner", "bright to dark fields"
+        if options.method == "log":
+            thing, step = "spot", "a spot to what is around it"
         if isinstance(options.threshold, str):
-            return '  threshold "auto": clear of the noise, and a fifth of the clearest corner'
-        return f"  threshold {options.threshold:g} grey levels from bright to dark fields"
-    if options.method == "log":
-        if isinstance(options.threshold, str):
-            return '  threshold "auto": clear of the noise, and a fifth of the clearest spot'
-        return f"  threshold {options.threshold:g} grey levels from a spot to what is around it"
+            return f'  threshold "auto": clear of the noise, and a fifth of the clearest {thing}'
+        return f"  threshold {options.threshold:g} grey levels from {step}"
     if options.method not in ("blobs", "intensity"):
         return f"  method {options.method} has a threshold of its own"
     scene = _scene(image, options)
@@ -103,8 +102,11 @@ def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
     level = _level(scene, image, options)
     lines = []
     if share > _FLOODED and finding.points is not None and len(finding.points) > 3 * len(body):
+        stricter = _direction(options, lower=False, level=level)
+        if options.method == "blobs":
+            stricter += f", raise min_area = {options.min_area:g} or set max_area"
         lines.append(
-            f"too much of the image counts as feature: {_stricter(options, level)}, or set "
+            f"too much of the image counts as feature: {stricter}, or set "
             'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
@@ -131,7 +133,7 @@ def _about_missing(
             "wrong"
         )
     if found := missing["faint"]:
-        level = _between(min(found.values()), raw)
+        level = (min(found.values()) + float(np.median(raw))) / 2  # and the background
         lines.append(
             f"not met, fainter than the threshold: {_some(found, body)}; "
             f"{_looser(options, level, raw, image)}"
@@ -341,11 +343,6 @@ def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice
     return slice(max(v - r, 0), v + r + 1), slice(max(u - r, 0), u + r + 1)
 
 
-def _between(peak: float, raw: Floats) -> float:
-    """A level between a faint peak and the background."""
-    return (peak + float(np.median(raw))) / 2
-
-
 def _looser(options: ExtractOptions, level: float, raw: Floats, image: Image) -> str:
     if float(np.mean(raw > level)) > _FLOODED:
         return 'set threshold = "local", as the background is as bright elsewhere'
@@ -360,13 +357,6 @@ def _level(scene: Foreground, image: Image, options: ExtractOptions) -> float:
     """
     base = float(np.median(_bright(image, options))) if scene.judged else 0.0
     return _in_image(base + scene.level, image, options)
-
-
-def _stricter(options: ExtractOptions, level: float) -> str:
-    areas = f", raise min_area = {options.min_area:g} or set max_area"
-    return _direction(options, lower=False, level=level) + (
-        areas if options.method == "blobs" else ""
-    )
 
 
 def _direction(options: ExtractOptions, *, lower: bool, level: float | None = None) -> str:

@@ -55,9 +55,9 @@ def densities_picture(
     about all that was found.
     """
     box = shown_box(view, body, T, _MARGIN * max(sigmas))
-    part, size = fitted(box, room)
+    part = fitted(box, room)
     rows = []
-    for panels in panels_of(view, body, T, sigmas, options, part, size):
+    for panels in panels_of(view, body, T, sigmas, options, part, room):
         peaks = [float(one.values.max()) for one in panels]
         top = max(peaks) or 1.0  # where nothing was found about the body, all is black
         bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol
 
 import cv2
 
@@ -24,16 +22,6 @@ CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 _DEFAULT_FPS = 25.0
 _SLOWEST, _FASTEST = 0.5, 120.0
-
-
-class Sink(Protocol):
-    """Takes the pictures of an overlay, frame by frame."""
-
-    def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
-        """Take the picture of the next frame."""
-
-    def close(self) -> None:
-        """Finish what was written."""
 
 
 class Overlay:
@@ -55,12 +43,7 @@ class Overlay:
     def __enter__(self) -> Overlay:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._sink.close()
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
@@ -72,7 +55,8 @@ class Overlay:
             self._estimates = []
 
 
-def _sink(path: Path, resume: bool) -> Sink:
+def _sink(path: Path, resume: bool) -> FolderSink | VideoSink:
+    """What takes the pictures of an overlay, frame by frame."""
     if not path.parent.is_dir():
         raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
     suffix = path.suffix.casefold()

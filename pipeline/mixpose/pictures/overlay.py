@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
@@ -22,7 +22,7 @@ from mixpose.pictures.canvas import (
     stroke,
     words,
 )
-from mixpose.records import Floats, Status
+from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
 
@@ -106,23 +106,23 @@ def draw_pose(
         Whether names stand beside features.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
-    radius = _MARK_PX * stroke(picture)
+    pose, radius = None, _MARK_PX * stroke(picture)
     if T_world_object is not None:
-        radius = mark_radius(picture, sensor, body, T_world_object, part)
+        pose = _DrawnPose(picture, sensor, body, T_world_object, part)
+        radius = pose.radius
     for place in part.places(found) if found is not None else ():
         cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
-    if T_world_object is not None:
-        colour = colour or STATUS_COLOURS[status or "ok"]
-        _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
-        _draw_features(picture, sensor, body, T_world_object, part, colour, named)
-        _draw_axes(picture, sensor, body, T_world_object, part)
+    if pose is not None:
+        pose.draw_ellipses(covariance, magnified)
+        pose.draw_features(colour or STATUS_COLOURS[status or "ok"], named=named)
+        pose.draw_axes()
     caption(picture, status, frame)
     return picture
 
 
 def projected_features(
     sensor: Sensor, body: Body, T_world_object: Floats
-) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[Floats, Mask, Mask]:
     """Where a sensor has the features of a body.
 
     Their places (N, m), whether it can measure there (N,), and whether they also face it (N,).
@@ -149,40 +149,6 @@ def ellipse_95(covariance: Floats) -> Floats:
     return np.asarray((circle * np.sqrt(CHI2_95[2] * np.maximum(values, 0))) @ vectors.T)
 
 
-def _draw_features(
-    picture: Picture,
-    sensor: Sensor,
-    body: Body,
-    T: Floats,
-    part: Part,
-    colour: Colour,
-    named: bool,
-) -> None:
-    radius = mark_radius(picture, sensor, body, T, part)
-    nodes, inside = sensor.project(transform(T, body.nodes.points))
-    for feature in np.flatnonzero(np.bincount(body.nodes.feature) > 1):
-        along = inside & (body.nodes.feature == feature)
-        polyline(picture, part.places(nodes[along]), colour)
-    y, inside, seen = projected_features(sensor, body, T)
-    for i, place in enumerate(part.places(y)):
-        if not inside[i]:
-            continue
-        if not seen[i]:  # turned away
-            ring(picture, place, radius / 2, GREY)
-            continue
-        ring(picture, place, radius, colour)
-        if named and len(body) <= _MOST_NUMBERS:
-            beside = (place[0] + 1.2 * radius, place[1] - 0.9 * radius)
-            words(picture, body.labels[i], beside, colour, size=0.8)
-
-
-def mark_radius(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> float:
-    """Radius in px of a feature's ring: visible, and clear of the features beside it."""
-    y, _, seen = projected_features(sensor, body, T)
-    usual = _MARK_PX * stroke(picture)
-    return min(usual, max(_CLEAR_SHARE * part.zoom * median_gap(y[seen]), 3.0))
-
-
 def median_gap(y: Floats) -> float:
     """Median distance of places (n, 2) from their nearest neighbours; infinite for a lone one."""
     if len(y) < 2:
@@ -192,51 +158,83 @@ def median_gap(y: Floats) -> float:
     return float(np.median(apart.min(axis=1)))
 
 
-def _draw_ellipses(
-    picture: Picture,
-    sensor: Sensor,
-    body: Body,
-    T: Floats,
-    covariance: Floats | None,
-    part: Part,
-    magnified: float,
-) -> None:
-    if covariance is None or not np.isfinite(covariance).all():
-        return
-    y, _, seen = projected_features(sensor, body, T)
-    spreads = projected_covariances(sensor, body, T, covariance)
-    for place, spread in zip(part.places(y)[seen], spreads[seen], strict=True):
-        outline = magnified * part.zoom * ellipse_95(spread)
-        if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * stroke(picture):
-            polyline(picture, place + outline, WHITE, closed=True)
+@dataclass(frozen=True)
+class _DrawnPose:
+    """A pose on a picture of a part of a sensor."""
 
+    picture: Picture
+    sensor: Sensor
+    body: Body
+    T: Floats
+    part: Part
 
-def _draw_axes(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> None:
-    """The object's axes at its origin, or amid the features where that is out of view."""
-    origin = np.zeros(3)
-    if not sensor.project(transform(T, origin[None]))[1].all():
-        origin = body.means.mean(axis=0)
-    length = _AXIS_SHARE * body.radius
-    centre, seen = sensor.project(transform(T, origin[None]))
-    if not seen.all():
-        return
-    start = part.places(centre[0])
-    # a feature at the origin stays visible
-    y, _, seen = projected_features(sensor, body, T)
-    radius = mark_radius(picture, sensor, body, T, part)
-    marked = np.linalg.norm(part.places(y[seen]) - start, axis=1).min(initial=np.inf) < radius
-    along = np.linspace(0.0, length, _AXIS_PIECES)[:, None]
-    for k, (name, colour) in enumerate(AXES):
-        y, inside = sensor.project(transform(T, origin + along * np.eye(3)[k]))
-        line = part.places(y[: len(inside) if inside.all() else int(np.argmin(inside))])
-        line = line[np.linalg.norm(line - start, axis=1) >= (1.3 * radius if marked else 0)]
-        if len(line) < 2:
-            continue
-        polyline(picture, line, colour, width=2)
-        shift = 0.3 * line_height(picture)
-        if np.linalg.norm(line[-1] - start) < 1.5 * line_height(picture):
-            continue  # letters would hide what they are beside
-        words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
+    @cached_property
+    def features(self) -> tuple[Floats, Mask, Mask]:
+        return projected_features(self.sensor, self.body, self.T)
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius in px of a feature's ring: visible, and clear of the features beside it."""
+        y, _, seen = self.features
+        usual = _MARK_PX * stroke(self.picture)
+        return min(usual, max(_CLEAR_SHARE * self.part.zoom * median_gap(y[seen]), 3.0))
+
+    def _project(self, points: Floats) -> tuple[Floats, Mask]:
+        """Places on the picture of points (n, 3) of the body, and whether they are in view."""
+        y, inside = self.sensor.project(transform(self.T, points))
+        return self.part.places(y), inside
+
+    def draw_features(self, colour: Colour, *, named: bool) -> None:
+        nodes, inside = self._project(self.body.nodes.points)
+        for feature in np.flatnonzero(np.bincount(self.body.nodes.feature) > 1):
+            polyline(self.picture, nodes[inside & (self.body.nodes.feature == feature)], colour)
+        y, inside, seen = self.features
+        for i, place in enumerate(self.part.places(y)):
+            if not inside[i]:
+                continue
+            if not seen[i]:  # turned away
+                ring(self.picture, place, self.radius / 2, GREY)
+                continue
+            ring(self.picture, place, self.radius, colour)
+            if named and len(self.body) <= _MOST_NUMBERS:
+                beside = (place[0] + 1.2 * self.radius, place[1] - 0.9 * self.radius)
+                words(self.picture, self.body.labels[i], beside, colour, size=0.8)
+
+    def draw_ellipses(self, covariance: Floats | None, magnified: float) -> None:
+        if covariance is None or not np.isfinite(covariance).all():
+            return
+        y, _, seen = self.features
+        spreads = projected_covariances(self.sensor, self.body, self.T, covariance)
+        for place, spread in zip(self.part.places(y)[seen], spreads[seen], strict=True):
+            outline = magnified * self.part.zoom * ellipse_95(spread)
+            if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * stroke(self.picture):
+                polyline(self.picture, place + outline, WHITE, closed=True)
+
+    def draw_axes(self) -> None:
+        """The object's axes at its origin, or amid the features where that is out of view."""
+        origin = np.zeros((1, 3))
+        if not self._project(origin)[1].all():
+            origin = self.body.means.mean(axis=0, keepdims=True)
+        (start,), in_view = self._project(origin)
+        if not in_view.all():
+            return
+        # a feature at the origin stays visible
+        y, _, seen = self.features
+        away = np.linalg.norm(self.part.places(y[seen]) - start, axis=1)
+        clear = 1.3 * self.radius if away.min(initial=np.inf) < self.radius else 0.0
+        along = np.linspace(0.0, _AXIS_SHARE * self.body.radius, _AXIS_PIECES)[:, None]
+        height = line_height(self.picture)
+        for k, (name, colour) in enumerate(AXES):
+            line, inside = self._project(origin + along * np.eye(3)[k])
+            line = line[: len(inside) if inside.all() else int(np.argmin(inside))]
+            line = line[np.linalg.norm(line - start, axis=1) >= clear]
+            if len(line) < 2:
+                continue
+            polyline(self.picture, line, colour, width=2)
+            if np.linalg.norm(line[-1] - start) < 1.5 * height:
+                continue  # letters would hide what they are beside
+            place = line[-1, 0] + 0.3 * height, line[-1, 1] + 0.3 * height
+            words(self.picture, name, place, colour, size=0.9)
 
 
 def caption(picture: Picture, status: Status | None, frame: int | None) -> None:

@@ -60,7 +60,8 @@ def draw_ranges(
         _draw_profile(picture, across(ranges), pattern.values[0])
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
-            _draw_bar(picture, u, _TOP, _BASE, FOUND)
+            bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
+            polyline(picture, bar, FOUND, width=2)
     if T_world_object is not None:
         colour = STATUS_COLOURS[status or "ok"]
         spread = half_widths_95(sensor, body, T_world_object, covariance)
@@ -130,11 +131,6 @@ def _draw_profile(picture: Picture, u: Floats, values: NDArray[np.float32]) -> N
     share = np.clip(values / top, -0.1, 1.0)
     v = height * (_BASE - (_BASE - _TOP) * share)
     polyline(picture, np.stack([u, v], axis=-1), FOUND)
-
-
-def _draw_bar(picture: Picture, u: float, top: float, base: float, colour: Colour) -> None:
-    height = picture.shape[0]
-    polyline(picture, np.array([[u, top * height], [u, base * height]]), colour, width=2)
 
 
 def _draw_expected(

@@ -54,6 +54,7 @@ LARGEST = (1920, 1080)
 _MOST_ENLARGED = 2
 _BLANK_SIZE = (640, 480)
 _DETECTION_PX = 2.5
+
 Box: TypeAlias = tuple[Floats, float]
 """A square of a sensor, px: the place (2,) of its upper left pixel, and its side."""
 
@@ -104,8 +105,11 @@ def _panel(
         return draw_camera(posed, setup, ground, part)
     panel = draw_camera(posed, setup, ground, part, named=False)
     data = None if frame is None else frame.data
-    whole = displayable(data) if isinstance(data, np.ndarray) else None
-    inset, larger = enlarged(whole, panel, box)
+    side = round(_SIDE * min(panel.shape[:2]))
+    larger = Part(side / box[1], (float(box[0][0]), float(box[0][1])))
+    inset = np.full((side, side, 3), BACKGROUND, np.uint8)
+    if isinstance(data, np.ndarray):
+        inset = cut_out(displayable(data), larger, (side, side), cv2.INTER_NEAREST)
     _mark_detections(inset, data, larger)
     put_into(panel, part, _draw_bodies(posed, setup, inset, larger), box)
     return panel
@@ -261,17 +265,13 @@ def small_box(
     return ((lower + upper - side) / 2, side) if is_small else None
 
 
-def enlarged(whole: Picture | None, picture: Picture, box: Box) -> tuple[Picture, Part]:
-    """A box of a sensor, by a picture of all its pixels if any, as large as an inset is."""
-    size = round(_SIDE * min(picture.shape[:2]))
-    part = Part(size / box[1], (float(box[0][0]), float(box[0][1])))
-    if whole is None:
-        return np.full((size, size, 3), BACKGROUND, np.uint8), part
-    # the sensor's place of the inset's first pixel, and how far the next is
-    first, step = box[0] + 0.5 / part.zoom - 0.5, 1 / part.zoom
+def cut_out(whole: Picture, part: Part, size: tuple[int, int], way: int) -> Picture:
+    """A part of a picture of all pixels of a sensor, in some size, resized in some way."""
+    # the sensor's place of the first pixel, and how far the next is
+    first, step = np.array(part.corner) + 0.5 / part.zoom - 0.5, 1 / part.zoom
     to_sensor = np.array([[step, 0.0, first[0]], [0.0, step, first[1]]])
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(whole, to_sensor, (size, size), flags=flags), np.uint8), part
+    cut = cv2.warpAffine(whole, to_sensor, size, flags=way | cv2.WARP_INVERSE_MAP)
+    return np.asarray(cut, dtype=np.uint8)
 
 
 def put_into(picture: Picture, part: Part, inset: Picture, box: Box) -> None:

@@ -22,6 +22,9 @@ from mixpose.session import Session
 BODIES = "bodies.png"
 """The frames of all sensors with the poses of several bodies."""
 
+STAGES = ("features", "threshold", "density", "pose")
+"""Pictures of a camera, as they stand on the sheet."""
+
 _LARGE = (1400, 1050)  # room of a picture of its own
 _SMALL = (460, 345)  # and on the sheet
 _WIDTH = 4 * _SMALL[0] + 12
@@ -52,9 +55,11 @@ def inspection_pictures(
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        made = _camera_pictures(session, finding, body, estimate, sigmas)
+        about = session, finding, body, estimate, sigmas
+        made = _camera_pictures(*about, on_sheet=False)
         pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        rows.append(_camera_row(session, finding, body, estimate, sigmas))
+        made = _camera_pictures(*about, on_sheet=True)
+        rows.append(in_grid([made[stage] for stage in STAGES if stage in made], 4, _SMALL))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
         ends = [_some(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
@@ -86,8 +91,7 @@ def _objective(
 
 def possible_names(session: Session) -> list[str]:
     """Names of all files that may be made of a session's frame."""
-    stages = ("features", "threshold", "density", "pose")
-    names = [f"{name}_{stage}.png" for name in file_names(_names(session)) for stage in stages]
+    names = [f"{name}_{stage}.png" for name in file_names(_names(session)) for stage in STAGES]
     names = ["sheet.png", "objective.png", "ranges.png", *names]
     prefixes = prefixes_of(session.labels)
     return [BODIES, *(prefix + name for prefix in prefixes for name in names)]
@@ -116,36 +120,23 @@ def _camera_pictures(
     body: Body,
     estimate: Estimate,
     sigmas: Sequence[float],
+    *,
+    on_sheet: bool,
 ) -> dict[str, Picture]:
+    """One camera's pictures by `STAGES`; no densities without blurs."""
+    room = _SMALL if on_sheet else _LARGE
     pictures = {
-        "features": features_picture(finding, _LARGE),
-        "threshold": threshold_picture(finding, _LARGE),
-        "pose": pose_picture(finding, body, estimate, _LARGE),
+        "features": features_picture(finding, room),
+        "threshold": threshold_picture(finding, room),
+        "pose": pose_picture(finding, body, estimate, room),
     }
     if finding.view is not None and sigmas:
-        T, few = estimate.T_world_object, _some(sigmas, _MOST_BLURS)
-        about = finding.view, body, T, few, session.estimator
+        few = _some(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
-        pictures["density"] = densities_picture(*about, (side, side))
+        panel = (_SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
+        about = finding.view, body, estimate.T_world_object, few, session.estimator
+        pictures["density"] = densities_picture(*about, panel)
     return pictures
-
-
-def _camera_row(
-    session: Session,
-    finding: Finding,
-    body: Body,
-    estimate: Estimate,
-    sigmas: Sequence[float],
-) -> Picture:
-    """One camera on the sheet: features, threshold, densities, pose."""
-    panels = [features_picture(finding, _SMALL), threshold_picture(finding, _SMALL)]
-    if finding.view is not None and sigmas:
-        half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX
-        T, few = estimate.T_world_object, _some(sigmas, _BLURS_ON_SHEET)
-        about = finding.view, body, T, few, session.estimator
-        panels.append(densities_picture(*about, half))
-    panels.append(pose_picture(finding, body, estimate, _SMALL))
-    return in_grid(panels, 4, _SMALL)
 
 
 def _heading(session: Session, estimate: Estimate) -> Picture:

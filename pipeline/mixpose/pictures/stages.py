@@ -6,7 +6,6 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.extraction.corners import CornerRules, saddle_strength
@@ -33,7 +32,7 @@ from mixpose.pictures.overlay import (
     projected_covariances,
     projected_features,
 )
-from mixpose.pictures.scene import backdrop
+from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
@@ -68,26 +67,27 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     window = 0, 0, data.shape[1], data.shape[0]
     if options.method == "corners":
         blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CornerRules().blur)
-        response = np.sqrt(np.maximum(saddle_strength(blurred), 0))
-        picture = displayable(_resized(response, size))
+        values = np.sqrt(np.maximum(saddle_strength(blurred), 0))
         title = "strength of saddles"
     elif options.method == "log":
-        strength = np.maximum(spot_strength(data, options), 0)
-        picture = displayable(_resized(strength, size))
+        values = np.maximum(spot_strength(data, options), 0)
         title = "height of spots"
     elif options.method == "intensity":
-        picture = displayable(_resized(feature_values(data, options, window), size))
+        values = feature_values(data, options, window)
         title = "grey values above the threshold"
     elif options.method == "blobs":
         scene = foreground(data, options, window)
         mask = above(scene.grey, scene.zero + scene.level)
         picture = np.asarray(np.round(_DIMMED * picture), dtype=np.uint8)
         # a pixel of the picture is marked if any of those behind it is
-        shown = cv2.resize(cv2.dilate(mask, _block(part.zoom)), size, None, 0, 0, cv2.INTER_NEAREST)
+        behind = np.ones([max(int(np.ceil(1 / part.zoom)), 1)] * 2, np.uint8)
+        shown = cv2.resize(cv2.dilate(mask, behind), size, None, 0, 0, cv2.INTER_NEAREST)
         picture[shown > 0] = ABOVE
         title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
         return titled(picture, f"{options.method}: its own threshold")
+    if options.method != "blobs":
+        picture = displayable(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     if options.method != "intensity":
         _mark(picture, part, finding.points)
     return titled(picture, title)
@@ -99,20 +99,12 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     if finding.view is None or T is None:
         picture, _ = backdrop(finding.setup, finding.frame, room)
         return draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
-    box = shown_box(finding.view, body, T, None)
-    part, size = fitted(box, room)
-    whole, native = backdrop(finding.setup, finding.frame, None)
-    matrix = np.array(
-        [
-            [native.zoom / part.zoom, 0, native.zoom * (part.corner[0] + 0.5 / part.zoom) - 0.5],
-            [0, native.zoom / part.zoom, native.zoom * (part.corner[1] + 0.5 / part.zoom) - 0.5],
-        ]
-    )
-    way = cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR
-    cut = cv2.warpAffine(whole, matrix, size, flags=way | cv2.WARP_INVERSE_MAP)
-    factor, note = _magnifier(finding, body, estimate, part.zoom, stroke(np.asarray(cut)))
+    part = fitted(shown_box(finding.view, body, T, None), room)
+    whole, _ = backdrop(finding.setup, finding.frame, None)
+    cut = cut_out(whole, part, room, cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR)
+    factor, note = _magnifier(finding, body, estimate, part.zoom, stroke(cut))
     drawn = draw_pose(
-        np.asarray(cut, dtype=np.uint8),
+        cut,
         finding.setup.sensor,
         body,
         T,
@@ -165,13 +157,13 @@ def shown_box(
     return region_of_interest(view.sensor, y, margin)
 
 
-def fitted(box: tuple[Floats, Floats], room: Size) -> tuple[Part, Size]:
-    """How a box of sensor coordinates fits into some room."""
+def fitted(box: tuple[Floats, Floats], room: Size) -> Part:
+    """The part of a sensor with a box of its coordinates that fits into some room."""
     extent = np.maximum(box[1] - box[0] + 1, 1)
     zoom = float(min(room[0] / extent[0], room[1] / extent[1]))
     # the box in the middle; what else there is room for is shown too
     corner = np.floor(box[0] - (np.array(room) / zoom - extent) / 2)
-    return Part(zoom, (float(corner[0]), float(corner[1]))), room
+    return Part(zoom, (float(corner[0]), float(corner[1])))
 
 
 def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
@@ -186,12 +178,3 @@ def titled(picture: Picture, title: str) -> Picture:
     """The picture, with a caption in its upper left corner."""
     words(picture, title, (0.5 * line_height(picture), 1.1 * line_height(picture)), WHITE, size=0.9)
     return picture
-
-
-def _resized(values: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-
-def _block(zoom: float) -> NDArray[np.uint8]:
-    side = max(int(np.ceil(1 / zoom)), 1)
-    return np.ones((side, side), np.uint8)
