@@ -50,7 +50,11 @@ class Adjustment:
 
     def of(self, unknown: Unknown) -> Adjustment:
         """With what may have met a feature that was missed, for values of that feature."""
-        endless = {name: _endless(sensor) for name, sensor in self.sensors.items()}
+        sensors: Mapping[str, Any] = self.sensors
+        endless = {  # cameras without the bounds of their images
+            name: replace(each, resolution=None) if hasattr(each, "resolution") else each
+            for name, each in sensors.items()
+        }
         frames = [list(frame) for frame in self.frames]
         for own, others in zip(frames, self.beside):
             for seen in others if unknown.feature is not None else ():
@@ -79,8 +83,7 @@ def promise(unknown: Unknown, given: Adjustment) -> float:
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
-    (A, b), _ = _normal(unknown, given, given.poses, np.zeros(k))
-    step, scales = np.linalg.solve(A + 1e-9 * np.eye(len(b)), b), _scales(unknown, given)
+    step, scales = _step(unknown, given, given.poses, np.zeros(k)), _scales(unknown, given)
     gain, F = 0.0, len(given.poses)
     for f in range(F):
         own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
@@ -100,10 +103,8 @@ def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]]
         return None
     poses, values = list(given.poses), np.zeros(k)
     for _ in range(_ITERATIONS):
-        (A, b), _ = _normal(unknown, given, poses, values)
-        step = np.linalg.solve(A + 1e-9 * np.eye(len(b)), b)
         scales = _scales(unknown, given)
-        step = step * scales
+        step = _step(unknown, given, poses, values) * scales
         if not np.isfinite(step).all():
             return None
         poses = [perturb(T, step[6 * f : 6 * f + 6]) for f, T in enumerate(poses)]
@@ -120,22 +121,19 @@ def _scales(unknown: Unknown, given: Adjustment) -> Floats:
     return np.concatenate([np.tile(pose, len(given.frames)), unknown.deviations])
 
 
-def _normal(
-    unknown: Unknown, given: Adjustment, poses: Sequence[Floats], values: Floats
-) -> tuple[tuple[Floats, Floats], Floats]:
-    """Normal equations of poses and values, in their scales, and residuals in the noise."""
+def _step(unknown: Unknown, given: Adjustment, poses: Sequence[Floats], values: Floats) -> Floats:
+    """A step (6 F + k,) of poses and values by least squares, in their scales."""
     k, F = len(values), len(poses)
     A, b = np.zeros((6 * F + k, 6 * F + k)), np.zeros(6 * F + k)
     A[-k:, -k:], b[-k:] = np.eye(k), -values / unknown.deviations
-    scales, all_residuals = _scales(unknown, given), []
+    scales = _scales(unknown, given)
     for f in range(F):
         own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
         r, J = _linearised(unknown, given, f, poses[f], values, scales[own])
         w = _OUTLYING / np.maximum(np.abs(r), _OUTLYING)
         A[np.ix_(own, own)] += J.T @ (w[:, None] * J)
         b[own] -= J.T @ (w * r)
-        all_residuals.append(r)
-    return (A, b), np.concatenate(all_residuals)
+    return np.asarray(np.linalg.solve(A + 1e-9 * np.eye(len(b)), b))
 
 
 def _linearised(
@@ -164,11 +162,3 @@ def _linearised(
         parts.append((off / noise).ravel())
         columns.append((by_all / noise[..., None]).reshape(-1, len(scales)))
     return np.concatenate(parts), np.concatenate(columns)
-
-
-def _endless(sensor: Any) -> Sensor:
-    """A camera without the bounds of its images."""
-    endless: Sensor = sensor
-    if hasattr(sensor, "resolution"):
-        endless = replace(sensor, resolution=None)
-    return endless

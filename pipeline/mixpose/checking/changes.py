@@ -67,32 +67,35 @@ def changes(session: Session) -> Iterator[Change]:
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
             lenses = {a: _with_lens(sensors[a], sensors[b]), b: _with_lens(sensors[b], sensors[a])}
-            yield Change(
+            yield _of_sensors(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
-                lambda views, lenses=lenses: [  # type: ignore[misc]
-                    with_sensor(view, lenses.get(view.name, view.sensor)) for view in views
-                ],
+                (a, b),
+                lambda view, lenses=lenses: with_sensor(view, lenses[view.name]),  # type: ignore[misc]
             )
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
     for names in _all_or_one(list(sized)):
-        yield Change(
+        yield _of_sensors(
             f"images of {called(names)} {{are}} mirrored",
             "with left and right of them exchanged",
-            lambda views, names=names: [  # type: ignore[misc]
-                _flipped(view, sized[view.name]) if view.name in names else view for view in views
-            ],
+            names,
+            lambda view: _flipped(view, sized[view.name]),
         )
     for names in _all_or_one([setup.name for setup in cameras]):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
-            yield Change(
+            yield _of_sensors(
                 f"camera_matrix of {called(names)} {{is}} that of images {images} as large",
                 f"with fx, fy, cx and cy {done}",
-                lambda views, names=names, factor=factor: [  # type: ignore[misc]
-                    with_sensor(view, scaled(view.sensor, factor)) if view.name in names else view
-                    for view in views
-                ],
+                names,
+                lambda view, k=factor: with_sensor(view, scaled(view.sensor, k)),  # type: ignore[misc]
             )
+
+
+def _of_sensors(
+    what: str, remedy: str, names: Sequence[str], changed: Callable[[View], View]
+) -> Change:
+    """A change of the views of some sensors."""
+    return Change(what, remedy, lambda views: [changed(v) if v.name in names else v for v in views])
 
 
 def scaled(sensor: Any, factor: float) -> Any:
@@ -159,13 +162,12 @@ def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
         if not np.allclose(each.T_sensor_world, np.eye(4), atol=1e-5)
     ]
     for names in _all_or_one(far):
-        yield Change(
+        yield _of_sensors(
             f"T_sensor_world of {called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
             "(it maps world to sensor coordinates)",
             "with the inverse",
-            lambda views, names=names: [  # type: ignore[misc]
-                _inverted(view) if view.name in names else view for view in views
-            ],
+            names,
+            _inverted,
         )
 
 

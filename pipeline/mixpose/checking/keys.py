@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mixpose.body import Body, LookAlike, congruent_parts
+from mixpose.body import LookAlike, congruent_parts
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.typical import typical_poses
 from mixpose.frames import files_of
@@ -100,15 +100,11 @@ def shared_part_warnings(session: Session) -> list[str]:
         return warnings
     noise = _noise_length(session)
     for one, other in combinations([each.body for each in session.objects], 2):
-        parts = congruent_parts(one, other, _tolerance(one, other, noise))
+        least = _LEAST * min(one.radius, other.radius)
+        parts = congruent_parts(one, other, max(least, _NOISES * noise, one.spread, other.spread))
         if parts:
             warnings.append(_text(parts[0], session.unit))
     return warnings
-
-
-def _tolerance(one: Body, other: Body, noise: float) -> float:
-    least = _LEAST * min(one.radius, other.radius)
-    return max(least, _NOISES * noise, one.spread, other.spread)
 
 
 def _noise_length(session: Session) -> float:
@@ -130,8 +126,7 @@ def _noise_length(session: Session) -> float:
 def _text(part: LookAlike, unit: str) -> str:
     one, other = part.body, part.other
     pairs = ", ".join(f"{i} like {j}" for i, j in zip(part.features, part.partners, strict=True))
-    whole = len(part.features) == len(one) == len(other)
-    if whole:
+    if len(part.features) == len(one) == len(other):
         return (
             f"the bodies {one.name!r} and {other.name!r} are congruent to {part.off:.2g} {unit} "
             f"(markers {pairs}): nothing tells them apart; give one [[object]] with count, or move "

@@ -75,7 +75,8 @@ def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
                 continue
             k = matches.names.index(view.name)
             features = np.flatnonzero((matches.weights[k] > 0) & (matches.shares[k] <= 0.5))
-            free = np.setdiff1d(np.arange(len(_pattern(view).points)), _taken(matches, k))
+            taken = matches.detections[k, matches.shares[k] > 0.5]  # by which features are met
+            free = np.setdiff1d(np.arange(len(_pattern(view).points)), taken)
             if len(features) and len(free):
                 near = _BESIDE * view.observation.sigma
                 away, at = cKDTree(_pattern(view).points[free]).query(
@@ -108,11 +109,6 @@ def _pairs(view: View, features: Indices, detections: Indices) -> Pairs:
 
 def _count(pairs: Sequence[Pairs]) -> int:
     return sum(len(features) for features, *_ in pairs)
-
-
-def _taken(matches: Matches, k: int) -> Indices:
-    """Detections by which a feature is met."""
-    return np.asarray(matches.detections[k, (matches.shares[k] > 0.5)])
 
 
 def _met(matches: Matches, k: int) -> Pairs:

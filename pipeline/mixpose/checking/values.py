@@ -100,9 +100,16 @@ def _distortion(names: Sequence[str]) -> Unknown:
 
 def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
     """Focal length, principal point and two coefficients of the distortion of a camera."""
-    twins = [o.name for o in cameras if o is not setup and _are_twins(setup.sensor, o.sensor)]
     camera: Any = setup.sensor
     given, name = camera.camera_matrix, setup.name
+    others: dict[str, Any] = {each.name: each.sensor for each in cameras if each is not setup}
+    twins = [
+        other
+        for other, each in others.items()
+        if np.array_equal(given, each.camera_matrix)
+        and np.array_equal(camera.distortion, each.distortion)
+        and np.any(camera.distortion)
+    ]
     centre = _CENTRE * 2 * float(given[0, 2])
 
     def matrix(K: Floats, v: Floats) -> Floats:
@@ -128,11 +135,6 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
         sensor=other,
         cost=-_COPIED if twins else 0.0,
     )
-
-
-def _are_twins(a: Any, b: Any) -> bool:
-    same = np.array_equal(a.camera_matrix, b.camera_matrix)
-    return same and np.array_equal(a.distortion, b.distortion) and bool(np.any(a.distortion))
 
 
 def _bent(sensor: Any, v: Floats) -> Any:

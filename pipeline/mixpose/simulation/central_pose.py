@@ -17,12 +17,14 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.options import Purpose, generator
+from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
 from mixpose.simulation.visible_spots import facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
 _SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob
 _ORIENTATIONS = 64
+_AMPLITUDE = 0.4  # of the body's radius
 
 
 def central_pose(session: Session, seed: int) -> Floats:
@@ -52,6 +54,22 @@ def central_pose(session: Session, seed: int) -> Floats:
             "object; add [start] with T_world_object"
         )
     return poses[best]
+
+
+def swinging(
+    session: Session, T_world_object: Floats, options: SimulationOptions, seed: int
+) -> Motion:
+    """The motion of a session's body about a central pose."""
+    body, amplitude = session.body, options.amplitude_translation
+    return plan_motion(
+        T_world_object,
+        pivot_of(body),
+        translation=_AMPLITUDE * body.radius if amplitude is None else amplitude,
+        rotation_deg=options.amplitude_rotation_deg,
+        period_s=options.period_s,
+        free=session.estimator.free,
+        seed=seed,
+    )
 
 
 def pivot_of(body: Body) -> Floats:

@@ -34,6 +34,7 @@ _SPOT_SIGMA_PX = 1.6
 _OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size themselves
 _PEAK_BINS = 1.5  # standard deviation of a peak, where nothing says it
 _PEAK_REACH = 5.0  # standard deviations of a peak that still fit into a profile
+_COORDINATES = {1: ("range",), 2: ("u", "v"), 3: ("x", "y", "z")}  # of tables
 
 
 @dataclass(frozen=True)
@@ -81,17 +82,19 @@ def plan_channel(
     and says so; cameras see `scenery`, too. A `SessionError` if it cannot be simulated.
     """
     shutter = shutter_of(setup, options, step_s)
-    if setup.sensor.dimension == 1:
-        channel = _range_channel(setup, files, body, motion, options, index)
-        return replace(channel, view=replace(channel.view, shutter=shutter), step_s=step_s)
-    if setup.sensor.dimension == 3:
-        channel = _cloud_channel(setup, files, body, motion, options)
-        return replace(channel, view=replace(channel.view, shutter=shutter), step_s=step_s)
-    assert setup.resolution is not None, "check_setup refuses this"
-    channel = _camera_channel(setup, files, body, options, setup.resolution, fps, index)
-    if files.kind == "detections":  # a detection is where the middle of a streak is
-        shutter = replace(shutter, exposure_s=0.0)
-    view = replace(channel.view, shutter=shutter, scenery=scenery)
+    is_profile = setup.range_min is not None and setup.bin_size is not None
+    is_table = files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile)
+    if is_table:
+        channel = _table_channel(setup, files, body, motion, options)
+    elif setup.sensor.dimension == 1:
+        channel = _profile_channel(setup, files, body, motion, options, index)
+    else:
+        channel = _camera_channel(setup, files, body, options, fps, index)
+    view = replace(channel.view, shutter=shutter)
+    if setup.sensor.dimension == 2:
+        if is_table:  # a detection is where the middle of a streak is
+            shutter = replace(shutter, exposure_s=0.0)
+        view = replace(view, shutter=shutter, scenery=scenery)
     return replace(channel, view=view, step_s=step_s)
 
 
@@ -111,43 +114,24 @@ def _camera_channel(
     files: SourceFiles,
     body: Body,
     options: SimulationOptions,
-    resolution: tuple[int, int],
     fps: float,
     index: int,
 ) -> Channel:
-    sensor, count = setup.sensor, len(body)
-    if files.kind == "detections":
-        view = View(sensor, sensor.lower, sensor.upper, np.ones(count), _TABLE_SPACING_PX)
-        noise, coordinates = options.pixel_noise, ("u", "v")
-        return Channel(
-            files,
-            view,
-            replace(options, brightness_spread=0.0),
-            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
-        )
+    assert setup.resolution is not None, "check_setup refuses this"
     optics = _SPOT_SIGMA_PX if body.radii is None else _OPTICS_PX
     spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
-    spacing = _LINE_SPACING * spot_sigma
-    view = View(
-        sensor,
-        sensor.lower,
-        sensor.upper,
-        _levels(count, options, index),
-        spacing,
-        _ridge(spot_sigma, spacing),
-    )
-
-    form = ImageFormat(resolution, spot_sigma, setup.extract.polarity)
+    form = ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
 
     def start(folder: Path) -> SensorWriter:
         if files.kind == "images":
             return ImageWriter(files, folder, options, form)
         return VideoWriter(files, folder, options, form, fps)
 
-    return Channel(files, view, options, start)
+    bounds = setup.sensor.lower, setup.sensor.upper
+    return Channel(files, _view(setup, body, bounds, spot_sigma, options, index), options, start)
 
 
-def _range_channel(
+def _profile_channel(
     setup: SensorSetup,
     files: SourceFiles,
     body: Body,
@@ -155,18 +139,10 @@ def _range_channel(
     options: SimulationOptions,
     index: int,
 ) -> Channel:
-    nearest, farthest = _ranges(setup, body, motion, options)
     range_min, bin_size = setup.range_min, setup.bin_size
-    if files.kind == "detections" or range_min is None or bin_size is None:
-        noise = setup.extract.sigma if options.range_noise is None else options.range_noise
-        # lines become detections about as far apart as these are exact
-        view = View(setup.sensor, nearest, farthest, np.ones(len(body)), setup.extract.sigma)
-        return Channel(
-            files,
-            view,
-            replace(options, brightness_spread=0.0),
-            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=("range",)),
-        )
+    assert range_min is not None
+    assert bin_size is not None
+    nearest, farthest = _around(setup, body, motion, options)
     width = options.range_width or setup.extract.spot_sigma or _PEAK_BINS * bin_size
     bins = ceil((farthest[0] + _PEAK_REACH * width - range_min) / bin_size) + 1
     if farthest[0] < range_min:
@@ -174,41 +150,53 @@ def _range_channel(
             f"sensor {setup.name!r}: range_min: found {range_min:g}; the object is at "
             f"ranges from {nearest[0]:g} to {farthest[0]:g}"
         )
-    spacing = _LINE_SPACING * width
-    view = View(
-        setup.sensor,
-        np.maximum(nearest, range_min),
-        farthest,
-        _levels(len(body), options, index),
-        spacing,
-        _ridge(width, spacing),
-    )
     form = ProfileFormat(bins, range_min, bin_size, width)
+    bounds = np.maximum(nearest, range_min), farthest
+    view = _view(setup, body, bounds, width, options, index)
     return Channel(files, view, options, lambda folder: ProfileWriter(files, folder, options, form))
 
 
-def _cloud_channel(
+def _table_channel(
     setup: SensorSetup, files: SourceFiles, body: Body, motion: Motion, options: SimulationOptions
 ) -> Channel:
-    nearest, farthest = _around(setup, body, motion, options)
-    noise = options.range_noise
-    if noise is None:
-        noise = _CLOUD_NOISE * setup.extract.sigma
-    view = View(setup.sensor, nearest, farthest, np.ones(len(body)), setup.extract.sigma)
+    sensor, sigma = setup.sensor, setup.extract.sigma
+    if sensor.dimension == 2:
+        bounds, spacing, noise = (
+            (sensor.lower, sensor.upper),
+            _TABLE_SPACING_PX,
+            options.pixel_noise,
+        )
+    else:
+        # lines become detections about as far apart as these are exact
+        bounds, spacing = _around(setup, body, motion, options), sigma
+        usual = sigma if sensor.dimension == 1 else _CLOUD_NOISE * sigma
+        noise = usual if options.range_noise is None else options.range_noise
+    view = View(sensor, *bounds, np.ones(len(body)), spacing)
+    coordinates = _COORDINATES[sensor.dimension]
     return Channel(
         files,
         view,
         replace(options, brightness_spread=0.0),
-        lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=("x", "y", "z")),
+        lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
     )
 
 
-def _ranges(
-    setup: SensorSetup, body: Body, motion: Motion, options: SimulationOptions
-) -> tuple[Floats, Floats]:
-    """Bounds (1,), (1,) of the ranges that the moving body can have."""
-    nearest, farthest = _around(setup, body, motion, options)
-    return np.maximum(nearest, 0.0), farthest
+def _view(
+    setup: SensorSetup,
+    body: Body,
+    bounds: tuple[Floats, Floats],
+    sigma: float,
+    options: SimulationOptions,
+    index: int,
+) -> View:
+    """The view of a sensor whose spots have a standard deviation."""
+    # the same throughout a recording
+    rng = generator(options.seed, Purpose.BRIGHTNESS, index)
+    levels = brightness_levels(len(body), options.brightness_spread, rng)
+    spacing = _LINE_SPACING * sigma
+    # spots this far apart are together as bright as one spot alone
+    ridge = float(spacing / (np.sqrt(2 * np.pi) * sigma))
+    return View(setup.sensor, *bounds, levels, spacing, ridge)
 
 
 def _around(
@@ -219,15 +207,5 @@ def _around(
     middle, _ = setup.sensor.project(pivot_world)
     reach = motion.reach + np.linalg.norm(body.nodes.points - motion.pivot, axis=1).max()
     reach += 4 * body.spread if options.deform else 0.0
-    return middle - reach, middle + reach
-
-
-def _levels(count: int, options: SimulationOptions, index: int) -> Floats:
-    """Brightness of the features, the same throughout a recording."""
-    rng = generator(options.seed, Purpose.BRIGHTNESS, index)
-    return brightness_levels(count, options.brightness_spread, rng)
-
-
-def _ridge(sigma: float, spacing: float) -> float:
-    """Brightness of spots this far apart that together are as bright as one spot alone."""
-    return float(spacing / (np.sqrt(2 * np.pi) * sigma))
+    nearest = middle - reach
+    return np.maximum(nearest, 0.0) if setup.sensor.dimension == 1 else nearest, middle + reach

@@ -16,8 +16,8 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.session import Session
-from mixpose.simulation.central_pose import central_pose, count_seen, pivot_of
-from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.central_pose import central_pose, count_seen, pivot_of, swinging
+from mixpose.simulation.motion import Motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
 from mixpose.simulation.scenery import Actor, motion_pose
 from mixpose.simulation.visible_spots import brightness_levels
@@ -25,7 +25,6 @@ from mixpose.simulation.visible_spots import brightness_levels
 _APART = 1.1  # sums of radii between bodies at rest
 _TRIES = 48  # places at each distance
 _DISTANCES = (1.2, 1.6, 2.2, 3.0, 4.0)  # radii of the largest
-_AMPLITUDE = 0.4  # of a body's radius, as of the first one
 _SEEDS_APART = 101  # between the motions of bodies
 
 
@@ -65,16 +64,7 @@ def plan_companions(
         if not is_at_start:
             T = _aside(own, T, placed, seed, turned=one.start is not None)
         placed.append((_middle(T, one.body), one.body.radius))
-        amplitude = options.amplitude_translation
-        motion = plan_motion(
-            T,
-            pivot_of(one.body),
-            translation=_AMPLITUDE * one.body.radius if amplitude is None else amplitude,
-            rotation_deg=options.amplitude_rotation_deg,
-            period_s=options.period_s,
-            free=session.estimator.free,
-            seed=seed,
-        )
+        motion = swinging(own, T, options, seed)
         rng = generator(seed, Purpose.BRIGHTNESS)
         levels = brightness_levels(len(one.body), options.brightness_spread, rng)
         actor = Actor(one.body, motion_pose(motion), levels, is_body=True)

@@ -86,7 +86,10 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
     The frame numbers, ascending, are those that lists of images say, else from 0. A `SessionError`
     if no files that can be written would be read by these sources.
     """
-    single = [(setup, _unlisted(source)) for setup, source in sources]
+    single = [
+        (setup, source[0] if isinstance(source, tuple) and len(source) == 1 else source)
+        for setup, source in sources
+    ]
     numbers = _frame_numbers(single, frames)
     files = tuple(_source_files(setup, source, numbers) for setup, source in single)
     for one in files:
@@ -101,10 +104,6 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
 
 def _where(sensor: str) -> str:
     return f"sensor {sensor!r}: source"
-
-
-def _unlisted(source: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    return source[0] if isinstance(source, tuple) and len(source) == 1 else source
 
 
 def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
@@ -208,7 +207,8 @@ def _camera_files(
         return SourceFiles(sensor, "detections", _filled(source))
     if suffix in VIDEO_SUFFIXES:
         return SourceFiles(sensor, "video", _filled(source))
-    if suffix in _OTHER_VIDEOS or suffix == ".npy" or _is_live(source):
+    is_live = "://" in source or source.startswith("camera:")
+    if suffix in _OTHER_VIDEOS or suffix == ".npy" or is_live:
         raise SessionError(
             f"{_where(sensor)}: found {source!r}; simulate writes images, .avi, .mp4 and .csv"
         )
@@ -216,10 +216,6 @@ def _camera_files(
         return _globbed_images(sensor, source, numbers)
     digits = max(_FEWEST_DIGITS, len(str(numbers[-1])))
     return SourceFiles(sensor, "images", source.rstrip("/") + "/", ".png", digits)
-
-
-def _is_live(source: str) -> bool:
-    return "://" in source or source.startswith("camera:")
 
 
 def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> SourceFiles:

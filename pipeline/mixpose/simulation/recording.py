@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,20 +16,19 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import central_pose, pivot_of
+from mixpose.simulation.central_pose import central_pose, swinging
 from mixpose.simulation.channels import Channel, check_setup, plan_channel
 from mixpose.simulation.companions import Companion, moved, plan_companions
-from mixpose.simulation.motion import Motion, PoseAfter, plan_motion
+from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
 from mixpose.simulation.scenery import motion_pose, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
-from mixpose.simulation.visible_spots import VisibleSpots, displacements, look
+from mixpose.simulation.visible_spots import VisibleSpots, displacements, later, look
 from mixpose.simulation.writers import SensorWriter
 
 TRUTH_NAME = "truth.jsonl"
 
-_AMPLITUDE = 0.4  # of the body's radius
 _DECIMALS = 12  # of true poses: what machines round differently is beyond
 
 Progress: TypeAlias = Callable[[int], None]
@@ -84,7 +83,7 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
     check_setup(session)
     copied = copy_session(session)
     sources = list(zip(session.sensors, copied.sources))
-    motion = _motion(session, options)
+    motion = swinging(session, central_pose(session, options.seed), options, options.seed)
     try:
         numbers, files = plan_files(sources, options.frames)
         fps = _frames_per_second(session, options)
@@ -169,20 +168,6 @@ def _frames_per_second(session: Session, options: SimulationOptions) -> float:
     return rates.pop() if rates else DEFAULT_FPS
 
 
-def _motion(session: Session, options: SimulationOptions) -> Motion:
-    body = session.body
-    amplitude = options.amplitude_translation
-    return plan_motion(
-        central_pose(session, options.seed),
-        pivot_of(body),
-        translation=_AMPLITUDE * body.radius if amplitude is None else amplitude,
-        rotation_deg=options.amplitude_rotation_deg,
-        period_s=options.period_s,
-        free=session.estimator.free,
-        seed=options.seed,
-    )
-
-
 def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
     """See that the frames in the folder will be those of this recording only."""
     if folder.resolve() == plan.session.folder.resolve():
@@ -211,20 +196,16 @@ def _write_times(plan: _Plan, folder: Path) -> None:
         for setup, channel in zip(plan.session.sensors, plan.channels, strict=True)
     }
     for name, sensor in plan.copied.times.items():
-        times = [_time(plan, number) + steps[sensor] for number in plan.numbers]
+        times = [number / plan.fps + steps[sensor] for number in plan.numbers]
         rows = [f"{n},{t:.6f}\n" for n, t in zip(plan.numbers, times, strict=True)]
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("frame,time_s\n" + "".join(rows), encoding="ascii", newline="\n")
 
 
-def _time(plan: _Plan, number: int) -> float:
-    return number / plan.fps
-
-
 def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
     with ExitStack() as stack:
-        writers = [stack.enter_context(channel.open(folder)) for channel in plan.channels]
+        writers = [stack.enter_context(closing(c.open(folder))) for c in plan.channels]
         truth = stack.enter_context((folder / TRUTH_NAME).open("w", encoding="ascii", newline="\n"))
         truth.write(_line(_header(plan)))
         for done, number in enumerate(plan.numbers, start=1):
@@ -253,7 +234,7 @@ def _record_frame(
     if options.deform:
         rng = generator(options.seed, Purpose.DEFORMATION, number)
         offsets = displacements(body, T_world_object, rng)
-    recorded = False
+    recorded, pose = False, motion_pose(plan.motion)
     for i, (channel, writer) in enumerate(zip(plan.channels, writers)):
         chance = generator(options.seed, Purpose.MISSING, number, i).random()
         is_missing = chance < options.missing
@@ -267,24 +248,15 @@ def _record_frame(
             channel.options,
             rng,
             offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else _after(plan.motion, moment),
+            pose_after=None if channel.view.shutter.is_ideal else later(pose, moment),
             time_s=moment,
             is_away=is_away,
         )
         if is_missing:
-            visible = _nothing(visible)
-        writer.write(number, _time(plan, number) + channel.step_s, visible, rng)
+            visible = VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
+        writer.write(number, number / plan.fps + channel.step_s, visible, rng)
         recorded = True
     return recorded and not is_away
-
-
-def _after(motion: Motion, moment: float) -> PoseAfter:
-    pose = motion_pose(motion)
-    return lambda seconds: pose(moment + seconds)
-
-
-def _nothing(visible: VisibleSpots) -> VisibleSpots:
-    return VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
 
 
 def _header(plan: _Plan) -> dict[str, Any]:
@@ -309,7 +281,7 @@ def _poses(
         yield {
             "type": "pose",
             "frame": number,
-            "time_s": round(_time(plan, number), 6),
+            "time_s": round(number / plan.fps, 6),
             "object": name,
             **({} if instance is None else {"instance": instance}),
             "status": "ok",

@@ -80,8 +80,10 @@ def render_image(
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
     draw_light(image, visible, options.brightness, form.spot_sigma)
-    gains = _mosaic(image.shape) if options.bayer else None
-    if gains is not None:
+    if options.bayer:
+        # what each pixel of a colour sensor takes of warm white light, by its filter
+        gains = np.full(image.shape, _GREEN, np.float32)
+        gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
         image *= gains
     if options.shot_noise:
         lit = image > 0
@@ -94,7 +96,7 @@ def render_image(
         image += noise
     np.clip(np.rint(image, out=image), 0, _WHITE, out=image)
     grey = image.astype(np.uint8)
-    if gains is not None:
+    if options.bayer:
         colours = cv2.cvtColor(grey, cv2.COLOR_BayerRGGB2BGR)
         grey = np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     if form.polarity == "dark":
@@ -126,13 +128,6 @@ def draw_light(
     for cover in visible.covers:
         rows, columns, shares = coverage(cover, image.shape)
         image[rows, columns] *= (1 - shares).astype(np.float32)
-
-
-def _mosaic(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """What each pixel of a colour sensor takes of warm white light, by its filter."""
-    gains = np.full(shape, _GREEN, np.float32)
-    gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
-    return gains
 
 
 def render_profile(

@@ -98,16 +98,16 @@ def look(
     for actor in view.scenery.actors:
         if is_away and actor.is_image:
             continue
-        later = _later(actor.pose, time_s)
-        faced = facing(view.sensor, actor.body, later(0.0), actor.mirror)
+        pose_later = later(actor.pose, time_s)
+        T = pose_later(0.0)
+        faced = facing(view.sensor, actor.body, T, actor.mirror)
         if actor.is_body:
-            T = later(0.0)
             others = [one for one in solid if one[2] is not actor]
             faced &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
             faced &= ~_hidden(len(actor.body), options, rng)
         for i in np.flatnonzero(faced).tolist():
             owner = count + len(false) + i
-            spots.add(view, actor.body, i, owner, later, actor.levels[i], None, actor.mirror)
+            spots.add(view, actor.body, i, owner, pose_later, actor.levels[i], None, actor.mirror)
     late = time_s + view.shutter.late_s
     covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
     return spots.visible(tuple(one for one in covers if len(one)))
@@ -152,7 +152,8 @@ def hidden_behind(
     return hidden
 
 
-def _later(pose: PoseAt, time_s: float) -> PoseAfter:
+def later(pose: PoseAt, time_s: float) -> PoseAfter:
+    """Poses so many seconds after a time."""
     return lambda seconds: pose(time_s + seconds)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -32,51 +31,31 @@ _VIDEO_QUALITY = 95
 
 
 class SensorWriter(Protocol):
-    """Writes what one sensor records; used in a ``with`` statement."""
+    """Writes what one sensor records."""
 
     def write(
         self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Record one frame; numbers ascend."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
-
-
-class _Closing:
-    """Leaves a ``with`` statement by `close`."""
-
     def close(self) -> None:
         """Finish the file."""
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+def _made(files: SourceFiles, folder: Path) -> Path:
+    """The one file of a source, in a folder that is there."""
+    path = folder / files.path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
-class ImageWriter(_Closing):
+class ImageWriter:
     """A file per image."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ImageFormat
     ) -> None:
-        self._files = files
-        self._folder = folder
-        self._options = options
-        self._form = form
+        self._files, self._folder, self._options, self._form = files, folder, options, form
 
     def write(
         self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
@@ -88,8 +67,11 @@ class ImageWriter(_Closing):
         suffix = path.suffix.casefold()
         path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
 
+    def close(self) -> None:
+        """Nothing is left to do: every image is whole."""
 
-class VideoWriter(_Closing):
+
+class VideoWriter:
     """All images in one video: MJPEG in .avi, MPEG-4 in .mp4."""
 
     def __init__(
@@ -100,10 +82,8 @@ class VideoWriter(_Closing):
         form: ImageFormat,
         fps: float,
     ) -> None:
-        self._options = options
-        self._form = form
-        path = folder / files.path
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self._options, self._form = options, form
+        path = _made(files, folder)
         # OpenCV's own writer of MJPEG lets the quality be set
         own = path.suffix.casefold() == ".avi"
         self._video = cv2.VideoWriter(
@@ -132,16 +112,14 @@ class VideoWriter(_Closing):
         self._video.release()
 
 
-class ProfileWriter(_Closing):
+class ProfileWriter:
     """A row per frame: .npy of float32, or .csv without a header."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
     ) -> None:
-        self._options = options
-        self._form = form
-        path = folder / files.path
-        path.parent.mkdir(parents=True, exist_ok=True)
+        self._options, self._form = options, form
+        path = _made(files, folder)
         self._is_text = path.suffix.casefold() == ".csv"
         self._file = path.open("wb")
         if not self._is_text:
@@ -154,14 +132,17 @@ class ProfileWriter(_Closing):
     ) -> None:
         """Draw one profile and append it."""
         profile = render_profile(visible, self._form, self._options, rng)
-        self._file.write(_row_of(profile) if self._is_text else profile.astype("<f4").tobytes())
+        row = profile.astype("<f4").tobytes()
+        if self._is_text:
+            row = (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")
+        self._file.write(row)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-class DetectionWriter(_Closing):
+class DetectionWriter:
     """A row per detection, in no particular order within a frame.
 
     A frame without detections has one row of weight 0, which says that the sensor looked.
@@ -170,11 +151,8 @@ class DetectionWriter(_Closing):
     def __init__(
         self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
     ) -> None:
-        self._noise = noise
-        self._coordinates = coordinates
-        path = folder / files.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("w", encoding="ascii", newline="\n")
+        self._noise, self._coordinates = noise, coordinates
+        self._file = _made(files, folder).open("w", encoding="ascii", newline="\n")
         self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
 
     def write(
@@ -200,7 +178,3 @@ def _is_covered(point: NDArray[np.float64], visible: VisibleSpots) -> bool:
     u, v = (float(x) for x in point) if len(point) == 2 else (0.0, 0.0)
     corners = [cover.astype(np.float32) for cover in visible.covers]
     return any(cv2.pointPolygonTest(one, (u, v), False) >= 0 for one in corners)
-
-
-def _row_of(profile: NDArray[np.float32]) -> bytes:
-    return (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")
