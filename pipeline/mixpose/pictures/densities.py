@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import partial
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
@@ -24,7 +26,7 @@ from mixpose.pictures.stages import fitted, shown_box, titled
 from mixpose.records import Floats
 
 Size: TypeAlias = tuple[int, int]
-Look: TypeAlias = Callable[[Floats], Floats]
+Look: TypeAlias = Callable[[Floats], NDArray[Any]]
 
 _STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
 _SHOWN = 1e-3  # of the lowest peak: what is less is black
@@ -82,9 +84,11 @@ def panels_of(
     """
     is_matched = options.objective == "matched"
     judged = list(sigmas) if is_matched else [view.observation.sigma]
+    lower = np.array(part.corner) - 1.0
+    shown = lower, lower + np.array(size) / part.zoom + 2.0
     observed, twice = [], []
     for sigma in sigmas:
-        look = _g(view, sigma, part, size)
+        look: Look = view.observation.density(sigma, shown).sample  # exact sums on a grid
         word = "g"
         if not is_matched and T is not None:
             samples = body.sample(options.samples, seed=options.seed)
@@ -93,18 +97,11 @@ def panels_of(
         title = f"{word}, σ = {sigma:.3g} px"
         observed.append(Panel(title, _on_picture(look, sigma, part, size)))
     for sigma in judged:
-        atlas = matched_objective([view], body, [sigma]).atlas
-        look = _first(atlas.look_up)
+        look_up = matched_objective([view], body, [sigma]).atlas.look_up
+        look = partial(_first, look_up)
         title = f"C = g ∗ ε, σ = {sigma:.3g} px"
         twice.append(Panel(title, _on_picture(look, sigma, part, size)))
     return [observed, twice]
-
-
-def _g(view: View, sigma: float, part: Part, size: Size) -> Look:
-    """The observed density of a sensor on a part of its image, exact sums on a grid."""
-    lower = np.array(part.corner) - 1.0
-    density = view.observation.density(sigma, (lower, lower + np.array(size) / part.zoom + 2.0))
-    return lambda places: np.asarray(density.sample(places), dtype=np.float64)
 
 
 def _sampled_g(view: View, samples: Floats, sigma: float, T: Floats) -> Look:
@@ -112,12 +109,12 @@ def _sampled_g(view: View, samples: Floats, sigma: float, T: Floats) -> Look:
     terms = sampled_terms([view], samples, [sigma], T)
     if not terms:
         return lambda places: np.zeros(places.shape[:-1])
-    return lambda places: np.asarray(terms[0].density.sample(places)[..., 0], dtype=np.float64)
+    return lambda places: terms[0].density.sample(places)[..., 0]
 
 
-def _first(look_up: Look) -> Look:
+def _first(look_up: Look, places: Floats) -> NDArray[Any]:
     """The values of one sensor without their gradients."""
-    return lambda places: np.asarray(look_up(places[None])[0, ..., 0])
+    return np.asarray(look_up(places[None])[0, ..., 0])
 
 
 def _on_picture(look: Look, sigma: float, part: Part, size: Size) -> Floats:
@@ -126,7 +123,7 @@ def _on_picture(look: Look, sigma: float, part: Part, size: Size) -> Floats:
     u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
     places = (pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner
-    blocks = look(places).reshape(size[1], fine, size[0], fine)
+    blocks = np.asarray(look(places), dtype=np.float64).reshape(size[1], fine, size[0], fine)
     return np.asarray(np.maximum(blocks.max(axis=(1, 3)), 0.0))
 
 

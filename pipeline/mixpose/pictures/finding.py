@@ -139,41 +139,34 @@ def _finding(
 ) -> Finding:
     if view is None:
         return Finding(setup, frame, None, None, 0.0, None)
-    pattern = view.observation.pattern
-    points = pattern.points if isinstance(pattern, PointPattern) else None
-    count = float(len(points)) if points is not None else _features_worth(view)
-    T = estimate.T_world_object
-    sure = estimate.status == "ok"
+    pattern, sigma = view.observation.pattern, view.observation.sigma
+    if isinstance(pattern, PointPattern):
+        points, count = pattern.points, float(len(pattern.points))
+    else:  # so many equal features would have the energy of the grid
+        top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
+        energy = view.observation.energy(sigma)
+        points, count = None, float(top / energy) if energy > 0 else 0.0
+    T, sure = estimate.T_world_object, estimate.status == "ok"
     expectation = None if T is None else _expect(view, body, T, points, sure=sure)
     return Finding(setup, frame, view, points, count, expectation)
 
 
-def _features_worth(view: View) -> float:
-    """How many equal features would have the energy of a grid pattern."""
-    sigma = view.observation.sigma
-    top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
-    energy = view.observation.energy(sigma)
-    return float(top / energy) if energy > 0 else 0.0
-
-
 def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
+    nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
+    met, explained, rms, rules = np.zeros_like(seen), 0.0, None, AssociationRules()
     found = _association(view, body, T)
-    met = np.zeros(len(body), dtype=np.bool_)
     if found is not None:
         shares = np.bincount(body.nodes.feature, found.shares[0], minlength=len(body))
         full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
-        met = seen & (shares > AssociationRules().min_share * full)
+        met = seen & (shares > rules.min_share * full)
+        in_view &= found.weights[0] > 0
+        explained, rms = float(found.explained[0]), found.rms[0]
     unexplained = np.zeros(0, dtype=np.bool_)
     if points is not None:
-        nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
-        if found is not None:
-            in_view &= found.weights[0] > 0
         away = np.linalg.norm(points[:, None] - nodes[in_view], axis=-1)
-        reach = view.observation.sigma * np.sqrt(2 * AssociationRules().reach_squared)
+        reach = view.observation.sigma * np.sqrt(2 * rules.reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
-    explained = 0.0 if found is None else float(found.explained[0])
-    rms = None if found is None else found.rms[0]
     return Expectation(y, seen, met, unexplained, explained, rms, sure)
 
 

@@ -110,7 +110,9 @@ def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> Non
     title = "finest blur"
     if covariance is not None and np.isfinite(covariance).all():
         outline = ellipse_95(covariance[np.ix_([i, j], [i, j])])
-        scale = _magnification(outline, one)
+        # a round factor that makes it large enough to be seen
+        share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
+        scale = next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
         closed = np.vstack([outline, outline[:1]]) * scale
         axes.plot(_shown(closed[:, 0], i), _shown(closed[:, 1], j), color="white", lw=1.2)
         title += "; 95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
@@ -122,17 +124,14 @@ def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> Non
     axes.set_title(title, fontsize=9)
 
 
-def _magnification(outline: Floats, one: Map) -> int:
-    """A round factor that makes an ellipse large enough to be seen on a map."""
-    share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
-    return next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
-
-
 def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
     """One range sensor; each curve is divided by its largest value, which the legend states."""
-    axes.set_title(_range_title(finding), fontsize=9, loc="left")
+    title = f"{finding.name}: echoes as of {finding.count:.1f} points"
+    if finding.points is not None:
+        title = f"{finding.name}: {len(finding.points)} ranges"
+    axes.set_title(title, fontsize=9, loc="left")
     axes.set_yticks([])
     axes.set_ylim(-0.03, 1.55)
     if finding.view is None:
@@ -203,12 +202,6 @@ def _span(finding: Finding) -> tuple[float, float]:
         shown = np.concatenate(finding.view.observation.extent)
     margin = max(_AROUND * float(np.ptp(shown)), _LEAST_AROUND * finding.sigma)
     return float(shown.min()) - margin, float(shown.max()) + margin
-
-
-def _range_title(finding: Finding) -> str:
-    if finding.points is None:
-        return f"{finding.name}: echoes as of {finding.count:.1f} points"
-    return f"{finding.name}: {len(finding.points)} ranges"
 
 
 def _shown(offsets: Floats, direction: int) -> Floats:

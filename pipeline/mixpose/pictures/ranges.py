@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, polyline, stroke, words
@@ -57,7 +56,9 @@ def draw_ranges(
     words(picture, text, (_MARGIN_PX, 22), WHITE if pattern is not None else GREY)
     if isinstance(pattern, GridPattern):
         ranges = pattern.origin[0] + pattern.step * np.arange(pattern.values.shape[1])
-        _draw_profile(picture, across(ranges), pattern.values[0])
+        share = np.clip(pattern.values[0] / max(float(pattern.values[0].max()), 1e-30), -0.1, 1.0)
+        heights = size[1] * (_BASE - (_BASE - _TOP) * share)
+        polyline(picture, np.stack([across(ranges), heights], axis=-1), FOUND)
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
             bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
@@ -123,14 +124,6 @@ def _draw_scale(picture: Picture, low: float, high: float, places: Floats) -> No
     for value, u in zip(_ticks(low, high), places, strict=True):
         polyline(picture, np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]]), GREY)
         words(picture, f"{value:g}", (u - 8, 0.96 * height), GREY, size=0.8)
-
-
-def _draw_profile(picture: Picture, u: Floats, values: NDArray[np.float32]) -> None:
-    height = picture.shape[0]
-    top = max(float(values.max()), 1e-30)
-    share = np.clip(values / top, -0.1, 1.0)
-    v = height * (_BASE - (_BASE - _TOP) * share)
-    polyline(picture, np.stack([u, v], axis=-1), FOUND)
 
 
 def _draw_expected(

@@ -38,15 +38,7 @@ from mixpose.pictures.overlay import (
     projected_features,
 )
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
-from mixpose.records import (
-    Estimate,
-    Floats,
-    FrameSet,
-    GridPattern,
-    Image,
-    PointPattern,
-    RawFrame,
-)
+from mixpose.records import Estimate, Floats, FrameSet, GridPattern, Image, PointPattern, RawFrame
 from mixpose.sensors import Sensor
 from mixpose.session import SensorSetup, Session
 

@@ -50,7 +50,7 @@ def inspection_pictures(
     blurs = fitted_blurs(views, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
-    names = file_names(_names(session))
+    names = file_names([setup.name for setup in session.sensors])
     for finding, name in zip(findings, names, strict=True):
         if finding.setup.sensor.dimension != 2:
             continue
@@ -91,7 +91,8 @@ def _objective(
 
 def possible_names(session: Session) -> list[str]:
     """Names of all files that may be made of a session's frame."""
-    names = [f"{name}_{stage}.png" for name in file_names(_names(session)) for stage in STAGES]
+    sensors = file_names([setup.name for setup in session.sensors])
+    names = [f"{name}_{stage}.png" for name in sensors for stage in STAGES]
     names = ["sheet.png", "objective.png", "ranges.png", *names]
     prefixes = prefixes_of(session.labels)
     return [BODIES, *(prefix + name for prefix in prefixes for name in names)]
@@ -159,10 +160,6 @@ def _some(sigmas: Sequence[float], most: int) -> list[float]:
     """The first and the last blur, and as many between them as there is room for."""
     chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, most)).astype(int))
     return [sigmas[k] for k in chosen] if sigmas else []
-
-
-def _names(session: Session) -> list[str]:
-    return [setup.name for setup in session.sensors]
 
 
 def file_names(wanted: Sequence[str]) -> list[str]:

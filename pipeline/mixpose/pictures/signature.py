@@ -23,14 +23,9 @@ def write_png(path: Path, picture: Picture) -> None:
     encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not encoded:
         raise SessionError(f"{path}: a picture of {picture.shape} cannot be made a PNG")
-    write_signed(path, np.asarray(data).tobytes())
-
-
-def write_signed(path: Path, png: bytes) -> None:
-    """Write the bytes of a PNG with the signature in a text chunk, or raise a `SessionError`."""
     try:
         with appearing_whole(path) as part:
-            part.write_bytes(_signed(png))
+            part.write_bytes(_signed(np.asarray(data).tobytes()))
     except OSError as error:
         raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
 

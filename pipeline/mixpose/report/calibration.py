@@ -35,7 +35,7 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
         refused=found.refused,
         unlinked=[found.after.names[k] for k in found.unlinked],
         images=[chart for chart in charts if chart is not None],
-        others=[_above(found, unit), _by_frame(found), _by_feature(found)],
+        others=[_above(found, unit), _residuals(found, "frame"), _residuals(found, "feature")],
     )
 
 
@@ -84,7 +84,8 @@ def _above(found: Calibration, unit: str) -> Chart:
     """Sensors and body in the plane in which the rig is widest."""
     before = np.array([centre_of(s) for s in found.before.sensors])
     after = np.array([centre_of(s) for s in found.after.sensors])
-    body = np.array([T[:3, :3] @ found.after.points.mean(axis=0) + T[:3, 3] for T in _poses(found)])
+    middle = found.after.points.mean(axis=0)
+    body = np.array([T[:3, :3] @ middle + T[:3, 3] for T in found.poses.values()])
     everything = np.concatenate([after, body])
     a, b = np.sort(np.argsort(-np.ptp(everything, axis=0), kind="stable")[:2])
     figure, axes = blank(height=3.6)
@@ -98,30 +99,26 @@ def _above(found: Calibration, unit: str) -> Chart:
     return Chart(title, f"{len(after)} sensors, {len(body)} frames", drawn(figure))
 
 
-def _poses(found: Calibration) -> Any:
-    return np.array(list(found.poses.values()))
-
-
-def _by_frame(found: Calibration) -> Chart:
-    numbers, values = _grouped(found, "frame")
+def _residuals(found: Calibration, kind: str) -> Chart:
+    """Residuals of each frame, as dots, or of each feature, as bars."""
+    numbers, values = _grouped(found, kind)
     figure, axes = blank()
-    axes.plot(numbers, values, ".", markersize=4, **POSE)
-    axes.set_xlabel("frame")
+    if kind == "frame":
+        axes.plot(numbers, values, ".", markersize=4, **POSE)
+        axes.set_xlabel("frame")
+        axes.set_ylim(bottom=0)
+    else:
+        labels = [found.after.labels[k] for k in numbers]
+        numbers = numbers + 1
+        axes.bar(numbers, values, **BARS)
+        if len(numbers) <= _MOST_NAMED:
+            axes.set_xticks(numbers, labels)
+        axes.set_xlabel("feature of the body")
     axes.set_ylabel("residual, standard deviations")
-    axes.set_ylim(bottom=0)
-    return Chart("Residual of each frame", _spoken("frame", numbers, values), drawn(figure))
-
-
-def _by_feature(found: Calibration) -> Chart:
-    indices, values = _grouped(found, "feature")
-    numbers = indices + 1
-    figure, axes = blank()
-    axes.bar(numbers, values, **BARS)
-    if len(numbers) <= _MOST_NAMED:
-        axes.set_xticks(numbers, [found.after.labels[k] for k in indices])
-    axes.set_xlabel("feature of the body")
-    axes.set_ylabel("residual, standard deviations")
-    return Chart("Residual of each feature", _spoken("feature", numbers, values), drawn(figure))
+    alt = "nothing was met"
+    if len(values):
+        alt = f"worst: {kind} {numbers[int(np.argmax(values))]}, {values.max():.3g}"
+    return Chart(f"Residual of each {kind}", alt, drawn(figure))
 
 
 def _grouped(found: Calibration, kind: str) -> tuple[Any, Any]:
@@ -134,9 +131,3 @@ def _grouped(found: Calibration, kind: str) -> tuple[Any, Any]:
     numbers, inverse = np.unique(key, return_inverse=True)
     mean = np.bincount(inverse, squared) / np.maximum(np.bincount(inverse), 1)
     return numbers, np.sqrt(mean)
-
-
-def _spoken(word: str, numbers: Any, values: Any) -> str:
-    if not len(values):
-        return "nothing was met"
-    return f"worst: {word} {numbers[int(np.argmax(values))]}, {values.max():.3g}"

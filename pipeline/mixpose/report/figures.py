@@ -80,13 +80,8 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         unit = unit_of(name)
         figure, (upper, lower) = stacked((1.0, 1.0))
         for axes, values, label in ((upper, rms, f"rms, {unit}"), (lower, explained, "explained")):
-            panel = TimeAxes(axes, series)
-            panel.mark_lost()
-            panel.draw(values)
-            panel.mark_ambiguous(values)
-            panel.frame()
+            _draw(axes, series, values)
             axes.set_ylabel(label)
-            axes.set_ylim(bottom=0.0)
         lower.set_ylim(0.0, 1.02)
         upper.tick_params(labelbottom=False)
         lower.set_xlabel(series.x_label)
@@ -117,15 +112,11 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)])
         axes.set_xlabel(series.x_label)
         axes.set_ylabel("feature; red: not met")
-        worst = max(residuals, key=lambda each: _typical(residuals[each]))
+        met_by = {name: each[np.isfinite(each)] for name, each in residuals.items()}
+        worst = max(met_by, key=lambda each: np.median(met_by[each]) if met_by[each].size else 0.0)
         alt = f"{name}: how far off each feature is met over time; the farthest off is {worst}"
         charts.append(Chart(f"{name}: features", alt, drawn(figure)))
     return charts
-
-
-def _typical(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else 0.0
 
 
 def latency(series: Series) -> list[Chart]:
@@ -155,15 +146,20 @@ def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
         (f"Position error, {series.unit}", errors.distance),
     ):
         figure, axes = blank()
-        panel = TimeAxes(axes, series)
-        panel.mark_lost()
-        panel.draw(values)
-        panel.mark_ambiguous(values)
-        panel.frame()
-        axes.set_ylim(bottom=0.0)
+        _draw(axes, series, values)
         axes.set_xlabel(series.x_label)
         charts.append(Chart(title, _spoken(title, values), drawn(figure)))
     return charts
+
+
+def _draw(axes: Axes, series: Series, values: Floats) -> None:
+    """Values of all frames, none of them negative; those of ambiguous and lost frames marked."""
+    panel = TimeAxes(axes, series)
+    panel.mark_lost()
+    panel.draw(values)
+    panel.mark_ambiguous(values)
+    panel.frame()
+    axes.set_ylim(bottom=0.0)
 
 
 def plain_ticks(axes: Axes) -> None:

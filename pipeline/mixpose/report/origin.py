@@ -44,8 +44,20 @@ def find_session(poses: PoseFile) -> Origin:
         return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
     for path, content in found:
         if hashlib.sha256(content).hexdigest() == wanted:
-            return _same(named, path, content)
-    return _other(named, *found[0], is_stated=isinstance(wanted, str))
+            text = content.decode("utf-8-sig", errors="replace")
+            try:
+                return Origin(named, path, text, session=load_session(path))
+            except SessionError as error:
+                return Origin(named, path, text, f"The session cannot be read again: {error}")
+    path, content = found[0]
+    notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
+    if isinstance(wanted, str):
+        notice = f"{path} has changed since the run: its SHA-256 is not the one in the poses file."
+    try:
+        load_session(path)
+    except SessionError:
+        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
+    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)
 
 
 def _content(path: Path) -> bytes | None:
@@ -55,23 +67,3 @@ def _content(path: Path) -> bytes | None:
     except OSError:
         return None
     return None
-
-
-def _same(named: str, path: Path, content: bytes) -> Origin:
-    text = content.decode("utf-8-sig", errors="replace")
-    try:
-        return Origin(named, path, text, session=load_session(path))
-    except SessionError as error:
-        return Origin(named, path, text, notice=f"The session cannot be read again: {error}")
-
-
-def _other(named: str, path: Path, content: bytes, *, is_stated: bool) -> Origin:
-    if is_stated:
-        notice = f"{path} has changed since the run: its SHA-256 is not the one in the poses file."
-    else:
-        notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
-    try:
-        load_session(path)
-    except SessionError:
-        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
-    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)

@@ -72,7 +72,11 @@ def overlay_frames(
         with closing(_read(opened, chosen)) as frame_sets:
             for frame_set in frame_sets:
                 line = lines[frame_set.number]
-                shots = _shots(session, setups, frame_set, line)
+                shots = tuple(
+                    _shot(session, setups[name], frame, frame.data, line)
+                    for name, frame in frame_set.frames.items()
+                    if isinstance(frame.data, np.ndarray)
+                )
                 why = chosen[frame_set.number]
                 frames.append(OverlayFrame(frame_set.number, line.status, why, shots))
     except RecordingError as error:
@@ -137,16 +141,6 @@ def _read(
         return
     for number in sorted(wanted):
         yield from pair(opened, number, number + 1)
-
-
-def _shots(
-    session: Session, setups: Mapping[str, SensorSetup], frame_set: FrameSet, line: PoseLine
-) -> tuple[Shot, ...]:
-    return tuple(
-        _shot(session, setups[name], frame, frame.data, line)
-        for name, frame in frame_set.frames.items()
-        if isinstance(frame.data, np.ndarray)
-    )
 
 
 def _found(session: Session, setup: SensorSetup, frame: RawFrame) -> Floats | None:

@@ -129,11 +129,14 @@ def _body_content(
 
     series = series_of(poses)
     errors = None if truth is None else errors_of(series, poses, truth)
-    evaluation = None if truth is None else _own_evaluation(poses, truth, series.label)
+    evaluation = None
+    if truth is not None:  # which may hold other bodies
+        own = tuple(line for line in truth.poses if line.label == series.label)
+        evaluation = evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
         names = [one.body.name for one in origin.session.objects]
-        own = origin.session.alone(series.object) if series.object in names else None
-        origin = replace(origin, session=own)
+        alone = origin.session.alone(series.object) if series.object in names else None
+        origin = replace(origin, session=alone)
     overlays, overlay_notices = (
         ([], [])
         if origin.session is None
@@ -159,12 +162,6 @@ def _body_content(
         "overlays": overlays,
         "overlay_notices": overlay_notices,
     }
-
-
-def _own_evaluation(poses: PoseFile, truth: PoseFile, label: str) -> Evaluation:
-    """The evaluation of one body, of which alone the poses are; the truth may hold others."""
-    own = tuple(line for line in truth.poses if line.label == label)
-    return evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
 
 
 def _name(poses: PoseFile) -> str:

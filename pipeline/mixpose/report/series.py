@@ -73,7 +73,9 @@ def series_of(file: PoseFile) -> Series:
         raise RecordingError(
             f"{file.path}: holds poses of {', '.join(map(repr, names))}; a series is of one body"
         )
-    T = np.array([_matrix(line) for line in lines], dtype=np.float64).reshape(-1, 4, 4)
+    no_pose = np.full((4, 4), np.nan)
+    poses = [no_pose if line.T_world_object is None else line.T_world_object for line in lines]
+    T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
     status = np.array([line.status for line in lines], dtype=np.str_)
     T_reference = _reference(T, status)
     frames = tuple(line.frame for line in lines)
@@ -154,10 +156,6 @@ def frame_ranges(series: Series, status: Status) -> list[tuple[int, int]]:
             ranges.append((first, frame))
         goes_on = found == status
     return ranges
-
-
-def _matrix(line: PoseLine) -> Floats:
-    return np.full((4, 4), np.nan) if line.T_world_object is None else line.T_world_object
 
 
 def _reference(T: Floats, status: Texts) -> Floats:

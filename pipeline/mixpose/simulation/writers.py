@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from mixpose.errors import SessionError
 from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.render import (
-    ImageFormat,
-    ProfileFormat,
-    render_image,
-    render_profile,
-)
+from mixpose.simulation.render import ImageFormat, ProfileFormat, render_image, render_profile
 from mixpose.simulation.visible_spots import VisibleSpots
 
 # Runs and no filter: the best for noise, and fast.
