@@ -288,12 +288,9 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
         if one.change.values == change.values and one.change.what != change.what
     ]
     words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
-    text = f"{change.what.format(**words)}: {change.remedy}"
-    if rivals:
-        text = f"{change.what.format(**words)}, or {rivals[0].change.what.format(**words)}: " + (
-            f"{change.remedy}, or {rivals[0].change.remedy}"
-        )
-    return Diagnosis(text, gain, good)
+    told_of = [change, *(one.change for one in rivals[:1])]
+    what = ", or ".join(each.what.format(**words) for each in told_of)
+    return Diagnosis(f"{what}: {', or '.join(each.remedy for each in told_of)}", gain, good)
 
 
 def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
@@ -325,17 +322,14 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
     if len(numbers) < _FRAMES or len({*np.diff(numbers).tolist()}) != 1:
         return None
     for setup in session.sensors:
-        given = [_with_next(now, after, setup.name) for (_, now), (_, after) in pairwise(frames)]
+        name = setup.name
+        given = [  # the views of a frame, that of one sensor from the frame after
+            [view for view in now if view.name != name] + [v for v in after if v.name == name]
+            for (_, now), (_, after) in pairwise(frames)
+        ]
         if all(_explains(anywhere(session), n, views) for n, views in zip(numbers, given)):
-            return (
-                f"{setup.name!r} is a frame late: with each of its frames given to the one before"
-            )
+            return f"{name!r} is a frame late: with each of its frames given to the one before"
     return None
-
-
-def _with_next(views: Views, after: Views, name: str) -> Views:
-    """The views of a frame, that of one sensor from the frame after."""
-    return [view for view in views if view.name != name] + [v for v in after if v.name == name]
 
 
 def _explains(session: Session, number: int, views: Views) -> bool:

@@ -159,15 +159,14 @@ class Channel:
                 if self._backlog.waits_for_end(self._rules.retry_s):
                     self._backlog.give_up()
                 continue
-            self._is_now_there()
-            self._count(message, heard)
-
-    def _count(self, message: Message, heard: bool) -> None:
-        self._sent += heard
-        self._unheard += not heard
-        if message.moment is not None:
-            self._latencies.append(message.late_s)
-            self._stamped_by = message.moment.of
+            if self._is_away:
+                self._is_away = False
+                self._tell(f"--publish {self._address.text}: the receiver is there")
+            self._sent += heard
+            self._unheard += not heard
+            if message.moment is not None:
+                self._latencies.append(message.late_s)
+                self._stamped_by = message.moment.of
 
     def _is_now_away(self, error: OSError) -> None:
         if not self._is_away:
@@ -177,8 +176,3 @@ class Channel:
                 f"warning: --publish {self._address.text}: the receiver is away: {reason}; the run "
                 "goes on, and tries to reach it"
             )
-
-    def _is_now_there(self) -> None:
-        if self._is_away:
-            self._is_away = False
-            self._tell(f"--publish {self._address.text}: the receiver is there")

@@ -96,17 +96,13 @@ def _bounds(setup: SensorSetup, shown: Shown | None) -> tuple[Floats, Floats]:
 def _border(sensor: Sensor, lower: Floats, upper: Floats) -> Rays | None:
     """Rays of the edge of an image, or of as much amid it as its lens model explains."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
+    steps = np.linspace(0.0, 1.0, _ALONG_EDGE + 1)[:-1, None]
     for share in _SHARES:
-        edge = _edge(middle - share * half, middle + share * half)
+        (left, top), (right, bottom) = middle - share * half, middle + share * half
+        corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        edge = np.concatenate([a + steps * (b - a) for a, b in sides])
         rays = sensor.rays(edge)
         if rays is not None and len(rays) == len(edge):
             return rays
     return None
-
-
-def _edge(lower: Floats, upper: Floats) -> Floats:
-    """Pixels (4 n, 2) around an image, from corner to corner."""
-    corners = np.array([lower, (upper[0], lower[1]), upper, (lower[0], upper[1])])
-    steps = np.linspace(0.0, 1.0, _ALONG_EDGE + 1)[:-1, None]
-    ends = np.roll(corners, -1, axis=0)
-    return np.concatenate([a + steps * (b - a) for a, b in zip(corners, ends, strict=True)])

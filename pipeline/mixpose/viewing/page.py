@@ -10,14 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 from viser import uplot
 
 from mixpose.body import Body
 from mixpose.pictures.canvas import GREY, Picture, stacked, words
 from mixpose.pictures.overlay import BODY_COLOURS, STATUS_COLOURS
 from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for, with_bodies
-from mixpose.records import Estimate, Floats, Status
+from mixpose.records import Estimate, Status
 from mixpose.session import SensorSetup, Session
 from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
@@ -71,7 +70,7 @@ class Page:
                 for setup in self._session.sensors:
                     shown = moment.sensors.get(setup.name, Shown(None))
                     drawn = self._draw(posed, setup, shown)
-                    self._pictures[setup.name].image = _rgb(drawn)
+                    self._pictures[setup.name].image = drawn[:, :, ::-1]
                 self._status.content = status_text(moment)
                 self._series.add(moment.rows)
                 before = self._scene.magnification
@@ -140,10 +139,6 @@ class Page:
                 self._scene.draw_ellipsoids(self._last.estimates)
 
 
-def _rgb(picture: Picture) -> NDArray[np.uint8]:
-    return picture[:, :, ::-1]
-
-
 def status_text(moment: Moment, *, ended: bool = False) -> str:
     """What the page says about a frame, as HTML; names of the session are only ever words in it."""
     first = moment.estimates[0]
@@ -203,10 +198,8 @@ class Series:
             ),
         )
         for names, plot in self._residuals:
-            plot.data = (frames, *(self._residuals_of(name) for name in names))
-
-    def _residuals_of(self, name: str) -> Floats:
-        return np.array([row.residuals.get(name, np.nan) for row in self._rows])
+            residuals = [[row.residuals.get(name, np.nan) for row in self._rows] for name in names]
+            plot.data = (frames, *map(np.array, residuals))
 
 
 def _plot(

@@ -68,18 +68,15 @@ class Wishes:
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, what: Wish) -> None:
-        """Ask the run for something."""
-        self._tell(what)
+    def wish(self, what: Wish | Viewers) -> None:
+        """Ask the run for something, or tell it."""
+        with self._lock:
+            self._connection.send(what)
 
     def viewers_are(self, count: int) -> None:
         """Tell how many browsers look."""
         self.viewers = count
-        self._tell(Viewers(count))
-
-    def _tell(self, message: object) -> None:
-        with self._lock:
-            self._connection.send(message)
+        self.wish(Viewers(count))
 
 
 def _be_quiet() -> None:

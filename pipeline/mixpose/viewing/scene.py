@@ -80,7 +80,9 @@ class Scene:
                 nodes.pose.wxyz = _wxyz(one.T_world_object)
                 if len(posed) == 1:
                     nodes.markers.colors = np.array(_rgb(STATUS_COLOURS[one.status]), np.uint8)
-            nodes.trail.points = self._scale * _trail([row.places[k] for row in self._rows])
+            places = pairwise(row.places[k] for row in self._rows)  # none where one is missing
+            trail = [(a, b) for a, b in places if a is not None and b is not None]
+            nodes.trail.points = self._scale * np.array(trail, dtype=np.float64).reshape(-1, 2, 3)
         self.draw_ellipsoids(moment.estimates)
 
     def draw_ellipsoids(self, estimates: Sequence[Estimate]) -> None:
@@ -227,12 +229,6 @@ def _distance(places: Floats, away: Floats, up: Floats) -> float:
     across = np.abs(places @ right) / (_ASPECT * half)
     upwards = np.abs(places @ np.cross(away, right)) / half
     return float((places @ away + np.maximum(across, upwards)).max())
-
-
-def _trail(places: Sequence[Floats | None]) -> Floats:
-    """Segments (n, 2, 3) between places that follow each other; none where one is missing."""
-    pairs = [(a, b) for a, b in pairwise(places) if a is not None and b is not None]
-    return np.array(pairs, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def _skeleton(points: Floats) -> Floats:

@@ -9,10 +9,9 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
-from types import TracebackType
+from typing import TypeAlias
 
 from mixpose.errors import SessionError
 from mixpose.objective import View
@@ -20,7 +19,7 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Done, Moment, Row, Shown, Viewers, row_of
+from mixpose.viewing.moment import PACE, Done, Moment, Row, Shown, Viewers, Wish, row_of
 
 _LOOK_S = 0.2
 """How often a wait looks whether it was interrupted; on some systems a wait on a lock is not."""
@@ -29,13 +28,8 @@ _LATELY_S = 2.0
 """Over which frames per second are counted."""
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A frame as the run has it."""
-
-    frame_set: FrameSet
-    found: dict[str, Floats]
-    estimates: tuple[Estimate, ...]
+_Frame: TypeAlias = tuple[FrameSet, dict[str, Floats], tuple[Estimate, ...]]
+"""A frame as the run has it, and what was found in it."""
 
 
 class Viewer:
@@ -144,12 +138,7 @@ class Viewer:
             self._ended = True
             self._state.notify_all()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._end()
         if kind is None:
             with suppress(KeyboardInterrupt):  # the recording is done
@@ -183,7 +172,7 @@ class Viewer:
             if isinstance(view.observation.pattern, PointPattern)
         }
         with self._state:
-            self._newest = _Frame(frame_set, found, estimates)
+            self._newest = frame_set, found, estimates
             self._rows.append(row_of(estimates))
             self._counts.update(one.status for one in estimates)
             self._instants.append(time.monotonic())
@@ -226,17 +215,14 @@ class Viewer:
             return frame, rows
 
     def _moment(self, frame: _Frame, rows: tuple[Row, ...]) -> Moment:
-        cameras = sum(setup.sensor.dimension == 2 for setup in self._session.sensors)
+        frame_set, found, estimates = frame
+        room = room_for(max(sum(s.sensor.dimension == 2 for s in self._session.sensors), 1))
         sensors = {
-            setup.name: _shown(
-                frame.frame_set.frames.get(setup.name),
-                frame.found.get(setup.name),
-                room_for(max(cameras, 1)),
-            )
+            setup.name: _shown(frame_set.frames.get(setup.name), found.get(setup.name), room)
             for setup in self._session.sensors
         }
         # what works out offsets holds the whole frame
-        estimates = tuple(replace(one, measured=dict) for one in frame.estimates)
+        estimates = tuple(replace(one, measured=dict) for one in estimates)
         with self._state:
             since = time.monotonic() - _LATELY_S
             lately = sum(instant > since for instant in self._instants)
@@ -245,17 +231,19 @@ class Viewer:
 
     def _receive(self) -> None:
         """Take what the page says until it is gone."""
-        for message in _messages(self._connection):
-            with self._state:
-                if isinstance(message, Viewers):
-                    self._viewers = message.count
-                elif message == "next":
-                    self._asked = True
-                elif message == "step":
-                    self._paused, self._steps = True, self._steps + 1
-                else:
-                    self._paused, self._steps = message == "pause", 0
-                self._state.notify_all()
+        with suppress(EOFError, OSError):
+            while True:
+                message: Wish | Viewers = self._connection.recv()
+                with self._state:
+                    if isinstance(message, Viewers):
+                        self._viewers = message.count
+                    elif message == "next":
+                        self._asked = True
+                    elif message == "step":
+                        self._paused, self._steps = True, self._steps + 1
+                    else:
+                        self._paused, self._steps = message == "pause", 0
+                    self._state.notify_all()
         with self._state:
             if not self._ended:  # said before the run goes on, which may be at its end by then
                 self._say("warning: the page of --view has ended; the run goes on without it")
@@ -272,13 +260,6 @@ def _shown(frame: RawFrame | None, found: Floats | None, room: tuple[int, int]) 
         return Shown(frame, found=found)
     image, zoom = resized(frame.data, room)
     return Shown(replace(frame, data=image), zoom, found)
-
-
-def _messages(connection: Connection) -> Iterator[object]:
-    """Messages until the other end is gone."""
-    with suppress(EOFError, OSError):
-        while True:
-            yield connection.recv()
 
 
 @contextmanager
