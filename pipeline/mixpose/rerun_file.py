@@ -55,20 +55,9 @@ def write_rerun_file(
 ) -> None:
     """Write the recording of the frames that have a pose line.
 
-    Parameters
-    ----------
-    path : Path
-    session : Session
-        That the poses were estimated with.
-    sources : mapping of str to Source
-        Its recordings, opened.
-    lines : sequence of PoseLine
-        By ascending frame number, in the unit of the session.
-
-    Raises
-    ------
-    RecordingError
-        If a frame cannot be read; the file then holds the frames before it.
+    Its sources are opened; lines are by ascending frame number, in the unit of the session that the
+    poses were estimated with. A `RecordingError` if a frame cannot be read; the file then holds the
+    frames before it.
     """
     stream = rr.RecordingStream("mixpose", send_properties=False)
     stream.set_log_time_enabled(False)

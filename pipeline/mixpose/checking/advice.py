@@ -24,10 +24,7 @@ _MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are 
 
 
 def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
-    """Whether a number of features is "too few" or "too many" for a body; None if neither.
-
-    `fewest` are in view where it is turned so; None: as many as are expected.
-    """
+    """ "too few" or "too many" features for a body, of which `fewest` may be in view, or None."""
     least = expected if fewest is None else fewest
     if count < min(_FEW * least, least - 1):
         return "too few"

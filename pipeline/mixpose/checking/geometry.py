@@ -38,13 +38,10 @@ _FIRST = 40  # frames of videos among which they are: to get far into one takes 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What frames tell of a session.
-
-    With a change that `explains` them numbers of features unlike those of the body are not odd.
-    """
+    """What frames tell of a session."""
 
     warnings: tuple[str, ...] = ()
-    explains: bool = False
+    explains: bool = False  # whether a change does: numbers of features are no more odd then
 
 
 def geometry_doubts(
@@ -91,10 +88,7 @@ class _Recording:
     surveys: Mapping[str, Survey]
 
     def shared(self, count: int, known: Container[int] = ()) -> Iterator[FrameSet]:
-        """A few frames all over the recording, in which sensors see most, the richest first.
-
-        Those that are known are left out.
-        """
+        """A few frames all over the recording, those that show most first, without those known."""
         shown = self._shown()
 
         def richness(number: int) -> float:

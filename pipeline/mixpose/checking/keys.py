@@ -22,10 +22,7 @@ _LEAST = 0.01  # of the smaller body's radius: nearer than this they are the sam
 
 
 def key_warnings(session: Session) -> list[str]:
-    """What is most likely wrong about calibrations and widths, a line each.
-
-    The session knows the sizes of the recorded images.
-    """
+    """What is most likely wrong about calibrations and widths; images have their recorded sizes."""
     return _off_centre(session) + _too_wide(session)
 
 
@@ -66,10 +63,7 @@ def _too_wide(session: Session) -> list[str]:
 
 
 def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> list[str]:
-    """Pairs of sensors that read the same files, the same camera or the same stream.
-
-    Recordings are `replaced` by sensor name.
-    """
+    """Pairs of sensors that read the same recording, some of which are `replaced` by name."""
     read = {
         setup.name: {
             os.path.realpath(place) if os.path.exists(place) else place  # noqa: PTH110 - or an address
@@ -91,10 +85,7 @@ def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> lis
 
 
 def shared_part_warnings(session: Session) -> list[str]:
-    """Pairs of bodies, or parts of them, that are congruent within the noise, with their markers.
-
-    The largest part of each pair is named.
-    """
+    """Pairs of bodies that are congruent within the noise, or whose largest such parts are."""
     warnings = list[str]()
     if len(session.objects) < 2:
         return warnings

@@ -105,10 +105,7 @@ def survey(
 
 
 def some_of(sources: Mapping[str, Source]) -> set[int] | None:
-    """Frames all over a recording that are enough to count features in; None for all.
-
-    They are the same of all sensors, as far as their frames pair.
-    """
+    """The same frames of all sensors that are enough to count features in; None for all."""
     known = [found for source in sources.values() if (found := numbers_of(source))]
     if not known:
         return None

@@ -25,15 +25,7 @@ _LISTED = 6  # features that are named one by one
 
 
 def describe(finding: Finding, body: Body, unit: str) -> list[str]:
-    """Lines for people about one sensor: counts first, then advice.
-
-    Parameters
-    ----------
-    finding : Finding
-    body : Body
-    unit : str
-        Of lengths.
-    """
+    """Lines for people about one sensor: counts first, then advice; `unit` is of lengths."""
     if finding.frame is None:
         return [f"{finding.name}: no frame of this number"]
     lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
@@ -360,10 +352,7 @@ def _level(scene: Foreground, image: Image, options: ExtractOptions) -> float:
 
 
 def _direction(options: ExtractOptions, *, lower: bool, level: float | None = None) -> str:
-    """How the threshold is to be moved, which for dark features is the other way round.
-
-    `level` is the grey level in the image that a rule chose, where it chose one.
-    """
+    """How to move a threshold, for dark features the other way; `level` is what a rule chose."""
     down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
     if isinstance(now, str):

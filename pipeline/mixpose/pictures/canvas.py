@@ -74,10 +74,7 @@ def cross(picture: Picture, place: Floats, inner: float, outer: float, colour: C
 def words(
     picture: Picture, text: str, place: tuple[float, float], colour: Colour, *, size: float = 1.0
 ) -> float:
-    """Write text from a place on its baseline on, and return where it ends, u in px.
-
-    `size` 1 is for captions.
-    """
+    """Write text from a place on its baseline on; returns where it ends, u in px."""
     pixels = max(round(_TEXT_PX * stroke(picture) * size), 9)
     rim = max(round(pixels / 14), 1)
     u, v = round(place[0]), round(place[1])
@@ -121,10 +118,7 @@ def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
 def in_grid(
     pictures: Sequence[Picture], columns: int, cell: tuple[int, int] | None = None
 ) -> Picture:
-    """Pictures from left to right, row by row, with gaps between them.
-
-    Cells are of the given width and height, else as wide as the widest and as high as their row.
-    """
+    """Pictures row by row with gaps between them, in cells (width, height), else in their own size."""
     width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
     rows = []
     for k in range(0, len(pictures), columns):

@@ -20,25 +20,7 @@ from mixpose.session import SensorSetup
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a pose expects of one sensor, and how far that is met.
-
-    Attributes
-    ----------
-    y : (N, m) float64
-        Where the features are expected.
-    seen : (N,) bool
-        Which of them are in view and face the sensor.
-    met : (N,) bool
-        Which of those were found there.
-    unexplained : (M,) bool
-        Which of the found points (if points they are) belong to no feature.
-    explained : float
-        Share of the sensor's density that the pose accounts for.
-    rms : float or None
-        Residual of the met features, sensor units.
-    sure : bool
-        Whether the estimate is "ok": what its features meet are markers then, and not clutter.
-    """
+    """What a pose expects of one sensor, and how far that is met."""
 
     y: Floats  # (N, m), where the features are expected
     seen: Mask  # (N,), which of them are in view and face the sensor
@@ -51,21 +33,7 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Finding:
-    """One sensor's frame, the features found in it, and what a pose expects.
-
-    Attributes
-    ----------
-    frame : RawFrame or None
-        None where the sensor has no frame of this number.
-    view : View or None
-        None where it has no frame.
-    points : (M, m) float64 or None
-        The features, where the extraction gives points.
-    count : float
-        Number of points found, or of as many points of light as give the energy of a grid.
-    expectation : Expectation or None
-        None without a pose or without features.
-    """
+    """One sensor's frame, the features found in it, and what a pose expects."""
 
     setup: SensorSetup
     frame: RawFrame | None  # None where the sensor has no frame of this number

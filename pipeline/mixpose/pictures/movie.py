@@ -28,11 +28,7 @@ class Overlay:
     """Draws every frame of a run and hands the pictures on; a context for ``run(watch=...)``.
 
     It goes into a video by the extension of its path, else into a folder, in which it can `resume`.
-
-    Raises
-    ------
-    SessionError
-        If the path is none of these, or holds something that mixpose did not write.
+    A `SessionError` if the path is none of these, or holds something that mixpose did not write.
     """
 
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:

@@ -38,10 +38,7 @@ _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 def inspection_pictures(
     session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
-    """All pictures of one body in one frame, of which there is a finding per sensor.
-
-    By file name, ``sheet.png`` first.
-    """
+    """All pictures of one body in one frame, by file name; ``sheet.png`` is the first."""
     views = [
         finding.view
         for finding in findings

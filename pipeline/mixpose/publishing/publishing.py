@@ -21,19 +21,9 @@ Foresee = Callable[[Estimate], Estimate]
 class Publishing:
     """Publishes estimates to receivers, which neither slow a run nor end it.
 
-    Parameters
-    ----------
-    tell : callable
-        Says a line to people.
-    foresee : mapping of str to callable
-        By label of a body; where there is none, estimates are published as they are.
-    ahead_s : float
-        What these callables look ahead.
-
-    Raises
-    ------
-    SessionError
-        If an address is wrong, its package is not installed, or it cannot be listened at.
+    It tells people lines. Of bodies by whose label there is something to `foresee` by, what that
+    makes of an estimate is published, `ahead_s` later. A `SessionError` if an address is wrong, its
+    package is not installed, or it cannot be listened at.
     """
 
     def __init__(
@@ -68,10 +58,7 @@ class Publishing:
             self._tell(channel.text())
 
     def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
-        """Publish an estimate of a frame; to be given to `mixpose.run`.
-
-        A `SessionError` if it is to be foretold, and the frame has no time.
-        """
+        """Publish an estimate; a `SessionError` where it is foretold, and has no time."""
         require_finite(estimate)
         # what tells its offsets holds all that the frame was made from
         estimate = replace(estimate, measured=dict)

@@ -46,10 +46,7 @@ SENDERS: Mapping[str, str] = {
 
 
 def sender_for(address: Address, header: Header) -> Sender:
-    """What sends the poses of a run to an address.
-
-    A `SessionError` if that is not one of its protocol, or its package is not installed.
-    """
+    """What sends the poses of a run, or a `SessionError` that says why it cannot."""
     module, _, name = SENDERS[address.scheme].partition(":")
     make: Callable[[Address, Header], Sender] = getattr(
         import_module(f"mixpose.publishing.{module}"), name

@@ -49,10 +49,7 @@ class SensorRow:
 
 
 def page_templates() -> Environment:
-    """The templates of pages, once what a page is made with is found to be installed.
-
-    Else a `SessionError` names the extra that brings it.
-    """
+    """The templates of pages, or a `SessionError` that names the extra with what makes them."""
     try:
         import matplotlib  # noqa: F401, PLC0415
         from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
@@ -73,14 +70,9 @@ def page_templates() -> Environment:
 def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
     """The report of a run as one HTML page without anything outside it.
 
-    `cut` says whether the last line of the poses was cut off; `version` is of mixpose.
-
-    Raises
-    ------
-    SessionError
-        If a library is missing.
-    RecordingError
-        If the poses cannot be compared with the truth.
+    `cut` says whether the last line of the poses was cut off; `version` is of mixpose. A
+    `SessionError` if a library is missing, a `RecordingError` if poses and truth cannot be
+    compared.
     """
     environment = page_templates()
     return environment.get_template(_TEMPLATE).render(

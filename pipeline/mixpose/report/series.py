@@ -104,10 +104,7 @@ def series_of(file: PoseFile) -> Series:
 
 
 def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
-    """Errors of every frame, modulo symmetries, as `mixpose.poses.evaluate` has them.
-
-    A `RecordingError` if the files cannot be compared.
-    """
+    """Errors of every frame, modulo symmetries; a `RecordingError` if that cannot be compared."""
     found = errors_to_truth(poses, truth)
     by_frame = {error.frame: error.twist for error in found if error.object == series.label}
     nothing = np.full(6, np.nan)

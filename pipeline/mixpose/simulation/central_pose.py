@@ -89,10 +89,7 @@ def count_seen(session: Session, T_world_object: Floats) -> int:
 
 
 def places(session: Session) -> list[Floats]:
-    """Candidates for the pivot's place (3,) in the world, the most natural one first.
-
-    Every camera of the session needs a resolution.
-    """
+    """Candidates for the pivot's place (3,) in the world, best first; resolutions are known."""
     radius = session.body.radius
     all_rays = [_ray(setup, radius) for setup in session.sensors]
     rays = [ray for ray in all_rays if ray is not None]

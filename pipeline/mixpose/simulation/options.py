@@ -33,10 +33,7 @@ def _option(default: Any, rule: Rule) -> Any:
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Frames, noise, clutter and motion of a simulated recording.
-
-    A `SessionError` if a number is not allowed.
-    """
+    """Frames, noise, clutter and motion of a recording, or a `SessionError` for a wrong number."""
 
     frames: int = field(metadata={"rule": _FRAMES})
     # the same seed, session and options give the same recording

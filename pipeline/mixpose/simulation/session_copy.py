@@ -46,11 +46,7 @@ class SessionCopy:
 
 
 def copy_session(session: Session) -> SessionCopy:
-    """Read a session file for a recording.
-
-    A `SessionError` if it cannot be read, or leads out of its folder in a way that cannot be
-    changed.
-    """
+    """Read a session file for a recording; a `SessionError` if what it names cannot go along."""
     try:
         content = session.path.read_bytes()
         data = tomllib.loads(content.decode("utf-8-sig"))

@@ -116,10 +116,7 @@ def look(
 def _solid(
     view: View, body: Body, T_world_object: Floats, time_s: float, *, is_away: bool
 ) -> list[tuple[Floats, float, object]]:
-    """Cores of the session's bodies, the first one first: middle, radius, and whose it is.
-
-    A session of one body hides nothing behind it.
-    """
+    """Middle, radius and owner of the cores of several bodies, behind which others are hidden."""
     actors = [actor for actor in view.scenery.actors if actor.is_body]
     if not actors:
         return []

@@ -102,10 +102,7 @@ class Guard:
     token: str | None  # None: only this machine can open it
 
     def answer(self, target: str, headers: Mapping[str, str]) -> Answer | None:
-        """What a request gets in place of the page; None where it may pass.
-
-        Its target is path and query, its headers those of `ASKED_FOR` that it has, each once.
-        """
+        """What a request for a path and query gets in place of the page; None where it may pass."""
         host = headers.get("Host", "")
         if self.token is None and not _is_loopback(host):
             return Answer(

@@ -35,23 +35,12 @@ _Frame: TypeAlias = tuple[FrameSet, dict[str, Floats], tuple[Estimate, ...]]
 class Viewer:
     """Shows a run on a page; a context for ``run(watch=...)``, announced once it is entered.
 
-    Parameters
-    ----------
-    text : str
-        Where the page is, as of `mixpose.viewing.address.listen`.
-    say : callable
-        Tells people a line.
-    on_files : bool
-        Whether the run can wait: it then waits for a browser before its first frame goes by, no
-        longer than `Pace.patience_s`, and pauses and steps as the page says.  Where nobody looks
-        any more it goes on.
-    paused : bool
-        Begin paused, and wait for the page for as long as it takes.
+    The page is where a `text` says, as of `mixpose.viewing.address.listen`. A run `on_files` waits
+    for a browser before its first frame goes by, no longer than `Pace.patience_s`, and pauses and
+    steps as the page says; where nobody looks any more it goes on. One that begins `paused` waits
+    for the page for as long as it takes.
 
-    Raises
-    ------
-    SessionError
-        If the package of the page is missing, or nothing can listen there.
+    A `SessionError` if the package of the page is missing, or nothing can listen there.
     """
 
     def __init__(
