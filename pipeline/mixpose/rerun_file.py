@@ -29,7 +29,6 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mixpose import rigid
-from mixpose.body import Body
 from mixpose.density import Observation, Window, render
 from mixpose.frames import Source, pair
 from mixpose.poses.poseline import PoseLine
@@ -176,7 +175,8 @@ class _Scene:
             # a transform that is cleared leaves the points where the world's origin is
             self._log(["world", line.label, "points"], rr.Points3D.from_fields(radii=[0.0]))
             return
-        body = self._body_of(line)
+        bodies = {one.body.name: one.body for one in self.session.objects}
+        body = bodies.get(line.object, self.session.body)
         colour = _COLOURS[line.status]
         labels = self.session.labels
         if own and line.status == "ok" and line.label in labels:
@@ -194,10 +194,6 @@ class _Scene:
                 points, seen = setup.sensor.project(world)
                 radius = rr.Radius.ui_points(2)
                 self._log(place, rr.Points2D(points[seen] + _HALF, radii=radius, colors=colour))
-
-    def _body_of(self, line: PoseLine) -> Body:
-        bodies = {one.body.name: one.body for one in self.session.objects}
-        return bodies.get(line.object, self.session.body)
 
 
 def _transform(T_parent_child: Floats) -> Any:

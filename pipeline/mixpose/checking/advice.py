@@ -24,7 +24,7 @@ _MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are 
 
 
 def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
-    """ "too few" or "too many" features for a body, of which `fewest` may be in view, or None."""
+    """Whether features are "too few" or "too many" for a body, `fewest` of which may be seen."""
     least = expected if fewest is None else fewest
     if count < min(_FEW * least, least - 1):
         return "too few"

@@ -54,10 +54,10 @@ def placement_warnings(session: Session) -> list[str]:
     T = session.start.T_world_object
     seen = {s.name: _seen(s.sensor, session, T) for s in session.sensors}
     unseen = [setup for setup in session.sensors if not seen[setup.name].any()]
-    hint = _inverted(session, unseen)
+    hint = _inverted(session, unseen, T)
     for setup in unseen:
         warnings.append(
-            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session)}"
+            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session, T)}"
         )
     for setup in session.sensors:
         count = int(seen[setup.name].sum())
@@ -66,7 +66,7 @@ def placement_warnings(session: Session) -> list[str]:
                 f"sensor {setup.name!r}: only {count} of {len(session.body)} features are in view "
                 "at [start]"
             )
-        warnings += _too_small(setup, session, seen[setup.name])
+        warnings += _too_small(setup, session, T, seen[setup.name])
     return warnings + hint
 
 
@@ -146,31 +146,28 @@ def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
     return [setup for setup in cameras if not _seen(setup.sensor, session, poses[0]).any()]
 
 
-def _inverted(session: Session, unseen: list[SensorSetup]) -> list[str]:
+def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> list[str]:
     """A hint where the inverse of what is written would put the body in view."""
     if not unseen:
         return []
-    assert session.start is not None
-    T = session.start.T_world_object
-    cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
-    placed = [
-        setup
-        for setup in cameras
-        if isinstance(setup.sensor, Looking)
-        and not np.allclose(setup.sensor.T_sensor_world, np.eye(4))
-    ]
+    cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
+    placed = {
+        name: sensor
+        for name, sensor in cameras.items()
+        if not np.allclose(sensor.T_sensor_world, np.eye(4))
+    }
     names = {setup.name for setup in unseen}
     # only where the inverse mends every camera, chance is no likely reason
-    if placed and all(setup.name in names for setup in placed):
-        flipped = [_with_inverse(setup.sensor) for setup in placed]
-        if all(_seen(sensor, session, T).all() for sensor in flipped):
+    if placed and names.issuperset(placed):
+        flipped = map(_with_inverse, placed.values())
+        if all(_seen(sensor, session, T_start).all() for sensor in flipped):
             return [
                 "T_sensor_world looks inverted: with its inverse the body at [start] would be in "
-                f"view of {_names(placed)}; {_MAPS}"
+                f"view of {', '.join(map(repr, placed))}; {_MAPS}"
             ]
-    back = inverse(T)
+    back = inverse(T_start)
     if len(unseen) == len(session.sensors) and all(
-        _seen(setup.sensor, session, back).all() for setup in cameras
+        _seen(sensor, session, back).all() for sensor in cameras.values()
     ):
         return [
             "start.T_world_object looks inverted: with its inverse the body would be in view of "
@@ -184,9 +181,8 @@ def _with_inverse(sensor: Sensor) -> Sensor:
     return replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world))
 
 
-def _why_unseen(sensor: Sensor, session: Session) -> str:
-    assert session.start is not None
-    points = transform(session.start.T_world_object, session.body.means)
+def _why_unseen(sensor: Sensor, session: Session, T_start: Floats) -> str:
+    points = transform(T_start, session.body.means)
     if not isinstance(sensor, Looking):
         return "out of reach: check position, range_min and the unit of lengths"
     in_sensor = transform(sensor.T_sensor_world, points)
@@ -201,12 +197,11 @@ def _why_unseen(sensor: Sensor, session: Session) -> str:
     return f"out of its view: {keys}"
 
 
-def _too_small(setup: SensorSetup, session: Session, seen: Mask) -> list[str]:
+def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask) -> list[str]:
     """A body of a few pixels: mostly two units of length in one file."""
     if not isinstance(setup.sensor, Looking) or not seen.any():
         return []
-    assert session.start is not None
-    y, _ = setup.sensor.project(transform(session.start.T_world_object, session.body.means))
+    y, _ = setup.sensor.project(transform(T_start, session.body.means))
     extent = float(np.ptp(y[seen], axis=0).max()) if seen.sum() > 1 else np.inf
     if extent > _SMALL * setup.extract.sigma:
         return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -110,8 +110,13 @@ def some_of(sources: Mapping[str, Source]) -> set[int] | None:
     if not known:
         return None
     numbers = sorted(set.intersection(*known) or set.union(*known))
-    places = np.linspace(0, len(numbers) - 1, min(_COUNTED, len(numbers)))
-    return {numbers[int(place)] for place in places}
+    return set(_spread(numbers, _COUNTED))
+
+
+def _spread(numbers: Sequence[int], most: int) -> list[int]:
+    """Some of the numbers from the first to the last."""
+    places = np.linspace(0, len(numbers) - 1, min(most, len(numbers)))
+    return [numbers[int(place)] for place in places]
 
 
 def image_of(source: Source, number: int) -> Image | None:
@@ -134,29 +139,27 @@ def _frames(
     source: Source, damage: list[tuple[int | None, str]], *, quick: bool
 ) -> Generator[RawFrame, None, None]:
     """The frames that can be read; what is said of the others is put into `damage`."""
-    frames: Iterator[RawFrame] = _readable(source, damage, quick=quick)
-    if quick and not isinstance(source, ImageSequence):
-        frames = islice(frames, _QUICK)
-    if source.ahead and not quick:
-        frames = prefetch(frames, source.ahead)
-    yield from frames
+    if isinstance(source, ImageSequence):
+        frames = _images(source, damage, quick=quick)
+    else:
+        frames = _whole(source, damage)
+        frames = islice(frames, _QUICK) if quick else frames
+    yield from prefetch(frames, source.ahead) if source.ahead and not quick else frames
 
 
-def _readable(
-    source: Source, damage: list[tuple[int | None, str]], *, quick: bool
+def _whole(source: Source, damage: list[tuple[int | None, str]]) -> Iterator[RawFrame]:
+    try:
+        yield from source.frames()
+    except RecordingError as error:
+        damage.append((None, str(error)))
+
+
+def _images(
+    source: ImageSequence, damage: list[tuple[int | None, str]], *, quick: bool
 ) -> Iterator[RawFrame]:
-    if not isinstance(source, ImageSequence):
-        try:
-            yield from source.frames()
-        except RecordingError as error:
-            damage.append((None, str(error)))
-        return
-    # each image by itself: after a damaged one the next can be read all the same
+    """Each image by itself: after a damaged one the next can be read all the same."""
     numbers = source.numbers
-    if quick:
-        places = np.linspace(0, len(numbers) - 1, min(_QUICK, len(numbers)))
-        numbers = tuple(numbers[int(place)] for place in places)
-    for number in numbers:
+    for number in _spread(numbers, _QUICK) if quick else numbers:
         try:
             for frame in source.frames(number, number + 1):
                 if source.resolution is None and isinstance(frame.data, np.ndarray):

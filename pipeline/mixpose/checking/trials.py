@@ -110,7 +110,12 @@ def diagnosis(
         in_part = partial(is_late, rules.whole)  # the rest is for values
         tried += _without_values(session, frames, before, others, in_part)
     # values only follow the noise where all frames are explained to within it without any
-    if not any(_is_all_explained(one, rules) for one in tried):
+    if not any(
+        all(is_well_explained(pose, rules) for pose in one.explained.poses)
+        and not one.change.values
+        and one.gain > rules.margin
+        for one in tried
+    ):
         tried += _with_values(session, frames, before, is_late)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
@@ -138,12 +143,6 @@ def _as_it_is(session: Session, frames: Frames, is_late: Callable[[], bool]) -> 
             break
         poses.append(best_pose(session, session.body, number, views))
     return Explained(tuple(poses))
-
-
-def _is_all_explained(one: Tried, rules: DiagnosisRules) -> bool:
-    """Whether a change without values explains all frames to within what good recordings err by."""
-    well = all(is_well_explained(pose, rules) for pose in one.explained.poses)
-    return well and not one.change.values and one.gain > rules.margin
 
 
 def _without_values(

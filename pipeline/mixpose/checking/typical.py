@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
-from mixpose.session import SensorSetup, Session
+from mixpose.session import Session
 from mixpose.simulation.central_pose import count_seen, pivot_of, places
 
 _TRIED = 64
@@ -23,18 +23,14 @@ def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | Non
     Where neither the session nor the recording says, the optical axis is taken to meet the middle
     of the image.
     """
-    setups = [_with_size(setup, sizes.get(setup.name)) for setup in session.sensors]
+    setups = []
+    for setup in session.sensors:
+        sensor = setup.sensor
+        size = setup.resolution or sizes.get(setup.name) or _size_by_axis(sensor)
+        if isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
+            sensor = replace(sensor, resolution=size)
+        setups.append(replace(setup, resolution=size, sensor=sensor))
     return replace(session, sensors=tuple(setups))
-
-
-def _with_size(setup: SensorSetup, size: tuple[int, int] | None) -> SensorSetup:
-    size = setup.resolution or size or _size_by_axis(setup.sensor)
-    if size is None:
-        return setup
-    sensor = setup.sensor
-    if isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
-        sensor = replace(sensor, resolution=size)
-    return replace(setup, resolution=size, sensor=sensor)
 
 
 def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:

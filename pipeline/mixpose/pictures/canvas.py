@@ -118,7 +118,7 @@ def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
 def in_grid(
     pictures: Sequence[Picture], columns: int, cell: tuple[int, int] | None = None
 ) -> Picture:
-    """Pictures row by row with gaps between them, in cells (width, height), else in their own size."""
+    """Pictures row by row with gaps between them, in cells of (width, height) if given."""
     width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
     rows = []
     for k in range(0, len(pictures), columns):

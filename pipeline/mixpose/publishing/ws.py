@@ -106,17 +106,15 @@ class WebSocketSender:
         ):
             await self._end.wait()
             deadline = self._loop.time() + PublishingRules.farewell_s
-            while self._are_waiting() and self._loop.time() < deadline:
+            # for what is still to be sent to those who read
+            while self._loop.time() < deadline and any(
+                one.waiting or one.began is not None for one in self._clients if not one.is_stuck()
+            ):
                 await asyncio.sleep(0.01)
             for client in self._clients:
                 self.dropped += len(client.waiting) + (client.began is not None)
                 if client.is_stuck():
                     client.connection.transport.abort()
-
-    def _are_waiting(self) -> bool:
-        """Whether anything is still to be sent to those who read."""
-        there = [one for one in self._clients if not one.is_stuck()]
-        return any(one.waiting or one.began is not None for one in there)
 
     def _refuse_other_paths(
         self, connection: ServerConnection, request: Request

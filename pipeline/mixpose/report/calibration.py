@@ -40,7 +40,8 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
 
 
 def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
-    sights, eye = found.sights[index], found.after.sensors[index]
+    sights = found.sights[index]
+    eye: Any = found.after.sensors[index]
     if not len(sights.y):
         return None
     if eye.dimension == 1:
@@ -49,7 +50,13 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
         axes.set_xlabel(f"range, {unit}")
         axes.set_ylabel(f"residual, {unit}")
     else:
-        figure, axes = _image_axes(eye, sights.y)
+        figure, axes = blank(height=3.2)
+        low, high = sights.y.min(axis=0), sights.y.max(axis=0)
+        if getattr(eye, "resolution", None) is not None:
+            low, high = np.zeros(2), np.array(eye.resolution, dtype=float)
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(high[1], low[1])
+        axes.set_aspect("equal")
         width = float(np.ptp(axes.get_xlim()))
         scale = 3 * found.noise[index] / (_LONG * width)
         axes.quiver(
@@ -66,18 +73,6 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
     title = f"{found.after.names[index]}: what was met, and by how much it is off"
     alt = f"{len(sights.y)} detections, residual {rms:.3g} RMS"
     return Chart(title, alt, drawn(figure))
-
-
-def _image_axes(eye: Any, y: Any) -> tuple[Any, Any]:
-    figure, axes = blank(height=3.2)
-    resolution = getattr(eye, "resolution", None)
-    low, high = y.min(axis=0), y.max(axis=0)
-    if resolution is not None:
-        low, high = np.zeros(2), np.array(resolution, dtype=float)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(high[1], low[1])
-    axes.set_aspect("equal")
-    return figure, axes
 
 
 def _above(found: Calibration, unit: str) -> Chart:

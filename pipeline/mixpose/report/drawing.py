@@ -173,13 +173,6 @@ def _broken(values: Floats, breaks: Flags) -> Floats:
     return np.insert(values, np.flatnonzero(breaks), np.nan)
 
 
-def count_axes(axes: Axes) -> None:
-    """Whole numbers on the vertical axis."""
-    from matplotlib.ticker import MaxNLocator  # noqa: PLC0415
-
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-
-
 def drawn(figure: Figure) -> str:
     """An ``<svg>`` element that names nothing outside itself."""
     from matplotlib import rc_context  # noqa: PLC0415

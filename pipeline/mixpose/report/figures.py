@@ -19,7 +19,6 @@ from mixpose.report.drawing import (
     TRUTH,
     TimeAxes,
     blank,
-    count_axes,
     drawn,
     line,
     mark_ambiguous,
@@ -121,6 +120,13 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
 
 def latency(series: Series) -> list[Chart]:
     """How long frames took, as a histogram over a logarithmic axis."""
+    from matplotlib.ticker import (  # noqa: PLC0415 - heavy
+        LogLocator,
+        MaxNLocator,
+        NullFormatter,
+        StrMethodFormatter,
+    )
+
     known = series.latency_ms[series.latency_ms > 0]  # NaN is not greater either
     if not known.size:
         return []
@@ -129,9 +135,12 @@ def latency(series: Series) -> list[Chart]:
     edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
     figure, axes = blank()
     axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
-    count_axes(axes)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     axes.set_xscale("log")
-    plain_ticks(axes)
+    # ticks as people write numbers
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("latency, ms")
     axes.set_ylabel("frames")
     title = "Time per frame"
@@ -160,15 +169,6 @@ def _draw(axes: Axes, series: Series, values: Floats) -> None:
     panel.mark_ambiguous(values)
     panel.frame()
     axes.set_ylim(bottom=0.0)
-
-
-def plain_ticks(axes: Axes) -> None:
-    """Ticks of a logarithmic axis as people write numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415
-
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:

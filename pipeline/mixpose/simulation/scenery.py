@@ -89,23 +89,20 @@ def plan_scenery(
     front = _unit(np.mean([_unit(camera.towards(middle)) for camera in cameras], axis=0))
     down = _unit(np.mean([_down(camera, middle) for camera in cameras], axis=0))
     side = _unit(np.cross(front, down))
-    frame = np.stack([side, down, front])
-    actors = [
-        *_lamps(body, middle, frame, options, rng),
-        *(_other(body, middle, frame, options, k, rng) for k in range(options.others)),
-    ]
+    stage = _Stage(body, middle, np.stack([side, down, front]), options, rng)
+    lamps = [stage.lamp() for _ in range(options.lamps)]
+    others = [stage.other(k) for k in range(options.others)]
+    images = []
     if options.mirror:
-        plane = middle + _TABLE_BELOW * body.radius * down
-        mirror = _reflection(plane, down)
+        # the map of the world onto its mirror image in the table
+        mirror, plane = np.eye(4), middle + _TABLE_BELOW * body.radius * down
+        mirror[:3, :3] -= 2 * np.outer(down, down)
+        mirror[:3, 3] = 2 * (plane @ down) * down
         levels = np.full(len(body), options.mirror)
         images = [Actor(body, motion_pose(motion), levels, mirror, is_image=True)]
-        images += [
-            Actor(one.body, one.pose, options.mirror * one.levels, mirror)
-            for one in actors[options.lamps :]
-        ]
-        actors += images
-    arms = tuple(_arm(body, middle, frame, options, rng) for _ in range(options.occluder))
-    return Scenery(tuple(actors), arms)
+        images += [Actor(o.body, o.pose, options.mirror * o.levels, mirror) for o in others]
+    arms = tuple(stage.arm() for _ in range(options.occluder))
+    return Scenery((*lamps, *others, *images), arms)
 
 
 def motion_pose(motion: Motion) -> PoseAt:
@@ -123,75 +120,60 @@ def _down(camera: Sensor, middle: Floats) -> Floats:
     return _unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300))
 
 
-def _lamps(
-    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
-) -> list[Actor]:
-    """Lamps behind the body that stay where they are."""
-    lamps = []
-    for _ in range(options.lamps):
+@dataclass(frozen=True)
+class _Stage:
+    """The surroundings of a body, of which scenery is drawn."""
+
+    body: Body
+    middle: Floats  # (3,)
+    frame: Floats  # (3, 3), rows to the side, down and to the front, as cameras see it
+    options: SimulationOptions
+    rng: np.random.Generator
+
+    def lamp(self) -> Actor:
+        """A lamp behind the body that stays where it is."""
+        radius, rng = self.body.radius, self.rng
         aside = rng.uniform(-_LAMPS_ASIDE, _LAMPS_ASIDE, 2)
-        place = middle + body.radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ frame)
+        place = self.middle + radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ self.frame)
         lamp = Body(
-            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * body.radius])
+            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * radius])
         )
-        lamps.append(Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL])))
-    return lamps
+        return Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL]))
 
+    def other(self, index: int) -> Actor:
+        """As many markers as the body has, elsewhere on another body that moves by itself."""
+        body, options, rng, count = self.body, self.options, self.rng, len(self.body)
+        directions = rng.standard_normal((count, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        places = body.radius * directions * rng.uniform(0.3, 1.0, (count, 1))
+        normals = None if body.normals is None else np.tile(self.frame[2], (count, 1))
+        features = tuple(PointFeature(place) for place in places)
+        radii = None if body.radii is None else np.full(count, float(np.median(body.radii)))
+        other = Body("other", features, normals, None, body.shape, radii)
+        angle = rng.uniform(0, 2 * np.pi)
+        aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        R = rotation_matrix(0.3 * rng.standard_normal(3))
+        motion = plan_motion(
+            from_parts(R, self.middle + body.radius * (aside @ self.frame)),
+            np.zeros(3),
+            translation=_OTHERS_MOVE * body.radius,
+            rotation_deg=options.amplitude_rotation_deg,
+            period_s=options.period_s,
+            seed=options.seed + 7919 * (index + 1),
+        )
+        return Actor(other, motion_pose(motion), np.ones(count))
 
-def _other(
-    body: Body,
-    middle: Floats,
-    frame: Floats,
-    options: SimulationOptions,
-    index: int,
-    rng: np.random.Generator,
-) -> Actor:
-    """As many markers as the body has, elsewhere on another body that moves by itself."""
-    count = len(body)
-    directions = rng.standard_normal((count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    places = body.radius * directions * rng.uniform(0.3, 1.0, (count, 1))
-    normals = None if body.normals is None else np.tile(frame[2], (count, 1))
-    features = tuple(PointFeature(place) for place in places)
-    radii = None if body.radii is None else np.full(count, float(np.median(body.radii)))
-    other = Body("other", features, normals, None, body.shape, radii)
-    angle = rng.uniform(0, 2 * np.pi)
-    aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
-    T = from_parts(
-        rotation_matrix(0.3 * rng.standard_normal(3)), middle + body.radius * (aside @ frame)
-    )
-    motion = plan_motion(
-        T,
-        np.zeros(3),
-        translation=_OTHERS_MOVE * body.radius,
-        rotation_deg=options.amplitude_rotation_deg,
-        period_s=options.period_s,
-        seed=options.seed + 7919 * (index + 1),
-    )
-    return Actor(other, motion_pose(motion), np.ones(count))
-
-
-def _arm(
-    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
-) -> Arm:
-    """A bar across the view that swings over the body and beside it."""
-    angle = rng.uniform(0, np.pi)
-    along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ frame
-    swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ frame
-    centre = middle + _ARM_BEFORE * body.radius * frame[2]
-    reach = 0.5 * _ARM_LENGTH * body.radius * along
-    return Arm(
-        np.array([centre - reach, centre + reach]),
-        _ARM_SWING * body.radius * swing,
-        _ARM_PERIOD * options.period_s,
-        rng.uniform(0, 2 * np.pi),
-        _ARM_WIDTH * body.radius,
-    )
-
-
-def _reflection(point: Floats, normal: Floats) -> Floats:
-    """The map (4, 4) of the world onto its mirror image in a plane."""
-    M = np.eye(4)
-    M[:3, :3] -= 2 * np.outer(normal, normal)
-    M[:3, 3] = 2 * (point @ normal) * normal
-    return M
+    def arm(self) -> Arm:
+        """A bar across the view that swings over the body and beside it."""
+        radius, angle = self.body.radius, self.rng.uniform(0, np.pi)
+        along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ self.frame
+        swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ self.frame
+        centre = self.middle + _ARM_BEFORE * radius * self.frame[2]
+        reach = 0.5 * _ARM_LENGTH * radius * along
+        return Arm(
+            np.array([centre - reach, centre + reach]),
+            _ARM_SWING * radius * swing,
+            _ARM_PERIOD * self.options.period_s,
+            self.rng.uniform(0, 2 * np.pi),
+            _ARM_WIDTH * radius,
+        )

@@ -65,7 +65,10 @@ def copy_session(session: Session) -> SessionCopy:
             files[new] = session.folder / old
         elif role == "times":
             times.setdefault(new, owner)
-    files.update(_modules(session))
+    # Python modules beside the session file that ``method = "module:function"`` names
+    methods = {setup.extract.method for setup in session.sensors}
+    names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
+    files |= {n: session.folder / n for n in names if (session.folder / n).is_file()}
     if moved:
         content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
     sources = [sensor.get("source", "") for sensor in new_data["sensor"]]
@@ -76,13 +79,6 @@ def copy_session(session: Session) -> SessionCopy:
         times=times,
         files=tuple((origin, name) for name, origin in files.items()),
     )
-
-
-def _modules(session: Session) -> dict[str, Path]:
-    """Python modules beside the session file that ``method = "module:function"`` names."""
-    methods = {setup.extract.method for setup in session.sensors}
-    names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
-    return {name: session.folder / name for name in names if (session.folder / name).is_file()}
 
 
 def _places(data: dict[str, Any]) -> Iterator[_Place]:

@@ -85,7 +85,10 @@ def look(
     moves.
     """
     count = len(body)
-    false = _false_features(options.clutter, view, rng)
+    # evenly over the bounds, their number of the given mean
+    least = int(options.clutter)
+    false_count = least + int(rng.random() < options.clutter - least)
+    false = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
     spots = _Spots([false], [brightness_levels(len(false), options.brightness_spread, rng)])
     spots.owners += range(count, count + len(false))
     seen = facing(view.sensor, body, T_world_object) & ~_hidden(count, options, rng)
@@ -238,31 +241,21 @@ def _hidden(count: int, options: SimulationOptions, rng: np.random.Generator) ->
     return hidden
 
 
-def _false_features(mean: float, view: View, rng: np.random.Generator) -> Floats:
-    """False features (n, m), evenly over the bounds; n has the given mean."""
-    count = int(mean) + int(rng.random() < mean - int(mean))
-    return np.asarray(rng.uniform(view.lowest, view.highest, (count, len(view.lowest))))
-
-
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
     """Places (K, m) and shares of brightness (K,) of one feature's visible spots."""
     R, t = T_world_object[:3, :3], T_world_object[:3, 3]
     points, shares = feature.nodes()
     if isinstance(feature, SegmentFeature):
         ends = np.array([feature.start, feature.end]) @ R.T + t
-        count = _spot_count(view, ends)
+        # so many that they lie no farther apart than `spacing`
+        pieces = np.linspace(0, 1, _PIECES + 1)[:, None]
+        y, visible = view.sensor.project(ends[0] + pieces * (ends[1] - ends[0]))
+        steps = np.linalg.norm(np.diff(y, axis=0), axis=1)[visible[1:] & visible[:-1]]
+        longest = float(steps.max()) * _PIECES if len(steps) else 0.0
+        count = max(2, ceil(longest / view.spacing))
         along = (np.arange(count) + 0.5)[:, None] / count
         y, visible = view.sensor.project(ends[0] + along * (ends[1] - ends[0]))
         shares = np.full(count, max(1.0 / count, view.ridge))
     else:
         y, visible = view.sensor.project(points @ R.T + t)
     return y[visible], shares[visible]
-
-
-def _spot_count(view: View, ends_world: Floats) -> int:
-    """How many spots a line needs so that they lie no farther apart than `spacing`."""
-    along = np.linspace(0, 1, _PIECES + 1)[:, None]
-    y, visible = view.sensor.project(ends_world[0] + along * (ends_world[1] - ends_world[0]))
-    steps = np.linalg.norm(np.diff(y, axis=0), axis=1)[visible[1:] & visible[:-1]]
-    longest = float(steps.max()) * _PIECES if len(steps) else 0.0
-    return max(2, ceil(longest / view.spacing))

@@ -14,7 +14,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers, MultipleValuesError
 from websockets.http11 import Request, Response
 
-from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Answer, Guard, Place
+from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Guard, Place
 
 _MADE_S = 0.01  # between two looks at whether the server is made
 
@@ -61,7 +61,12 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
 
     def serve(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
-            answer = _answer(guard, request)
+            try:
+                asked = {name: request.headers.get(name) for name in ASKED_FOR}
+            except MultipleValuesError:
+                asked = {}
+            given = {name: value for name, value in asked.items() if value is not None}
+            answer = guard.answer(request.path, given)
             if answer is not None:
                 text = answer.text.encode()
                 headers = Headers(**answer.headers)
@@ -86,13 +91,3 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
         websockets.asyncio.server.serve = usual
     if not guarded:
         raise RuntimeError(f"viser {viser.__version__} does not serve as expected")
-
-
-def _answer(guard: Guard, request: Request) -> Answer | None:
-    try:
-        asked = {name: request.headers.get(name) for name in ASKED_FOR}
-    except MultipleValuesError:
-        asked = {}
-    return guard.answer(
-        request.path, {name: value for name, value in asked.items() if value is not None}
-    )
