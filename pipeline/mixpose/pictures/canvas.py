@@ -87,6 +87,11 @@ def words(
     return float(left + width)
 
 
+def caption_place(picture: Picture, line: int = 0) -> tuple[float, float]:
+    """Where a line of captions in the upper left corner begins."""
+    return 0.5 * line_height(picture), (line + 1.1) * line_height(picture)
+
+
 def line_height(picture: Picture) -> float:
     """Distance of two lines of captions in px."""
     return 1.5 * _TEXT_PX * stroke(picture)

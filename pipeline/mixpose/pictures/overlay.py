@@ -10,18 +10,8 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
-from mixpose.pictures.canvas import (
-    GREY,
-    WHITE,
-    Colour,
-    Picture,
-    cross,
-    line_height,
-    polyline,
-    ring,
-    stroke,
-    words,
-)
+from mixpose.pictures import canvas
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
@@ -106,12 +96,12 @@ def draw_pose(
         Whether names stand beside features.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
-    pose, radius = None, _MARK_PX * stroke(picture)
+    pose, radius = None, _MARK_PX * canvas.stroke(picture)
     if T_world_object is not None:
         pose = _DrawnPose(picture, sensor, body, T_world_object, part)
         radius = pose.radius
     for place in part.places(found) if found is not None else ():
-        cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
+        canvas.cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
     if pose is not None:
         pose.draw_ellipses(covariance, magnified)
         pose.draw_features(colour or STATUS_COLOURS[status or "ok"], named=named)
@@ -176,7 +166,7 @@ class _DrawnPose:
     def radius(self) -> float:
         """Radius in px of a feature's ring: visible, and clear of the features beside it."""
         y, _, seen = self.features
-        usual = _MARK_PX * stroke(self.picture)
+        usual = _MARK_PX * canvas.stroke(self.picture)
         return min(usual, max(_CLEAR_SHARE * self.part.zoom * median_gap(y[seen]), 3.0))
 
     def _project(self, points: Floats) -> tuple[Floats, Mask]:
@@ -187,18 +177,19 @@ class _DrawnPose:
     def draw_features(self, colour: Colour, *, named: bool) -> None:
         nodes, inside = self._project(self.body.nodes.points)
         for feature in np.flatnonzero(np.bincount(self.body.nodes.feature) > 1):
-            polyline(self.picture, nodes[inside & (self.body.nodes.feature == feature)], colour)
+            along = inside & (self.body.nodes.feature == feature)
+            canvas.polyline(self.picture, nodes[along], colour)
         y, inside, seen = self.features
         for i, place in enumerate(self.part.places(y)):
             if not inside[i]:
                 continue
             if not seen[i]:  # turned away
-                ring(self.picture, place, self.radius / 2, GREY)
+                canvas.ring(self.picture, place, self.radius / 2, GREY)
                 continue
-            ring(self.picture, place, self.radius, colour)
+            canvas.ring(self.picture, place, self.radius, colour)
             if named and len(self.body) <= _MOST_NUMBERS:
                 beside = (place[0] + 1.2 * self.radius, place[1] - 0.9 * self.radius)
-                words(self.picture, self.body.labels[i], beside, colour, size=0.8)
+                canvas.words(self.picture, self.body.labels[i], beside, colour, size=0.8)
 
     def draw_ellipses(self, covariance: Floats | None, magnified: float) -> None:
         if covariance is None or not np.isfinite(covariance).all():
@@ -207,8 +198,10 @@ class _DrawnPose:
         spreads = projected_covariances(self.sensor, self.body, self.T, covariance)
         for place, spread in zip(self.part.places(y)[seen], spreads[seen], strict=True):
             outline = magnified * self.part.zoom * ellipse_95(spread)
-            if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * stroke(self.picture):
-                polyline(self.picture, place + outline, WHITE, closed=True)
+            if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * canvas.stroke(
+                self.picture
+            ):
+                canvas.polyline(self.picture, place + outline, WHITE, closed=True)
 
     def draw_axes(self) -> None:
         """The object's axes at its origin, or amid the features where that is out of view."""
@@ -223,33 +216,37 @@ class _DrawnPose:
         away = np.linalg.norm(self.part.places(y[seen]) - start, axis=1)
         clear = 1.3 * self.radius if away.min(initial=np.inf) < self.radius else 0.0
         along = np.linspace(0.0, _AXIS_SHARE * self.body.radius, _AXIS_PIECES)[:, None]
-        height = line_height(self.picture)
+        height = canvas.line_height(self.picture)
         for k, (name, colour) in enumerate(AXES):
             line, inside = self._project(origin + along * np.eye(3)[k])
             line = line[: len(inside) if inside.all() else int(np.argmin(inside))]
             line = line[np.linalg.norm(line - start, axis=1) >= clear]
             if len(line) < 2:
                 continue
-            polyline(self.picture, line, colour, width=2)
+            canvas.polyline(self.picture, line, colour, width=2)
             if np.linalg.norm(line[-1] - start) < 1.5 * height:
                 continue  # letters would hide what they are beside
             place = line[-1, 0] + 0.3 * height, line[-1, 1] + 0.3 * height
-            words(self.picture, name, place, colour, size=0.9)
+            canvas.words(self.picture, name, place, colour, size=0.9)
 
 
 def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
     """Write number and status of a frame into the upper left corner, in place."""
-    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
+    u, v = canvas.caption_place(picture)
     if frame is not None:
-        u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
+        u = canvas.words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * canvas.line_height(
+            picture
+        )
     if status is not None:
-        words(picture, status, (u, v), STATUS_COLOURS[status])
+        canvas.words(picture, status, (u, v), STATUS_COLOURS[status])
 
 
 def legend(picture: Picture, bodies: Sequence[tuple[str, Status]], frame: int) -> None:
     """Write the number of a frame, and each body with its status in its colour, in place."""
-    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
-    words(picture, f"frame {frame}", (u, v), WHITE)
+    u, v = canvas.caption_place(picture)
+    canvas.words(picture, f"frame {frame}", (u, v), WHITE)
     for k, (label, status) in enumerate(bodies):
         colour = BODY_COLOURS[k % len(BODY_COLOURS)] if status != "lost" else GREY
-        words(picture, f"{label} {status}", (u, v + (k + 2) * line_height(picture)), colour)
+        canvas.words(
+            picture, f"{label} {status}", (u, v + (k + 2) * canvas.line_height(picture)), colour
+        )

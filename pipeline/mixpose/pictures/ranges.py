@@ -7,14 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.pictures import overlay
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, polyline, stroke, words
-from mixpose.pictures.overlay import (
-    CHI2_95,
-    FOUND,
-    STATUS_COLOURS,
-    projected_covariances,
-    projected_features,
-)
 from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Status
 from mixpose.sensors import Sensor
 
@@ -43,7 +37,7 @@ def draw_ranges(
     picture = np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     expected = np.zeros(0)
     if T_world_object is not None:
-        y, _, seen = projected_features(sensor, body, T_world_object)
+        y, _, seen = overlay.projected_features(sensor, body, T_world_object)
         expected = np.where(seen, y[:, 0], np.nan)
     low, high = _span(sensor, pattern, expected, body)
     width = size[0] - 2 * _MARGIN_PX
@@ -58,13 +52,13 @@ def draw_ranges(
         ranges = pattern.origin[0] + pattern.step * np.arange(pattern.values.shape[1])
         share = np.clip(pattern.values[0] / max(float(pattern.values[0].max()), 1e-30), -0.1, 1.0)
         heights = size[1] * (_BASE - (_BASE - _TOP) * share)
-        polyline(picture, np.stack([across(ranges), heights], axis=-1), FOUND)
+        polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.FOUND)
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
             bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
-            polyline(picture, bar, FOUND, width=2)
+            polyline(picture, bar, overlay.FOUND, width=2)
     if T_world_object is not None:
-        colour = STATUS_COLOURS[status or "ok"]
+        colour = overlay.STATUS_COLOURS[status or "ok"]
         spread = half_widths_95(sensor, body, T_world_object, covariance)
         _draw_expected(
             picture, across(expected), spread * width / (high - low), body.labels, colour
@@ -78,8 +72,8 @@ def half_widths_95(
     """Half-widths (N,) of the intervals that hold a feature's range with 95 %; 0 if not known."""
     if covariance is None or not np.isfinite(covariance).all():
         return np.zeros(len(body))
-    variances = projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
-    return np.asarray(np.sqrt(CHI2_95[1] * np.maximum(variances, 0)))
+    variances = overlay.projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
+    return np.asarray(np.sqrt(overlay.CHI2_95[1] * np.maximum(variances, 0)))
 
 
 def _span(

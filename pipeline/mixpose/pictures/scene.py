@@ -12,31 +12,9 @@ import cv2
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.pictures.canvas import (
-    GREY,
-    WHITE,
-    Colour,
-    Picture,
-    columns_for,
-    displayable,
-    in_grid,
-    line_height,
-    polyline,
-    ring,
-    stacked,
-    stroke,
-    words,
-)
-from mixpose.pictures.overlay import (
-    BODY_COLOURS,
-    FOUND,
-    STATUS_COLOURS,
-    Part,
-    caption,
-    draw_pose,
-    legend,
-    projected_features,
-)
+from mixpose.pictures import canvas, overlay
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
+from mixpose.pictures.overlay import Part
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, Image, PointPattern, RawFrame
 from mixpose.sensors import Sensor
@@ -67,21 +45,22 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     strips = [setup for setup in session.sensors if setup.sensor.dimension == 1]
     rows: list[Picture] = []
     if cameras:
-        columns, room = columns_for(len(cameras)), room_for(len(cameras))
+        columns, room = canvas.columns_for(len(cameras)), room_for(len(cameras))
         panels = [_panel(posed, one, frame_set.frames.get(one.name), room) for one in cameras]
         for panel, setup in zip(panels, cameras, strict=True):
             if setup.name not in frame_set.frames:
                 _name(panel, f"{setup.name}: no frame", GREY)
             elif len(cameras) > 1:
                 _name(panel, setup.name, WHITE)
-        rows.append(in_grid(panels, columns))
+        rows.append(canvas.in_grid(panels, columns))
     else:
         head = np.full((36, STRIP_SIZE[0], 3), BACKGROUND, np.uint8)
-        caption(head, estimates[0].status if len(estimates) == 1 else None, estimates[0].frame)
+        status = estimates[0].status if len(estimates) == 1 else None
+        overlay.caption(head, status, estimates[0].frame)
         rows.append(head)
     for setup in strips:
         rows += draw_strips(posed, setup, frame_set.frames.get(setup.name))
-    return stacked(rows)
+    return canvas.stacked(rows)
 
 
 def _panel(
@@ -101,7 +80,7 @@ def _panel(
     larger = Part(side / box[1], (float(box[0][0]), float(box[0][1])))
     inset = np.full((side, side, 3), BACKGROUND, np.uint8)
     if isinstance(data, np.ndarray):
-        inset = cut_out(displayable(data), larger, (side, side), cv2.INTER_NEAREST)
+        inset = cut_out(canvas.displayable(data), larger, (side, side), cv2.INTER_NEAREST)
     _mark_detections(inset, data, larger)
     put_into(panel, part, _draw_bodies(posed, setup, inset, larger), box)
     return panel
@@ -111,7 +90,7 @@ def _mark_detections(picture: Picture, data: object, part: Part) -> None:
     """Draw the detections of a camera that has them in place of images, if it has."""
     if isinstance(data, PointPattern):
         for place in part.places(data.points):
-            ring(picture, place, _DETECTION_PX * stroke(picture), FOUND)
+            canvas.ring(picture, place, _DETECTION_PX * canvas.stroke(picture), overlay.FOUND)
 
 
 def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[Body, Estimate]]:
@@ -122,7 +101,7 @@ def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[B
 
 def room_for(cameras: int) -> tuple[int, int]:
     """Width and height in px that each of so many cameras has in a picture of them all."""
-    columns = columns_for(cameras)
+    columns = canvas.columns_for(cameras)
     return LARGEST[0] // columns, LARGEST[1] // -(-cameras // columns)
 
 
@@ -143,7 +122,7 @@ def backdrop(
         _mark_detections(picture, data, part)
         return picture, part
     data, zoom = resized(data, room)
-    return displayable(data), Part(zoom)
+    return canvas.displayable(data), Part(zoom)
 
 
 def resized(image: Image, room: tuple[int, int] | None) -> tuple[Image, float]:
@@ -189,9 +168,9 @@ def draw_camera(
     picture = _draw_bodies(posed, setup, picture, part, found, named=named)
     first = posed[0][1]
     if len(posed) == 1:
-        caption(picture, first.status, first.frame)
+        overlay.caption(picture, first.status, first.frame)
     else:
-        legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
+        overlay.legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
     return picture
 
 
@@ -205,9 +184,11 @@ def _draw_bodies(
     named: bool = True,
 ) -> Picture:
     """The same without words about the frame: on a new picture."""
-    colours = BODY_COLOURS if len(posed) > 1 else (STATUS_COLOURS[posed[0][1].status],)
+    colours = (
+        overlay.BODY_COLOURS if len(posed) > 1 else (overlay.STATUS_COLOURS[posed[0][1].status],)
+    )
     for k, (body, one) in enumerate(posed):
-        picture = draw_pose(
+        picture = overlay.draw_pose(
             picture, setup.sensor, body, one.T_world_object, one.covariance,
             part=part, colour=colours[k % len(colours)], found=None if k else found, named=named,
         )  # fmt: skip
@@ -235,8 +216,7 @@ def draw_strips(
 
 def _name(picture: Picture, name: str, colour: Colour) -> None:
     """Write a sensor's name below the caption."""
-    place = 0.5 * line_height(picture), 2.1 * line_height(picture)
-    words(picture, name, place, colour, size=0.9)
+    canvas.words(picture, name, canvas.caption_place(picture, 1), colour, size=0.9)
 
 
 def small_box(
@@ -246,7 +226,7 @@ def small_box(
     places = [np.zeros((0, 2))]
     for body, one in posed:
         if one.T_world_object is not None:
-            y, _, seen = projected_features(sensor, body, one.T_world_object)
+            y, _, seen = overlay.projected_features(sensor, body, one.T_world_object)
             places.append(y[seen])
     y = np.concatenate(places)
     if len(y) < 2:
@@ -277,4 +257,4 @@ def put_into(picture: Picture, part: Part, inset: Picture, box: Box) -> None:
     picture[v : v + side, u : u + side] = inset
     for corner, size in ((np.array([u, v]), side - 1.0), (part.places(box[0]), part.zoom * box[1])):
         outline = size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-        polyline(picture, corner + outline, WHITE, closed=True)
+        canvas.polyline(picture, corner + outline, WHITE, closed=True)

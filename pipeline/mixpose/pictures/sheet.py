@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,25 +65,15 @@ def inspection_pictures(
         pictures["ranges.png"] = picture
         rows.append(picture)
     if estimate.T_world_object is not None and views:
-        pictures["objective.png"] = _objective(session, body, views, blurs, estimate)
-        rows.append(pictures["objective.png"])
+        levels = list(zip(*(blurs[view.name] for view in views), strict=True))
+        T, covariance = estimate.T_world_object, estimate.covariance
+        around = objective_around(views, body, T, covariance, session.estimator, levels)
+        finest = [view.observation.sigma for view in views]
+        factors = [max(a / b for a, b in zip(level, finest)) for level in levels]
+        picture = objective_picture(*around, factors, covariance, session.unit, _WIDTH)
+        pictures["objective.png"] = picture
+        rows.append(picture)
     return {"sheet.png": stacked(rows), **pictures}
-
-
-def _objective(
-    session: Session,
-    body: Body,
-    views: Sequence[View],
-    blurs: Mapping[str, Sequence[float]],
-    estimate: Estimate,
-) -> Picture:
-    T, covariance = estimate.T_world_object, estimate.covariance
-    assert T is not None, "without a pose there is nothing to cut the objective around"
-    levels = list(zip(*(blurs[view.name] for view in views), strict=True))
-    slices, maps = objective_around(views, body, T, covariance, session.estimator, levels)
-    finest = [view.observation.sigma for view in views]
-    factors = [max(a / b for a, b in zip(level, finest)) for level in levels]
-    return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
 
 
 def possible_names(session: Session) -> list[str]:

@@ -12,26 +12,10 @@ from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
 from mixpose.objective import View, region_of_interest
-from mixpose.pictures.canvas import (
-    WHITE,
-    Colour,
-    Picture,
-    cross,
-    displayable,
-    line_height,
-    stroke,
-    words,
-)
+from mixpose.pictures import canvas, overlay
+from mixpose.pictures.canvas import WHITE, Colour, Picture
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.overlay import (
-    FOUND,
-    Part,
-    draw_pose,
-    ellipse_95,
-    median_gap,
-    projected_covariances,
-    projected_features,
-)
+from mixpose.pictures.overlay import Part
 from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
@@ -87,7 +71,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     else:
         return titled(picture, f"{options.method}: its own threshold")
     if options.method != "blobs":
-        picture = displayable(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
+        picture = canvas.displayable(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     if options.method != "intensity":
         _mark(picture, part, finding.points)
     return titled(picture, title)
@@ -98,12 +82,12 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     T = estimate.T_world_object
     if finding.view is None or T is None:
         picture, _ = backdrop(finding.setup, finding.frame, room)
-        return draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
+        return overlay.draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
     part = fitted(shown_box(finding.view, body, T, None), room)
     whole, _ = backdrop(finding.setup, finding.frame, None)
     cut = cut_out(whole, part, room, cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR)
-    factor, note = _magnifier(finding, body, estimate, part.zoom, stroke(cut))
-    drawn = draw_pose(
+    factor, note = _magnifier(finding, body, estimate, part.zoom, canvas.stroke(cut))
+    drawn = overlay.draw_pose(
         cut,
         finding.setup.sensor,
         body,
@@ -116,7 +100,8 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
         magnified=factor,
     )
     if note:
-        words(drawn, note, (0.5 * line_height(drawn), drawn.shape[0] - 8), WHITE, size=0.8)
+        place = canvas.caption_place(drawn)[0], drawn.shape[0] - 8
+        canvas.words(drawn, note, place, WHITE, size=0.8)
     return drawn
 
 
@@ -128,12 +113,12 @@ def _magnifier(
     if T is None or covariance is None or not np.isfinite(covariance).all():
         return 1, ""
     sensor = finding.setup.sensor
-    y, _, seen = projected_features(sensor, body, T)
-    spreads = projected_covariances(sensor, body, T, covariance)[seen]
+    y, _, seen = overlay.projected_features(sensor, body, T)
+    spreads = overlay.projected_covariances(sensor, body, T, covariance)[seen]
     if not len(spreads):
         return 1, ""
-    largest = [np.linalg.norm(ellipse_95(spread), axis=1).max() for spread in spreads]
-    room = min(_ELLIPSE_PX * scale, 0.4 * zoom * median_gap(y[seen]))
+    largest = [np.linalg.norm(overlay.ellipse_95(spread), axis=1).max() for spread in spreads]
+    room = min(_ELLIPSE_PX * scale, 0.4 * zoom * overlay.median_gap(y[seen]))
     allowed = room / max(zoom * float(np.median(largest)), 1e-12)
     factor = max((each for each in _MAGNIFIERS if each <= allowed), default=1)
     enlarged = f", drawn {factor} times as large" if factor > 1 else ""
@@ -169,12 +154,14 @@ def fitted(box: tuple[Floats, Floats], room: Size) -> Part:
 def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
     if points is None or not len(points):
         return
-    reach = min(_MARK_PX * stroke(picture), max(0.45 * part.zoom * median_gap(points), 3.0))
+    reach = min(
+        _MARK_PX * canvas.stroke(picture), max(0.45 * part.zoom * overlay.median_gap(points), 3.0)
+    )
     for place in part.places(points):
-        cross(picture, place, reach / 3, reach, FOUND)
+        canvas.cross(picture, place, reach / 3, reach, overlay.FOUND)
 
 
 def titled(picture: Picture, title: str) -> Picture:
     """The picture, with a caption in its upper left corner."""
-    words(picture, title, (0.5 * line_height(picture), 1.1 * line_height(picture)), WHITE, size=0.9)
+    canvas.words(picture, title, canvas.caption_place(picture), WHITE, size=0.9)
     return picture

@@ -12,18 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.report.drawing import (
-    BAND,
-    BARS,
-    POSE,
-    TRUTH,
-    TimeAxes,
-    blank,
-    drawn,
-    line,
-    mark_ambiguous,
-    stacked,
-)
+from mixpose.report import drawing
+from mixpose.report.drawing import BAND, BARS, POSE, TRUTH, TimeAxes
 from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
 
 if TYPE_CHECKING:
@@ -77,7 +67,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
     for name, rms in series.rms.items():
         explained = series.explained[name]
         unit = unit_of(name)
-        figure, (upper, lower) = stacked((1.0, 1.0))
+        figure, (upper, lower) = drawing.stacked((1.0, 1.0))
         for axes, values, label in ((upper, rms, f"rms, {unit}"), (lower, explained, "explained")):
             _draw(axes, series, values)
             axes.set_ylabel(label)
@@ -85,7 +75,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         upper.tick_params(labelbottom=False)
         lower.set_xlabel(series.x_label)
         alt = f"{_spoken(f'{name}: rms, {unit}', rms)}; {_spoken('explained share', explained)}"
-        charts.append(Chart(name, alt, drawn(figure)))
+        charts.append(Chart(name, alt, drawing.drawn(figure)))
     return charts
 
 
@@ -97,7 +87,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
             continue
         rows = np.array(list(residuals.values()))[:_MOST_ROWS]
         met = np.isfinite(rows)
-        figure, axes = blank()
+        figure, axes = drawing.blank()
         largest = float(np.quantile(rows[met], 0.98)) if met.any() else 1.0
         steps = np.diff(series.x)
         half = 0.5 * (float(np.median(steps)) if steps.size else 1.0)
@@ -114,7 +104,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         met_by = {name: each[np.isfinite(each)] for name, each in residuals.items()}
         worst = max(met_by, key=lambda each: np.median(met_by[each]) if met_by[each].size else 0.0)
         alt = f"{name}: how far off each feature is met over time; the farthest off is {worst}"
-        charts.append(Chart(f"{name}: features", alt, drawn(figure)))
+        charts.append(Chart(f"{name}: features", alt, drawing.drawn(figure)))
     return charts
 
 
@@ -133,7 +123,7 @@ def latency(series: Series) -> list[Chart]:
     low, high = float(known.min()), float(known.max())
     low, high = (low / 1.5, high * 1.5) if high < 1.5 * low else (low, high)
     edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
-    figure, axes = blank()
+    figure, axes = drawing.blank()
     axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     axes.set_xscale("log")
@@ -144,7 +134,7 @@ def latency(series: Series) -> list[Chart]:
     axes.set_xlabel("latency, ms")
     axes.set_ylabel("frames")
     title = "Time per frame"
-    return [Chart(title, _spoken("Time per frame, ms", known), drawn(figure))]
+    return [Chart(title, _spoken("Time per frame, ms", known), drawing.drawn(figure))]
 
 
 def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
@@ -154,10 +144,10 @@ def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
         ("Rotation error, deg", errors.rotation_deg),
         (f"Position error, {series.unit}", errors.distance),
     ):
-        figure, axes = blank()
+        figure, axes = drawing.blank()
         _draw(axes, series, values)
         axes.set_xlabel(series.x_label)
-        charts.append(Chart(title, _spoken(title, values), drawn(figure)))
+        charts.append(Chart(title, _spoken(title, values), drawing.drawn(figure)))
     return charts
 
 
@@ -172,12 +162,12 @@ def _draw(axes: Axes, series: Series, values: Floats) -> None:
 
 
 def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
-    figure, axes = blank(height=3.6)
+    figure, axes = drawing.blank(height=3.6)
     position = series.position
     if errors is not None:
-        line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
-    line(axes, position[:, a], position[:, b], series.breaks)
-    mark_ambiguous(axes, position[:, a], position[:, b], series)
+        drawing.line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
+    drawing.line(axes, position[:, a], position[:, b], series.breaks)
+    drawing.mark_ambiguous(axes, position[:, a], position[:, b], series)
     known = position[series.status != "lost"]
     if len(known):
         ink = {"linestyle": "none", "color": POSE["color"], "zorder": 5}
@@ -189,14 +179,14 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
     axes.set_ylabel(f"{AXES[b]}, {series.unit}")
     title = f"Plane {AXES[a]}{AXES[b]}"
     spoken = [_spoken(AXES[k], position[:, k]) for k in (a, b)]
-    return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawn(figure))
+    return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawing.drawn(figure))
 
 
 def _values(
     series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
 ) -> str:
     """Values with their band above, the band's half-width alone below."""
-    figure, (upper, lower) = stacked((3.0, 1.2))
+    figure, (upper, lower) = drawing.stacked((3.0, 1.2))
     panel = TimeAxes(upper, series, jumps)
     panel.mark_lost()
     panel.band(values, half_width)
@@ -219,7 +209,7 @@ def _values(
         lower.set_ylim(0.0, 1.15 * float(positive.max()) if positive.size else 1.0)
     lower.set_ylabel("± 95 %")
     lower.set_xlabel(series.x_label)
-    return drawn(figure)
+    return drawing.drawn(figure)
 
 
 def _limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:
