@@ -132,7 +132,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-values-cost-nothing-and-have-no-prior",
-        "checking/adjusted.py",
+        "checking/values.py",
         "b[-k:] = np.eye(k), -values / unknown.deviations",
         "b[-k:] = 1e9 * np.eye(k), -values / unknown.deviations",
         "values stay where they are, and no size is found",
@@ -266,7 +266,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-half-of-the-image",
-        "checking/typical.py",
+        "checking/placement.py",
         "return max(round(2 * u) + 1, 1), max(round(2 * v) + 1, 1)",
         "return max(round(u) + 1, 1), max(round(v) + 1, 1)",
         "an image of unknown size is taken for a quarter of it",

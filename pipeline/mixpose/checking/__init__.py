@@ -4,10 +4,10 @@
 the count is off and the body is found with that change, `keys` doubts calibrations and widths, and
 finds bodies that could be taken for each other and recordings that are given twice, `placement`
 looks at where sensors stand and the body starts, `lookalikes` finds poses that the sensors could
-not tell apart, `typical` has poses where the session names no start. `geometry` takes a few frames
-all over the recording, and `trials` tries what else the session could have said: `changes` of it as
-a whole, and `values` that are `adjusted` to what sensors met (`meetings`); `evidence` says how well
-frames are explained, `rules` when a change is told.
+not tell apart. `geometry` takes a few frames all over the recording, and `trials` tries what else
+the session could have said: `changes` of it as a whole, and `values` that are adjusted to what
+sensors met (`meetings`); `evidence` says how well frames are explained, `rules` when a change is
+told.
 """
 
 from mixpose.checking.advice import advice as advice, judge as judge, told_apart as told_apart
@@ -40,7 +40,7 @@ from mixpose.checking.recordings import (
     survey as survey,
 )
 from mixpose.checking.trials import explanation as explanation
-from mixpose.checking.typical import (
+from mixpose.checking.placement import (
     depends_on_distance as depends_on_distance,
     typical_poses as typical_poses,
     with_image_sizes as with_image_sizes,

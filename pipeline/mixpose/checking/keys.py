@@ -10,7 +10,7 @@ import numpy as np
 
 from mixpose.body import LookAlike, congruent_parts
 from mixpose.checking.lookalikes import noise_of
-from mixpose.checking.typical import typical_poses
+from mixpose.checking.placement import typical_poses
 from mixpose.frames import files_of
 from mixpose.runner import source_spec
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mixpose.checking.adjusted import Adjustment, Unknown, adjusted, promise
 from mixpose.checking.changes import Change, changes, of_points, other_sizes, with_sensor
 from mixpose.checking.evidence import (
     Explained,
@@ -32,7 +31,7 @@ from mixpose.checking.evidence import (
 )
 from mixpose.checking.meetings import beside, seen_by
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.values import unknowns
+from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.runner import begin

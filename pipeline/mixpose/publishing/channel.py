@@ -12,8 +12,7 @@ import numpy as np
 
 from mixpose.constants import constant
 from mixpose.publishing.address import Address
-from mixpose.publishing.message import Message
-from mixpose.publishing.senders import Sender
+from mixpose.publishing.message import Message, Sender
 
 _REMEMBERED = 10_000  # latencies: a live source may run for days
 

@@ -10,8 +10,7 @@ from mixpose.poses.header import Header
 from mixpose.poses.plain import require_finite
 from mixpose.publishing.address import parse
 from mixpose.publishing.channel import Channel, PublishingRules
-from mixpose.publishing.message import Message
-from mixpose.publishing.senders import SENDERS, sender_for
+from mixpose.publishing.message import SENDERS, Message, sender_for
 from mixpose.records import Estimate, FrameSet
 
 Foresee = Callable[[Estimate], Estimate]

@@ -19,8 +19,7 @@ from mixpose.poses.header import Header
 from mixpose.poses.ros import pose_message
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, path_word
-from mixpose.publishing.senders import Sender
+from mixpose.publishing.message import Message, Sender, path_word
 from mixpose.publishing.sockets import connected, force_down
 
 if TYPE_CHECKING:

@@ -1,7 +1,8 @@
-"""The page: what it says, put into its template."""
+"""The page: what it says, put into its template, and the session that its poses came from."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +14,8 @@ from mixpose.errors import SessionError
 from mixpose.poses.evaluate import Evaluation, as_numbered, evaluate
 from mixpose.poses.jsonl import PoseFile
 from mixpose.records import Floats, Status
-from mixpose.report.origin import Origin, find_session
 from mixpose.report.series import Series, errors_of, frame_ranges, series_of
+from mixpose.session import Session, load_session
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -25,6 +26,7 @@ MARK = '<meta name="generator" content="mixpose report'
 _TEMPLATE, _BODY_TEMPLATE = "page.html.j2", "body.html.j2"
 _STATUSES: tuple[Status, ...] = ("ok", "ambiguous", "lost")
 _MOST_RANGES = 40
+_LARGEST = 2_000_000  # bytes; no session file is near it
 
 
 @dataclass(frozen=True)
@@ -277,3 +279,59 @@ def _median(values: Floats) -> str:
 def _short(value: float) -> str:
     """Three digits that count, and no power of ten where people would write none."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is known of the session file."""
+
+    named: str | None = None  # path in the header of the poses
+    path: Path | None = None  # where it was found
+    text: str | None = None  # its text
+    notice: str | None = None  # what is wrong: missing, changed, no session any more
+    # only if the file is the very one that the poses were estimated with
+    session: Session | None = None
+
+
+def find_session(poses: PoseFile) -> Origin:
+    """Read the session file that the header names, or its like beside the poses.
+
+    A file that is not the one of the run is shown only if it is a session file: a header may name
+    any file, and whoever passes the page on should not pass on that.
+    """
+    named = poses.header.get("session")
+    if not isinstance(named, str) or not named:
+        return Origin(notice="The poses file names no session file.")
+    wanted = poses.header.get("session_sha256")
+    found = [
+        (path, content)
+        for path in (Path(named), poses.path.parent / Path(named).name)
+        if (content := _bytes_of(path)) is not None
+    ]
+    if not found:
+        return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
+    for path, content in found:
+        if hashlib.sha256(content).hexdigest() == wanted:
+            text = content.decode("utf-8-sig", errors="replace")
+            try:
+                return Origin(named, path, text, session=load_session(path))
+            except SessionError as error:
+                return Origin(named, path, text, f"The session cannot be read again: {error}")
+    path, content = found[0]
+    notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
+    if isinstance(wanted, str):
+        notice = f"{path} has changed since the run: its SHA-256 is not the one in the poses file."
+    try:
+        load_session(path)
+    except SessionError:
+        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
+    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)
+
+
+def _bytes_of(path: Path) -> bytes | None:
+    try:
+        if path.is_file() and path.stat().st_size <= _LARGEST:
+            return path.read_bytes()
+    except OSError:
+        return None
+    return None

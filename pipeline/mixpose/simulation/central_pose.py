@@ -1,11 +1,13 @@
-"""Where a body is simulated if the session names no start: in view of its sensors.
+"""Where bodies are simulated if the session names no start: in view of its sensors.
 
 With several cameras that is where they look together; with one camera, in front of it where the
-body fills about a quarter of the image; among range sensors, beside their middle.
+body fills about a quarter of the image; among range sensors, beside their middle.  Bodies beside
+the first stand about that place, so far from each other that they touch by their motion at most.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +16,22 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse
+from mixpose.rigid import from_parts, inverse, rotation_matrix
 from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
-from mixpose.simulation.visible_spots import facing
+from mixpose.simulation.scenery import Actor, motion_pose
+from mixpose.simulation.visible_spots import brightness_levels, facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
 _SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob
 _ORIENTATIONS = 64
 _AMPLITUDE = 0.4  # of the body's radius
+_APART = 1.1  # sums of radii between bodies at rest
+_TRIES = 48  # places at each distance
+_DISTANCES = (1.2, 1.6, 2.2, 3.0, 4.0)  # radii of the largest
+_SEEDS_APART = 101  # between the motions of bodies
 
 
 def central_pose(session: Session, seed: int) -> Floats:
@@ -163,3 +170,92 @@ def _beside_ranges(session: Session) -> Floats:
     aside = max(spread / 2, nearest + 5 * session.body.radius)
     _, _, axes = np.linalg.svd(centred, full_matrices=True)
     return np.asarray(positions.mean(axis=0) + aside * axes[2])
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A body beside the first one of a session."""
+
+    name: str
+    instance: int | None
+    body: Body
+    motion: Motion
+    actor: Actor
+
+
+def plan_companions(
+    session: Session, first: Motion, options: SimulationOptions
+) -> tuple[Companion, ...]:
+    """Place and move the bodies beside the first.
+
+    A `SessionError` if there are some, and a sensor is no camera, or no place is left in view.
+    """
+    members = [(one, i) for one in session.objects for i in one.instances][1:]
+    if not members:
+        return ()
+    if any(setup.sensor.dimension != 2 for setup in session.sensors):
+        raise SessionError(
+            f"{session.path}: object: found {len(members) + 1} bodies before sensors of ranges; "
+            "simulate draws several bodies before cameras only"
+        )
+    placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
+    companions = []
+    for k, (one, instance) in enumerate(members, start=1):
+        own = session.alone(one.body.name)
+        seed = options.seed + _SEEDS_APART * k
+        is_at_start = one.start is not None and not instance
+        T = central_pose(own, seed)
+        if not is_at_start:
+            T = _aside(own, T, placed, seed, turned=one.start is not None)
+        placed.append((_middle(T, one.body), one.body.radius))
+        motion = swinging(own, T, options, seed)
+        rng = generator(seed, Purpose.BRIGHTNESS)
+        levels = brightness_levels(len(one.body), options.brightness_spread, rng)
+        actor = Actor(one.body, motion_pose(motion), levels, is_body=True)
+        companions.append(Companion(one.body.name, instance, one.body, motion, actor))
+    return tuple(companions)
+
+
+def _middle(T_world_object: Floats, body: Body) -> Floats:
+    return np.asarray(T_world_object[:3, :3] @ pivot_of(body) + T_world_object[:3, 3])
+
+
+def _aside(
+    session: Session,
+    T: Floats,
+    placed: Sequence[tuple[Floats, float]],
+    seed: int,
+    *,
+    turned: bool,
+) -> Floats:
+    """A pose apart from all that are placed, as near as can be where most features are seen."""
+    body = session.body
+    rng = generator(seed, Purpose.ORIENTATION)
+    largest = max([body.radius, *(radius for _, radius in placed)])
+    for distance in _DISTANCES:
+        best: tuple[int, Floats] | None = None
+        for _ in range(_TRIES):
+            direction = rng.standard_normal(3)
+            shift = distance * largest * direction / np.linalg.norm(direction)
+            middle = placed[0][0] + shift
+            R = rotation_matrix(rng.standard_normal(3)) @ T[:3, :3] if turned else T[:3, :3]
+            if any(
+                np.linalg.norm(middle - other) < _APART * (body.radius + radius)
+                for other, radius in placed
+            ):
+                continue
+            there = from_parts(R, middle - R @ pivot_of(body))
+            seen = count_seen(session, there)
+            if best is None or seen > best[0]:
+                best = seen, there
+        if best is not None and best[0] == len(body) * len(session.sensors):
+            return best[1]
+    raise SessionError(
+        f"{session.path}: object {body.name!r}: found no place apart from the other bodies in view "
+        "of all cameras; give it an [object.start]"
+    )
+
+
+def moved(companions: Sequence[Companion], seconds: float, decimals: int) -> list[Floats]:
+    """Where they are at a moment."""
+    return [np.round(one.motion.poses(np.array(seconds)), decimals) + 0.0 for one in companions]

@@ -16,9 +16,14 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import central_pose, swinging
+from mixpose.simulation.central_pose import (
+    Companion,
+    central_pose,
+    moved,
+    plan_companions,
+    swinging,
+)
 from mixpose.simulation.channels import Channel, check_setup, plan_channel
-from mixpose.simulation.companions import Companion, moved, plan_companions
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator

@@ -17,8 +17,7 @@ from scipy.special import erf
 
 from mixpose.records import Floats
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.outlines import coverage
-from mixpose.simulation.visible_spots import VisibleSpots
+from mixpose.simulation.visible_spots import VisibleSpots, coverage
 
 _REACH = 5.0  # standard deviations up to which a spot is drawn: the rest is below 1e-6 of it
 _WHITE = 255.0
