@@ -187,7 +187,16 @@ class _Scene:
         if line.covariance is None:
             self._log(places[1], rr.Clear(recursive=False))
         else:
-            self._log(places[1], _ellipsoid(T[:3, 3], line.covariance, colour))
+            # where the position is with 95 %
+            half_axes, axes = rigid.position_ellipsoid_95(line.covariance)
+            turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
+            ellipsoid = rr.Ellipsoids3D(
+                half_sizes=[half_axes],
+                centers=[T[:3, 3]],
+                quaternions=[rr.Quaternion(xyzw=turn)],
+                colors=[colour],
+            )
+            self._log(places[1], ellipsoid)
         world = rigid.transform(T, body.means)
         for setup, place in zip(self.session.sensors, predicted, strict=True):
             if setup.sensor.dimension == 2:
@@ -198,18 +207,6 @@ class _Scene:
 
 def _transform(T_parent_child: Floats) -> Any:
     return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
-
-
-def _ellipsoid(centre: Floats, covariance: Floats, colour: tuple[int, int, int]) -> Any:
-    """Where the position is with 95 %; `covariance` is (6, 6)."""
-    half_axes, axes = rigid.position_ellipsoid_95(covariance)
-    turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
-    return rr.Ellipsoids3D(
-        half_sizes=[half_axes],
-        centers=[centre],
-        quaternions=[rr.Quaternion(xyzw=turn)],
-        colors=[colour],
-    )
 
 
 def _eight_bits(image: Image) -> NDArray[np.uint8]:

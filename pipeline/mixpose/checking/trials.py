@@ -65,11 +65,6 @@ class _Runner:
         seen, guesses = self.change.views(views), DiagnosisRules().guesses
         self.poses.append(best_pose(session, body, number, seen, guesses))
 
-    def is_ahead(self, rules: DiagnosisRules) -> bool:
-        """Whether it explains the last frame that it tried."""
-        last = self.poses[-1] if self.poses else None
-        return last is not None and is_explained(last, rules)
-
     def gain(self, before: Explained) -> float:
         """Nats by which it explains the frames that it tried better."""
         return sum(evidence_of(a) - evidence_of(b) for a, b in zip(self.poses, before.poses))
@@ -162,7 +157,9 @@ def _without_values(
             if is_late() and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
             runner.advance(session)
-        if k == 0 and not is_late() and not any(r.is_ahead(rules) for r in runners):
+        firsts = [runner.poses[-1] for runner in runners if runner.poses]
+        is_ahead = any(pose is not None and is_explained(pose, rules) for pose in firsts)
+        if k == 0 and not is_late() and not is_ahead:
             sizes = [_Runner(change, frames) for change in other_sizes(session, frames[:2])]
             for runner in sizes:
                 runner.advance(session)
@@ -325,13 +322,13 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
             [view for view in now if view.name != name] + [v for v in after if v.name == name]
             for (_, now), (_, after) in pairwise(frames)
         ]
-        if all(_explains(anywhere(session), n, views) for n, views in zip(numbers, given)):
+        if all(_is_ok(session, n, views) for n, views in zip(numbers, given)):
             return f"{name!r} is a frame late: with each of its frames given to the one before"
     return None
 
 
-def _explains(session: Session, number: int, views: Views) -> bool:
-    tracker, track = begin(session)
+def _is_ok(session: Session, number: int, views: Views) -> bool:
+    tracker, track = begin(anywhere(session))
     with np.errstate(all="ignore"):
         _, estimate = tracker.advance(track, number, None, views)
     shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]

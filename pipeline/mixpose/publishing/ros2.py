@@ -189,7 +189,14 @@ class RosbridgeSender:
         """Publish the pose of one body and its transform."""
         for each in ros_messages(message, self._topics):
             self._say({"op": "publish", "topic": each.topic, "msg": each.fields})
-        self._heed()
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        assert self._connection is not None
+        with suppress(TimeoutError, ConnectionClosed):
+            # the bridge says something only where it refuses
+            answer = json.loads(self._connection.recv(timeout=0))
+            if answer.get("op") == "status" and answer.get("level") == "error":
+                raise ConnectionError(f"the rosbridge refuses: {answer.get('msg')}")
         return True
 
     def close(self) -> None:
@@ -212,13 +219,3 @@ class RosbridgeSender:
             raise ConnectionError("the rosbridge has gone") from error
         finally:
             self._is_sending = False
-
-    def _heed(self) -> None:
-        """Read what the bridge says; it says something only where it refuses."""
-        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
-
-        assert self._connection is not None
-        with suppress(TimeoutError, ConnectionClosed):
-            answer = json.loads(self._connection.recv(timeout=0))
-            if answer.get("op") == "status" and answer.get("level") == "error":
-                raise ConnectionError(f"the rosbridge refuses: {answer.get('msg')}")

@@ -87,7 +87,8 @@ def _content(
 ) -> dict[str, Any]:
     """What is said once, and the parts of the page about each body."""
     labels = list(dict.fromkeys(line.label for line in poses.poses))
-    origin, swaps = find_session(poses), None
+    origin, swaps, named = find_session(poses), None, poses.header.get("session")
+    path = Path(named) if isinstance(named, str) and named else poses.path
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
     files = [poses]
@@ -103,7 +104,10 @@ def _content(
         parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
     return {
-        "name": _name(poses),
+        # the session's file with its folder, which says more than the file alone
+        "name": "/".join(
+            (Path(named) if isinstance(named, str) and named else poses.path).parts[-2:]
+        ),
         "truth": truth,
         "facts": _facts(poses, labels),
         "notices": contents[0]["notices"] if len(files) == 1 else [],
@@ -156,13 +160,6 @@ def _body_content(
         "overlays": overlays,
         "overlay_notices": overlay_notices,
     }
-
-
-def _name(poses: PoseFile) -> str:
-    """The session's file with its folder, which says more than the file alone."""
-    named = poses.header.get("session")
-    path = Path(named) if isinstance(named, str) and named else poses.path
-    return "/".join(path.parts[-2:])
 
 
 def _facts(poses: PoseFile, labels: Sequence[str]) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCam
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
-from mixpose.simulation.scenery import Actor, motion_pose
+from mixpose.simulation.scenery import Actor
 from mixpose.simulation.visible_spots import brightness_levels, facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
@@ -172,20 +172,9 @@ def _beside_ranges(session: Session) -> Floats:
     return np.asarray(positions.mean(axis=0) + aside * axes[2])
 
 
-@dataclass(frozen=True)
-class Companion:
-    """A body beside the first one of a session."""
-
-    name: str
-    instance: int | None
-    body: Body
-    motion: Motion
-    actor: Actor
-
-
 def plan_companions(
     session: Session, first: Motion, options: SimulationOptions
-) -> tuple[Companion, ...]:
+) -> tuple[Actor, ...]:
     """Place and move the bodies beside the first.
 
     A `SessionError` if there are some, and a sensor is no camera, or no place is left in view.
@@ -211,8 +200,7 @@ def plan_companions(
         motion = swinging(own, T, options, seed)
         rng = generator(seed, Purpose.BRIGHTNESS)
         levels = brightness_levels(len(one.body), options.brightness_spread, rng)
-        actor = Actor(one.body, motion_pose(motion), levels, is_body=True)
-        companions.append(Companion(one.body.name, instance, one.body, motion, actor))
+        companions.append(Actor(one.body, motion.pose, levels, is_body=True))
     return tuple(companions)
 
 
@@ -254,8 +242,3 @@ def _aside(
         f"{session.path}: object {body.name!r}: found no place apart from the other bodies in view "
         "of all cameras; give it an [object.start]"
     )
-
-
-def moved(companions: Sequence[Companion], seconds: float, decimals: int) -> list[Floats]:
-    """Where they are at a moment."""
-    return [np.round(one.motion.poses(np.array(seconds)), decimals) + 0.0 for one in companions]

@@ -60,6 +60,10 @@ class Motion:
         pivot_world = R_centre @ self.pivot + t_centre + self.shift.at(times_s)
         return from_parts(R, pivot_world - R @ self.pivot)
 
+    def pose(self, time_s: float) -> Floats:
+        """The pose (4, 4) at a time."""
+        return self.poses(np.array(time_s))
+
     @property
     def reach(self) -> float:
         """Farthest that the pivot gets from its central place."""

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import permutations
 from pathlib import Path, PurePosixPath
 from typing import Literal, TypeAlias
 
@@ -98,7 +99,13 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
                 f"{_where(one.sensor)}: counts frames from 0, while a list of images of another "
                 f"sensor has the numbers {numbers[0]} to {numbers[-1]}; use numbered images"
             )
-    _check_apart(files, numbers[0])
+    for one, other in permutations(files, 2):
+        name = one.name(numbers[0])
+        if other.reads(name):
+            raise SessionError(
+                f"{_where(other.sensor)}: would also read {name} of sensor {one.sensor!r}; give "
+                "each sensor files of its own"
+            )
     return numbers, files
 
 
@@ -159,17 +166,6 @@ def _source_files(
             "needs an even width and height, .avi and images do not"
         )
     return files
-
-
-def _check_apart(sources: Sequence[SourceFiles], number: int) -> None:
-    for one in sources:
-        for other in sources:
-            if one is not other and other.reads(one.name(number)):
-                raise SessionError(
-                    f"{_where(other.sensor)}: would also read "
-                    f"{one.name(number)} of sensor {one.sensor!r}; give each sensor files of its "
-                    "own"
-                )
 
 
 def _range_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:

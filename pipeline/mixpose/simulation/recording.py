@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,9 +17,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import (
-    Companion,
     central_pose,
-    moved,
     plan_companions,
     swinging,
 )
@@ -27,7 +25,7 @@ from mixpose.simulation.channels import Channel, check_setup, plan_channel
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
-from mixpose.simulation.scenery import motion_pose, plan_scenery
+from mixpose.simulation.scenery import Actor, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
 from mixpose.simulation.visible_spots import VisibleSpots, displacements, later, look
 from mixpose.simulation.writers import SensorWriter
@@ -50,7 +48,7 @@ class _Plan:
     fps: float
     motion: Motion
     channels: tuple[Channel, ...]
-    companions: tuple[Companion, ...] = ()
+    companions: tuple[Actor, ...] = ()
 
 
 def simulate(
@@ -97,8 +95,7 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
         scenery = plan_scenery(session.body, motion, cameras, options)
         companions = plan_companions(session, motion, options)
-        actors = (*(one.actor for one in companions), *scenery.actors)
-        scenery = replace(scenery, actors=actors)
+        scenery = replace(scenery, actors=(*companions, *scenery.actors))
         channels = tuple(
             plan_channel(
                 setup,
@@ -209,6 +206,9 @@ def _write_times(plan: _Plan, folder: Path) -> None:
 
 
 def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
+    # in the order of the session's bodies
+    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
+    paths = [plan.motion.pose, *(one.pose for one in plan.companions)]
     with ExitStack() as stack:
         writers = [stack.enter_context(closing(c.open(folder))) for c in plan.channels]
         truth = stack.enter_context((folder / TRUTH_NAME).open("w", encoding="ascii", newline="\n"))
@@ -216,10 +216,19 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
         for done, number in enumerate(plan.numbers, start=1):
             # the motion begins with the first frame, whatever its number
             moment = (number - plan.numbers[0]) / plan.fps
-            T = np.round(plan.motion.poses(np.array(moment)), _DECIMALS) + 0.0
-            if _record_frame(plan, writers, number, T, moment):
-                for pose in _poses(plan, number, T, moved(plan.companions, moment, _DECIMALS)):
-                    truth.write(_line(pose))
+            poses = [np.round(pose(moment), _DECIMALS) + 0.0 for pose in paths]
+            is_recorded = _record_frame(plan, writers, number, poses[0], moment)
+            for (name, instance), T in zip(names, poses, strict=True) if is_recorded else ():
+                pose_line = {
+                    "type": "pose",
+                    "frame": number,
+                    "time_s": round(number / plan.fps, 6),
+                    "object": name,
+                    **({} if instance is None else {"instance": instance}),
+                    "status": "ok",
+                    "T_world_object": T.tolist(),
+                }
+                truth.write(_line(pose_line))
             if progress is not None:
                 progress(done)
 
@@ -239,7 +248,7 @@ def _record_frame(
     if options.deform:
         rng = generator(options.seed, Purpose.DEFORMATION, number)
         offsets = displacements(body, T_world_object, rng)
-    recorded, pose = False, motion_pose(plan.motion)
+    recorded = False
     for i, (channel, writer) in enumerate(zip(plan.channels, writers)):
         chance = generator(options.seed, Purpose.MISSING, number, i).random()
         is_missing = chance < options.missing
@@ -253,7 +262,7 @@ def _record_frame(
             channel.options,
             rng,
             offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else later(pose, moment),
+            pose_after=None if channel.view.shutter.is_ideal else later(plan.motion.pose, moment),
             time_s=moment,
             is_away=is_away,
         )
@@ -275,23 +284,6 @@ def _header(plan: _Plan) -> dict[str, Any]:
         "seed": plan.options.seed,
         "simulation": asdict(plan.options),
     }
-
-
-def _poses(
-    plan: _Plan, number: int, T_first: Floats, others: Sequence[Floats]
-) -> Iterator[dict[str, Any]]:
-    """The lines of a frame, in the order of the session's bodies."""
-    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
-    for (name, instance), T in zip(names, [T_first, *others], strict=True):
-        yield {
-            "type": "pose",
-            "frame": number,
-            "time_s": round(number / plan.fps, 6),
-            "object": name,
-            **({} if instance is None else {"instance": instance}),
-            "status": "ok",
-            "T_world_object": T.tolist(),
-        }
 
 
 def _line(values: dict[str, Any]) -> str:

@@ -99,15 +99,10 @@ def plan_scenery(
         mirror[:3, :3] -= 2 * np.outer(down, down)
         mirror[:3, 3] = 2 * (plane @ down) * down
         levels = np.full(len(body), options.mirror)
-        images = [Actor(body, motion_pose(motion), levels, mirror, is_image=True)]
+        images = [Actor(body, motion.pose, levels, mirror, is_image=True)]
         images += [Actor(o.body, o.pose, options.mirror * o.levels, mirror) for o in others]
     arms = tuple(stage.arm() for _ in range(options.occluder))
     return Scenery((*lamps, *others, *images), arms)
-
-
-def motion_pose(motion: Motion) -> PoseAt:
-    """The pose of a motion at a time."""
-    return lambda time_s: motion.poses(np.array(time_s))
 
 
 def _unit(vector: Floats) -> Floats:
@@ -161,7 +156,7 @@ class _Stage:
             period_s=options.period_s,
             seed=options.seed + 7919 * (index + 1),
         )
-        return Actor(other, motion_pose(motion), np.ones(count))
+        return Actor(other, motion.pose, np.ones(count))
 
     def arm(self) -> Arm:
         """A bar across the view that swings over the body and beside it."""

@@ -7,7 +7,6 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.errors import SessionError
 from mixpose.simulation.naming import SourceFiles
@@ -155,7 +154,11 @@ class DetectionWriter:
     ) -> None:
         """Append the detections of one frame."""
         noise = self._noise * rng.standard_normal(visible.points.shape)
-        shown = ~np.array([_is_covered(point, visible) for point in visible.points], dtype=bool)
+        shown = np.ones(len(noise), dtype=bool)
+        for cover in visible.covers:  # of something dark before cameras
+            corners = cover.astype(np.float32)
+            inside = [cv2.pointPolygonTest(corners, y.tolist(), False) for y in visible.points]
+            shown &= np.array(inside, dtype=float) < 0
         points, weights = (visible.points + noise)[shown], visible.levels[shown]
         if not len(points):
             points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
@@ -166,10 +169,3 @@ class DetectionWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-
-def _is_covered(point: NDArray[np.float64], visible: VisibleSpots) -> bool:
-    """Whether something dark stands before a spot."""
-    u, v = (float(x) for x in point) if len(point) == 2 else (0.0, 0.0)
-    corners = [cover.astype(np.float32) for cover in visible.covers]
-    return any(cv2.pointPolygonTest(one, (u, v), False) >= 0 for one in corners)
