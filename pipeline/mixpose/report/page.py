@@ -104,10 +104,7 @@ def _content(
         parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
     return {
-        # the session's file with its folder, which says more than the file alone
-        "name": "/".join(
-            (Path(named) if isinstance(named, str) and named else poses.path).parts[-2:]
-        ),
+        "name": "/".join(path.parts[-2:]),  # the folder says more than the file alone
         "truth": truth,
         "facts": _facts(poses, labels),
         "notices": contents[0]["notices"] if len(files) == 1 else [],
