@@ -60,11 +60,9 @@ def evidence_of(pose: ScoredPose | None) -> float:
 
 
 def rms_of(pose: ScoredPose, feature: int | None = None) -> float:
-    """Root mean square of the offsets of a pose, or of a feature there, in sigma; NaN of none.
-
-    A cut spot counts as far as it is exact.
-    """
+    """Root mean square offset of a pose, or of a feature there, in sigma; NaN of none."""
     matches, noise = pose.matches, NOISE_OF_SIGMA**2
+    # a cut spot counts as far as it is exact
     shares = (matches.shares * (noise / (noise + matches.extra)))[:, _columns(feature)]
     total = float(shares.sum())
     squares = float((shares * matches.squared[:, _columns(feature)]).sum())

@@ -47,10 +47,7 @@ class Doubts:
 def geometry_doubts(
     session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
 ) -> Doubts:
-    """What of a session is most likely wrong, by a few frames of its recording.
-
-    Nothing is said of several bodies, and of streams, which are read once.
-    """
+    """What of a session of one body, and not of streams, is most likely wrong, by a few frames."""
     streams = any(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()

@@ -146,10 +146,7 @@ def _without_values(
     others: Sequence[tuple[Change, Frames]],
     is_late: Callable[[], bool],
 ) -> Iterator[Tried]:
-    """Changes that explain frames better than they are: a race, frame by frame.
-
-    All changes try the first frame; those that gain far less than the best drop out after each.
-    """
+    """Changes that explain frames better: a race in which those far behind the best drop out."""
     rules, runners = DiagnosisRules(), [_Runner(*each) for each in others]
     runners += [_Runner(change, frames) for change in changes(session)]
     for k in range(len(frames)):

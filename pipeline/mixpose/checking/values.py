@@ -86,10 +86,7 @@ class Adjustment:
 
 
 def promise(unknown: Unknown, given: Adjustment) -> float:
-    """Nats that values are likely to gain, by one step of least squares.
-
-    What is far off may be of clutter and gains no more than what is outlying, wherever it is moved.
-    """
+    """Nats that values are likely to gain, by one step of least squares."""
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
@@ -98,6 +95,7 @@ def promise(unknown: Unknown, given: Adjustment) -> float:
     for f in range(F):
         own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
         r, J = _linearised(unknown, given, f, given.poses[f], np.zeros(k), scales[own])
+        # what is far off may be of clutter, and gains no more than what is outlying
         gain += float((_loss(r) - _loss(r + J @ step[own])).sum())
     return gain
 

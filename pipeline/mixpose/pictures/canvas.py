@@ -150,10 +150,7 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
 
 
 def displayable(image: NDArray[Any]) -> Picture:
-    """A grey image (H, W), finite, of any type as a picture, brightened where most of it is dark.
-
-    Its contrast is stretched; blue, green and red are alike.
-    """
+    """A grey image (H, W) of any type with its contrast stretched, brightened where it is dark."""
     low, high, exponent = _stretch(image)
 
     def curve(values: NDArray[Any]) -> NDArray[np.uint8]:

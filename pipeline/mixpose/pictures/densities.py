@@ -7,9 +7,8 @@ scale, which a bar below states: it is logarithmic, as a peak falls with the squ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeAlias
 
 import cv2
@@ -26,7 +25,6 @@ from mixpose.pictures.stages import fitted, shown_box, titled
 from mixpose.records import Floats
 
 Size: TypeAlias = tuple[int, int]
-Look: TypeAlias = Callable[[Floats], NDArray[Any]]
 
 _STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
 _SHOWN = 1e-3  # of the lowest peak: what is less is black
@@ -86,44 +84,40 @@ def panels_of(
     judged = list(sigmas) if is_matched else [view.observation.sigma]
     lower = np.array(part.corner) - 1.0
     shown = lower, lower + np.array(size) / part.zoom + 2.0
+    values: NDArray[Any]
     observed, twice = [], []
     for sigma in sigmas:
-        look: Look = view.observation.density(sigma, shown).sample  # exact sums on a grid
-        word = "g"
-        if not is_matched and T is not None:
+        places = _places(sigma, part, size)
+        if is_matched or T is None:
+            # exact sums on a grid
+            word, values = "g", view.observation.density(sigma, shown).sample(places)
+        else:
+            # as the objectives that draw samples have it: around these, and 0 elsewhere
             samples = body.sample(options.samples, seed=options.seed)
-            look = _sampled_g(view, samples, sigma, T)
-            word = "g sampled"
-        title = f"{word}, σ = {sigma:.3g} px"
-        observed.append(Panel(title, _on_picture(look, sigma, part, size)))
+            terms = sampled_terms([view], samples, [sigma], T)
+            word, values = "g sampled", np.zeros(places.shape[:-1])
+            if terms:
+                values = terms[0].density.sample(places)[..., 0]
+        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", _largest(values, size)))
     for sigma in judged:
-        look_up = matched_objective([view], body, [sigma]).atlas.look_up
-        look = partial(_first, look_up)
-        title = f"C = g ∗ ε, σ = {sigma:.3g} px"
-        twice.append(Panel(title, _on_picture(look, sigma, part, size)))
+        atlas = matched_objective([view], body, [sigma]).atlas
+        values = atlas.look_up(_places(sigma, part, size)[None])[0, ..., 0]
+        twice.append(Panel(f"C = g ∗ ε, σ = {sigma:.3g} px", _largest(values, size)))
     return [observed, twice]
 
 
-def _sampled_g(view: View, samples: Floats, sigma: float, T: Floats) -> Look:
-    """The same as the objectives that draw samples have it: around these, and 0 elsewhere."""
-    terms = sampled_terms([view], samples, [sigma], T)
-    if not terms:
-        return lambda places: np.zeros(places.shape[:-1])
-    return lambda places: terms[0].density.sample(places)[..., 0]
-
-
-def _first(look_up: Look, places: Floats) -> NDArray[Any]:
-    """The values of one sensor without their gradients."""
-    return np.asarray(look_up(places[None])[0, ..., 0])
-
-
-def _on_picture(look: Look, sigma: float, part: Part, size: Size) -> Floats:
-    """Values of a density on a picture (H, W): of each pixel the largest, lest peaks be missed."""
+def _places(sigma: float, part: Part, size: Size) -> Floats:
+    """Places (fine H, fine W, 2) of a picture at which a density is looked up."""
     fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
     u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    places = (pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner
-    blocks = np.asarray(look(places), dtype=np.float64).reshape(size[1], fine, size[0], fine)
+    return np.asarray((pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner)
+
+
+def _largest(values: NDArray[Any], size: Size) -> Floats:
+    """Of each pixel of a picture (H, W) the largest of its values, lest peaks be missed."""
+    fine = len(values) // size[1]
+    blocks = np.asarray(values, dtype=np.float64).reshape(size[1], fine, size[0], fine)
     return np.asarray(np.maximum(blocks.max(axis=(1, 3)), 0.0))
 
 

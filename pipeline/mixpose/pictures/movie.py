@@ -136,7 +136,15 @@ class VideoSink:
         self._writer = None
         try:
             sign_video(self._part)
-            self._see_that_it_is_whole()
+            # FFmpeg does not tell when a disk is full
+            written = cv2.VideoCapture(str(self._part))
+            count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+            written.release()
+            if count < self._count - 1:  # containers that only estimate it may be one off
+                raise SessionError(
+                    f"--overlay {self._path}: {count} of {self._count} frames could be written: "
+                    "is the disk full?"
+                )
             self._part.replace(self._path)
         except OSError as error:
             raise SessionError(
@@ -144,17 +152,6 @@ class VideoSink:
             ) from error
         finally:
             self._part.unlink(missing_ok=True)
-
-    def _see_that_it_is_whole(self) -> None:
-        """FFmpeg does not tell when a disk is full."""
-        written = cv2.VideoCapture(str(self._part))
-        count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
-        written.release()
-        if count < self._count - 1:  # containers that only estimate it may be one off
-            raise SessionError(
-                f"--overlay {self._path}: {count} of {self._count} frames could be written: is "
-                "the disk full?"
-            )
 
     def _open(self, fps: float) -> None:
         if self._first is None:

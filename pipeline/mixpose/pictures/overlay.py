@@ -113,10 +113,7 @@ def draw_pose(
 def projected_features(
     sensor: Sensor, body: Body, T_world_object: Floats
 ) -> tuple[Floats, Mask, Mask]:
-    """Where a sensor has the features of a body.
-
-    Their places (N, m), whether it can measure there (N,), and whether they also face it (N,).
-    """
+    """Places (N, m) of features, which of them can be measured, and which are faced as well."""
     points = transform(T_world_object, body.means)
     y, inside = sensor.project(points)
     return y, inside, inside & facing(sensor, T_world_object, points, body.normals)

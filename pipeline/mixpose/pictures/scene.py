@@ -160,11 +160,7 @@ def draw_camera(
     *,
     named: bool = True,
 ) -> Picture:
-    """Draw the bodies of a moment on a camera's frame, as of `backdrop`.
-
-    Of several each has a colour of its own.  Features `found` (M, 2), in pixels of the sensor, are
-    marked too; those of bodies are `named`.
-    """
+    """Draw the bodies of a moment, and features `found` (M, 2), on a frame of `backdrop`."""
     picture = _draw_bodies(posed, setup, picture, part, found, named=named)
     first = posed[0][1]
     if len(posed) == 1:

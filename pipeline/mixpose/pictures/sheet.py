@@ -91,10 +91,7 @@ def prefixes_of(labels: Sequence[str]) -> list[str]:
 
 
 def fitted_blurs(views: Sequence[View], estimate: Estimate) -> dict[str, list[float]]:
-    """Blurs that a pose was fitted by, in their order, by sensor.
-
-    Where it was not fitted to this frame, or a sensor was left out, σ_ε, by which it is judged.
-    """
+    """Blurs by sensor that a pose was fitted by, in their order; σ_ε of one that it was not."""
     levels = estimate.blurs or ({},)
     return {
         view.name: [level.get(view.name, view.observation.sigma) for level in levels]

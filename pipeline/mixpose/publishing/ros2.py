@@ -57,10 +57,7 @@ class RosMessage(NamedTuple):
 
 
 def topics(address: Address, header: Header) -> Topics:
-    """``ros2://topic`` is the topic of a body; of several, each has its own below that.
-
-    A `SessionError` if the address names no topic.
-    """
+    """Topics by ``ros2://topic``, of several bodies one each below it, or a `SessionError`."""
     names = address.name.split("/")
     if not all(part == path_word(part) and part for part in names):
         raise address.error(

@@ -57,11 +57,7 @@ class OverlayFrame:
 def overlay_frames(
     session: Session, poses: PoseFile, series: Series, errors: Errors | None
 ) -> tuple[list[OverlayFrame], list[str]]:
-    """Read a few frames again and draw their poses.
-
-    The frames are ascending, and none where no camera's recording can be read; beside them stands
-    what could not be read, a sentence each.
-    """
+    """A few frames, ascending, with their poses on them, and sentences on what is not read."""
     setups, opened, notices = _open(session)
     chosen = chosen_frames(series, errors)
     lines = {line.frame: line for line in poses.poses}

@@ -134,10 +134,7 @@ def turns_deg(T: Floats, T_reference: Floats) -> Floats:
 
 
 def jumps_of_turns(turn_deg: Floats) -> Flags:
-    """Before which frames (n,) rotation vectors (n, 3) pass half a turn.
-
-    They come in again on the other side, by a whole turn, in all of their components at once.
-    """
+    """Before which frames (n,) rotation vectors (n, 3) pass half a turn, all components at once."""
     with np.errstate(invalid="ignore"):
         far = np.linalg.norm(np.diff(turn_deg, axis=0), axis=1) > _HALF_TURN_DEG
     return np.concatenate([np.zeros(min(len(turn_deg), 1), dtype=bool), far])

@@ -114,14 +114,11 @@ def places(session: Session) -> list[Floats]:
 
 @dataclass(frozen=True)
 class _Ray:
-    """The line of sight through the middle of a camera's image.
-
-    `distance` is where the body fills its share of the image; None for a parallel beam, where it
-    does so everywhere or nowhere.
-    """
+    """The line of sight through the middle of a camera's image."""
 
     origin: Floats
     direction: Floats
+    # where the body fills its share of the image; None: nowhere or everywhere
     distance: float | None
 
     def suits(self, place: Floats) -> bool:
@@ -175,10 +172,7 @@ def _beside_ranges(session: Session) -> Floats:
 def plan_companions(
     session: Session, first: Motion, options: SimulationOptions
 ) -> tuple[Actor, ...]:
-    """Place and move the bodies beside the first.
-
-    A `SessionError` if there are some, and a sensor is no camera, or no place is left in view.
-    """
+    """Place and move the bodies beside the first; a `SessionError` where that cannot be done."""
     members = [(one, i) for one in session.objects for i in one.instances][1:]
     if not members:
         return ()

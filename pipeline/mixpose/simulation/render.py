@@ -135,10 +135,7 @@ def render_profile(
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """The profile (bins,) that a range sensor records of spots in length units.
-
-    It is 1 at the peak of a mean feature; never below 0, as amplitudes are not.
-    """
+    """The profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
     profile = np.zeros(form.bins)
     places = (visible.points[:, 0] - form.range_min) / form.bin_size
     draw_profile(profile, places, visible.levels, form.width / form.bin_size)

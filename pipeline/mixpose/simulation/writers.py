@@ -137,10 +137,7 @@ class ProfileWriter:
 
 
 class DetectionWriter:
-    """A row per detection, in no particular order within a frame.
-
-    A frame without detections has one row of weight 0, which says that the sensor looked.
-    """
+    """A row per detection, in no order, or one of weight 0: the sensor looked, and saw none."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]

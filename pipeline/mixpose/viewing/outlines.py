@@ -61,7 +61,7 @@ def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
 
 
 def up_of(session: Session) -> Floats:
-    """The world's direction (3,) that is up in the images, or nearly: an axis; else z."""
+    """The world's direction (3,) that is up in the images: an axis where one nearly is; else z."""
     ups = [
         -setup.sensor.T_sensor_world[1, :3]
         for setup in session.sensors

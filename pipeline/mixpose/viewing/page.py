@@ -143,12 +143,17 @@ def status_text(moment: Moment, *, ended: bool = False) -> str:
     """What the page says about a frame, as HTML; names of the session are only ever words in it."""
     first = moment.estimates[0]
     when = "" if first.time_s is None else f", {first.time_s:.3f} s"
-    counts = ", ".join(
-        f"{moment.counts.get(status, 0)} {_coloured(status, status)}" for status in STATUS_COLOURS
-    )
+    counts = ", ".join(f"{moment.counts.get(s, 0)} {_coloured(s)}" for s in STATUS_COLOURS)
     speed = f"{moment.per_second:.3g} frames a second" if moment.per_second else "one at a time"
     speed = "done" if ended else speed
-    rows = "".join(_line(one) for one in moment.estimates)
+    rows = ""
+    for one in moment.estimates:
+        confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
+        doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
+        rows += (
+            f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status)}</td>"
+            f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
+        )
     return (
         f"<div style='padding: 0 0.8em; font-size: 0.9em'><b>frame {first.frame}</b>{when}"
         f"<br>{counts}<br>{speed}, {first.latency_ms:.3g} ms for this one"
@@ -157,18 +162,9 @@ def status_text(moment: Moment, *, ended: bool = False) -> str:
     )
 
 
-def _line(one: Estimate) -> str:
-    confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
-    doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
-    return (
-        f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status, one.status)}</td>"
-        f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
-    )
-
-
-def _coloured(status: Status, text: str) -> str:
+def _coloured(status: Status) -> str:
     blue, green, red = STATUS_COLOURS[status]
-    return f"<span style='color: rgb({red}, {green}, {blue})'>{text}</span>"
+    return f"<span style='color: rgb({red}, {green}, {blue})'>{status}</span>"
 
 
 class Series:

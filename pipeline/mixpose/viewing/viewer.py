@@ -147,10 +147,7 @@ class Viewer:
                 self._state.wait(_LOOK_S)
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Take one pose; the frame is shown with the last of its bodies, if the page asks for it.
-
-        On files this is where a run that is paused waits.
-        """
+        """Take one pose; with the last of a frame, show that if asked to, and wait if paused."""
         self._estimates.append(estimate)
         if len(self._estimates) < len(self._session.labels):
             return
