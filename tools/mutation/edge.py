@@ -245,7 +245,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-one-of-two-is-too-few",
-        "checking/advice.py",
+        "checking/keys.py",
         "if count < min(_FEW * least, least - 1):",
         "if count < _FEW * least:",
         "a single hidden feature of two is warned about",

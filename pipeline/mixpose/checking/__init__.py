@@ -1,16 +1,15 @@
 """What can be said of a session before its poses are estimated.
 
-`recordings` reads every frame and counts features in some, `advice` says which key to change where
-the count is off and the body is found with that change, `keys` doubts calibrations and widths, and
-finds bodies that could be taken for each other and recordings that are given twice, `placement`
-looks at where sensors stand and the body starts, `lookalikes` finds poses that the sensors could
-not tell apart. `geometry` takes a few frames all over the recording, and `trials` tries what else
-the session could have said: `changes` of it as a whole, and `values` that are adjusted to what
-sensors met (`meetings`); `evidence` says how well frames are explained, `rules` when a change is
-told.
+`recordings` reads every frame and counts features in some, `keys` says which key to change where
+the count is off and the body is found with that change, doubts calibrations and widths, and finds
+bodies that could be taken for each other and recordings that are given twice, `placement` looks at
+where sensors stand and the body starts, `lookalikes` finds poses that the sensors could not tell
+apart. `geometry` takes a few frames all over the recording, and `trials` tries what else the
+session could have said: `changes` of it as a whole, and `values` that are adjusted to what sensors
+met (`meetings`); `evidence` says how well frames are explained, `rules` when a change is told.
 """
 
-from mixpose.checking.advice import advice as advice, judge as judge, told_apart as told_apart
+from mixpose.checking.keys import advice as advice, judge as judge, told_apart as told_apart
 from mixpose.checking.geometry import (
     CAUSES as CAUSES,
     Doubts as Doubts,

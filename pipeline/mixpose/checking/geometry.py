@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking.advice import judge
 from mixpose.checking.changes import Change, of_units
 from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
+from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules

@@ -1,33 +1,45 @@
-"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib."""
+"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib.
+
+The objective is cut along each direction, and over pairs of directions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
-from mixpose.objective import View, matched_objective
+from mixpose.fit import EstimatorOptions, free_mask
+from mixpose.objective import View, build_objective, matched_objective, pose_jacobian
 from mixpose.pictures.canvas import Picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import ellipse_95
-from mixpose.pictures.ranges import half_widths_95
-from mixpose.pictures.slices import Map, Slice
+from mixpose.pictures.scene import half_widths_95
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
-from mixpose.rigid import TWIST_NAMES
+from mixpose.rigid import TWIST_NAMES, perturb, transform
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 _DPI = 100
 _MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"
 _AROUND = 0.6  # of the extent of the expected ranges, shown around them
 _LEAST_AROUND = 6.0  # in σ
 _PLACES = 600  # at which C is drawn
+_WIDE = 1.5  # widest blurs to either side of a slice
+_NARROW = 5.0  # finest blurs to either side of a map
+_LEAST_WIDE = 8.0  # finest blurs to either side of a slice
+_POINTS = 241  # of a slice
+_SIDE = 41  # points along a side of a map
+_MAPS = 3
+_BATCH = 512  # poses that are projected at once
+_SAMPLES = 200  # per feature: enough to look at
 
 
 def require_matplotlib() -> None:
@@ -225,3 +237,93 @@ def _raster(figure: Figure) -> Picture:
     canvas.draw()
     rgba = np.asarray(canvas.buffer_rgba())
     return np.ascontiguousarray(rgba[..., 2::-1], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The objective along one direction."""
+
+    direction: int  # of `mixpose.rigid.TWIST_NAMES`
+    offsets: Floats  # (n,) lengths or radians from the pose
+    values: Floats  # (levels, n) per level of blur, the largest of each level 1
+
+
+@dataclass(frozen=True)
+class Map:
+    """The objective at the finest blur over two directions."""
+
+    directions: tuple[int, int]  # across and up
+    offsets: tuple[Floats, Floats]  # (n,), (n,)
+    values: Floats  # (n, n), rows along the second direction; the largest is 1
+
+
+def objective_around(
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    covariance: Floats | None,
+    options: EstimatorOptions,
+    levels: Sequence[Sequence[float]],
+) -> tuple[list[Slice], list[Map]]:
+    """Cut the objective along every free direction, and over the pairs that depend most.
+
+    There is at least one view, and none with an empty observation. Pairs are chosen by their
+    correlation in the covariance (6, 6); without it they are the first. `levels` are the blurs per
+    level and view, coarse to fine.
+    """
+    free = np.flatnonzero(free_mask(options)).tolist()
+    unit = _one_blur(views, body, T_world_object, levels[-1])
+    widest = max(w / f for w, f in zip(levels[0], levels[-1], strict=True))
+    wide = max(_LEAST_WIDE, _WIDE * widest)
+    samples = body.sample(min(options.samples, _SAMPLES), seed=options.seed)
+
+    def values(sigmas: Sequence[float], twists: Floats) -> Floats:
+        objective = build_objective(options.objective, views, body, samples, sigmas, T_world_object)
+        poses = perturb(T_world_object, twists)
+        parts = [objective.value(poses[k : k + _BATCH]) for k in range(0, len(poses), _BATCH)]
+        found = np.nan_to_num(np.concatenate(parts))
+        return np.asarray(found / max(float(found.max()), 1e-300))
+
+    slices = []
+    for k in free:
+        offsets = _half_width(wide * unit[k], k) * np.linspace(-1, 1, _POINTS)
+        twists = offsets[:, None] * np.eye(6)[k]
+        curves = np.array([values(sigmas, twists) for sigmas in levels])
+        slices.append(Slice(k, offsets, curves))
+    maps = []
+    for i, j in _pairs(free, covariance):
+        across, up = (_half_width(_NARROW * unit[k], k) * np.linspace(-1, 1, _SIDE) for k in (i, j))
+        grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+        surface = values(levels[-1], grid @ np.eye(6)[[i, j]])
+        maps.append(Map((i, j), (across, up), surface.reshape(_SIDE, _SIDE)))
+    return slices, maps
+
+
+def _half_width(offset: float, direction: int) -> float:
+    """An offset, but for turns half a turn at most."""
+    return min(offset, np.pi) if direction >= 3 else offset
+
+
+def _one_blur(
+    views: Sequence[View], body: Body, T_world_object: Floats, sigmas: Sequence[float]
+) -> Floats:
+    """By how much each direction moves the features by one finest blur, in the keenest sensor."""
+    points = body.nodes.points
+    keenest = np.zeros(6)
+    for view, sigma in zip(views, sigmas, strict=True):
+        _, by_world, seen = view.sensor.linearise(transform(T_world_object, points))
+        if seen.any():
+            J = pose_jacobian(by_world, points @ T_world_object[:3, :3].T)[seen] / sigma
+            keenest = np.maximum(keenest, (J**2).sum(axis=1).mean(axis=0))
+    usual = np.repeat([0.02 * body.radius, np.radians(1.0)], 3)
+    return np.where(keenest > 0, 1 / np.sqrt(np.maximum(keenest, 1e-300)), usual)
+
+
+def _pairs(free: Sequence[int], covariance: Floats | None) -> list[tuple[int, int]]:
+    """The pairs of directions that depend on each other most."""
+    pairs = list(combinations(free, 2))
+    if covariance is not None and np.isfinite(covariance).all():
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        related = np.abs(covariance / deviations / deviations[:, None])
+        pairs.sort(key=lambda pair: -related[pair])
+    return pairs[:_MAPS]

@@ -10,12 +10,15 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
-from mixpose.pictures.densities import densities_picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
-from mixpose.pictures.plots import objective_picture, ranges_picture
-from mixpose.pictures.slices import objective_around
-from mixpose.pictures.stages import features_picture, pose_picture, threshold_picture
+from mixpose.pictures.plots import objective_around, objective_picture, ranges_picture
+from mixpose.pictures.stages import (
+    densities_picture,
+    features_picture,
+    pose_picture,
+    threshold_picture,
+)
 from mixpose.records import Estimate
 from mixpose.session import Session
 

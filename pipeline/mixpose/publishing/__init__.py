@@ -3,5 +3,5 @@
 A new protocol is one file with its `Sender` and one line in `mixpose.publishing.message`.
 """
 
-from mixpose.publishing.publishing import Publishing as Publishing
+from mixpose.publishing.channel import Publishing as Publishing
 from mixpose.publishing.message import SENDERS as SENDERS

@@ -1,20 +1,26 @@
-"""One receiver, served in a thread of its own: whatever it does, the run goes on."""
+"""All receivers of a run, each served in a thread of its own: whatever they do, the run goes on."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.constants import constant
-from mixpose.publishing.address import Address
-from mixpose.publishing.message import Message, Sender
+from mixpose.poses.header import Header
+from mixpose.poses.plain import require_finite
+from mixpose.publishing.address import Address, parse
+from mixpose.publishing.message import SENDERS, Message, Sender, sender_for
+from mixpose.records import Estimate, FrameSet
 
 _REMEMBERED = 10_000  # latencies: a live source may run for days
+
+Foresee = Callable[[Estimate], Estimate]
+"""Makes of an estimate the one that is foretold."""
 
 
 @dataclass(frozen=True)
@@ -175,3 +181,55 @@ class Channel:
                 f"warning: --publish {self._address.text}: the receiver is away: {reason}; the run "
                 "goes on, and tries to reach it"
             )
+
+
+class Publishing:
+    """Publishes estimates to receivers, which neither slow a run nor end it.
+
+    It tells people lines. Of bodies by whose label there is something to `foresee` by, what that
+    makes of an estimate is published, `ahead_s` later. A `SessionError` if an address is wrong, its
+    package is not installed, or it cannot be listened at.
+    """
+
+    def __init__(
+        self,
+        urls: Sequence[str],
+        header: Header,
+        tell: Callable[[str], None],
+        foresee: Mapping[str, Foresee] | None = None,
+        ahead_s: float = 0.0,
+        rules: PublishingRules = PublishingRules(),
+    ) -> None:
+        self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
+        addresses = [parse(url, SENDERS) for url in urls]
+        self._channels = [
+            Channel(each, sender_for(each, header), tell, rules) for each in addresses
+        ]
+
+    def __enter__(self) -> Publishing:
+        for channel in self._channels:
+            channel.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for channel in self._channels:
+            channel.end()
+        closing = [threading.Thread(target=channel.close) for channel in self._channels]
+        for thread in closing:
+            thread.start()
+        for thread in closing:
+            thread.join()
+        for channel in self._channels:
+            self._tell(channel.text())
+
+    def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
+        """Publish an estimate; a `SessionError` where it is foretold, and has no time."""
+        require_finite(estimate)
+        # what tells its offsets holds all that the frame was made from
+        estimate = replace(estimate, measured=dict)
+        foresee = self._foresee.get(estimate.label)
+        if foresee is not None:
+            estimate = foresee(estimate)
+        message = Message(estimate, frame_set.moment, self._ahead_s if foresee else 0.0)
+        for channel in self._channels:
+            channel.put(message)

@@ -225,7 +225,7 @@ def brightness_levels(count: int, spread: float, rng: np.random.Generator) -> Fl
 
 
 def displacements(body: Body, T_world_object: Floats, rng: np.random.Generator) -> Floats:
-    """Displacements (N, 3) in the body's axes, drawn from its spread; gravity's also by its pose."""
+    """Displacements (N, 3) in the body's axes, drawn from its spread; gravity's by its pose."""
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
     pairs = zip(draws, body.features, strict=True)
     drawn = np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
