@@ -112,7 +112,7 @@ _SIMULATION = (
     ),
     Mutant(
         "simulation-weightless-frames-left-out",
-        "simulation/writers.py",
+        "simulation/render.py",
         "points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)",
         "points, weights = np.zeros((0, len(self._coordinates))), np.zeros(0)",
         "a frame without detections is missing from its table",
@@ -180,7 +180,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-displaced-images-are-not-met",
-        "checking/meetings.py",
+        "checking/evidence.py",
         "if _count(pairs) < _MISSED * expected:",
         "if _count(pairs) < 0:",
         "a camera with the principal point of another is not found out",

@@ -6,7 +6,7 @@ bodies that could be taken for each other and recordings that are given twice, `
 where sensors stand and the body starts, `lookalikes` finds poses that the sensors could not tell
 apart. `geometry` takes a few frames all over the recording, and `trials` tries what else the
 session could have said: `changes` of it as a whole, and `values` that are adjusted to what sensors
-met (`meetings`); `evidence` says how well frames are explained, `rules` when a change is told.
+met; `evidence` says what they met and how well frames are explained, `rules` when a change is told.
 """
 
 from mixpose.checking.keys import advice as advice, judge as judge, told_apart as told_apart

@@ -23,13 +23,14 @@ from mixpose.checking.evidence import (
     Frames,
     Views,
     anywhere,
+    beside,
     best_pose,
     evidence_of,
     is_explained,
     is_well_explained,
     pose_near,
+    seen_by,
 )
-from mixpose.checking.meetings import beside, seen_by
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
 from mixpose.judgement import ScoredPose

@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.body import PointFeature
 from mixpose.checking.changes import OTHER_SIZE, called
-from mixpose.checking.meetings import Seen
+from mixpose.checking.evidence import Seen
 from mixpose.records import Floats
 from mixpose.rigid import perturb
 from mixpose.sensors import PinholeCamera, Sensor

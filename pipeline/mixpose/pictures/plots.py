@@ -101,8 +101,7 @@ def objective_picture(
             label = "σ" if abs(level - 1) < 0.001 else f"{level:.2g} σ"
             axes.plot(_shown(one.offsets, one.direction), values, color=colour, label=label)
         axes.axvline(0, color="0.6", lw=0.8, ls=":")
-        axes.set_xlabel(_label(one.direction, unit))
-        axes.set_ylim(0, 1.05)
+        axes.set(xlabel=_label(one.direction, unit), ylim=(0, 1.05))
         axes.locator_params(axis="x", nbins=5)
         if k == 0:
             axes.set_ylabel("objective / its largest")
@@ -129,10 +128,8 @@ def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> Non
         axes.plot(_shown(closed[:, 0], i), _shown(closed[:, 1], j), color="white", lw=1.2)
         title += "; 95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
     axes.locator_params(nbins=7)
-    axes.set_xlim(across[0], across[-1])
-    axes.set_ylim(up[0], up[-1])
-    axes.set_xlabel(_label(i, unit))
-    axes.set_ylabel(_label(j, unit))
+    axes.set(xlim=across[[0, -1]], ylim=up[[0, -1]])
+    axes.set(xlabel=_label(i, unit), ylabel=_label(j, unit))
     axes.set_title(title, fontsize=9)
 
 
@@ -144,8 +141,7 @@ def _plot_ranges(
     if finding.points is not None:
         title = f"{finding.name}: {len(finding.points)} ranges"
     axes.set_title(title, fontsize=9, loc="left")
-    axes.set_yticks([])
-    axes.set_ylim(-0.03, 1.55)
+    axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
         return

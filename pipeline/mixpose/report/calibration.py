@@ -9,8 +9,7 @@ import numpy as np
 from mixpose.calibration import Calibration
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
-from mixpose.report.drawing import BARS, POSE, TRUTH, blank, drawn
-from mixpose.report.figures import Chart
+from mixpose.report.figures import BARS, POSE, TRUTH, Chart, blank, drawn
 from mixpose.report.page import page_templates
 
 MARK = '<meta name="generator" content="mixpose calibration'
@@ -47,16 +46,13 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
     if eye.dimension == 1:
         figure, axes = blank()
         axes.plot(sights.y[:, 0], sights.offset[:, 0], ".", markersize=2.5, **POSE)
-        axes.set_xlabel(f"range, {unit}")
-        axes.set_ylabel(f"residual, {unit}")
+        axes.set(xlabel=f"range, {unit}", ylabel=f"residual, {unit}")
     else:
         figure, axes = blank(height=3.2)
         low, high = sights.y.min(axis=0), sights.y.max(axis=0)
         if getattr(eye, "resolution", None) is not None:
             low, high = np.zeros(2), np.array(eye.resolution, dtype=float)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(high[1], low[1])
-        axes.set_aspect("equal")
+        axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
         width = float(np.ptp(axes.get_xlim()))
         scale = 3 * found.noise[index] / (_LONG * width)
         axes.quiver(
@@ -88,8 +84,7 @@ def _above(found: Calibration, unit: str) -> Chart:
     axes.plot(before[:, a], before[:, b], **{**TRUTH, "linestyle": "none", "marker": "x"})
     axes.plot(after[:, a], after[:, b], "o", markersize=5, fillstyle="none", **POSE)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{'xyz'[a]}, {unit}")
-    axes.set_ylabel(f"{'xyz'[b]}, {unit}")
+    axes.set(xlabel=f"{'xyz'[a]}, {unit}", ylabel=f"{'xyz'[b]}, {unit}")
     title = "Sensors before (crosses) and after (circles), and the body (dots)"
     return Chart(title, f"{len(after)} sensors, {len(body)} frames", drawn(figure))
 
@@ -100,8 +95,7 @@ def _residuals(found: Calibration, kind: str) -> Chart:
     figure, axes = blank()
     if kind == "frame":
         axes.plot(numbers, values, ".", markersize=4, **POSE)
-        axes.set_xlabel("frame")
-        axes.set_ylim(bottom=0)
+        axes.set(xlabel="frame", ylim=(0, None))
     else:
         labels = [found.after.labels[k] for k in numbers]
         numbers = numbers + 1

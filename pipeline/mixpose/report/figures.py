@@ -1,26 +1,201 @@
 """What the figures of a report show: each is one small SVG that takes on the page's colours.
 
-Words by people stay out of the figures (the page escapes them); figures hold only our own.
+Texts stay texts, and the colours of ink and rules are the page's own, so that a figure follows the
+reader's fonts and light or dark background.  Words by people stay out of the figures (the page
+escapes them); figures hold only our own.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.report import drawing
-from mixpose.report.drawing import BAND, BARS, POSE, TRUTH, TimeAxes
 from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
+# Legible on white and on near black alike.
+_BLUE, _ORANGE, _RED, _GREY = "#2f80d0", "#d9780f", "#dc4450", "#8a8f98"
+
+POSE: dict[str, Any] = {"color": _BLUE}
+BARS: dict[str, Any] = {"color": _BLUE}
+TRUTH: dict[str, Any] = {"color": _GREY, "linestyle": (0, (3, 1.5)), "linewidth": 1.1, "marker": ""}
+BAND: dict[str, Any] = {"color": _BLUE, "linewidth": 0.9, "markersize": 1.5}
+_AMBIGUOUS: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "D",
+    "markeredgewidth": 0,
+    "color": _ORANGE,
+    "zorder": 4,
+}
+
+# Stand-ins that `drawn` exchanges for the page's colours.
+_INK, _RULE = "#1a1b1c", "#c1c2c3"
+
+_WIDTH = 4.4  # inches; on the page a figure is 1 to 1.5 times as large
+_HEIGHT = 2.5
+_DOTS = 100  # frames; more of them are lines without dots
+_MANY = 250  # frames; more of them are drawn as pixels, lest the page grow
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mixpose",
+    "font.size": 9.5,
+    "axes.edgecolor": _RULE,
+    "axes.labelcolor": _INK,
+    "axes.titlecolor": _INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5),
+    "grid.color": _RULE,
+    "grid.linewidth": 0.4,
+    "text.color": _INK,
+    "xtick.color": _RULE,
+    "ytick.color": _RULE,
+    "xtick.labelcolor": _INK,
+    "ytick.labelcolor": _INK,
+}
 AXES = ("x", "y", "z")
 _BINS = 40
+
+
+def blank(height: float = _HEIGHT) -> tuple[Figure, Axes]:
+    """An empty figure with one pair of axes; `height` in inches."""
+    figure, axes = _figure(height, (1.0,))
+    return figure, axes[0]
+
+
+def stacked(shares: tuple[float, float]) -> tuple[Figure, tuple[Axes, Axes]]:
+    """A figure with two pairs of axes, one above the other, with a common time axis."""
+    figure, axes = _figure(_HEIGHT * 1.15, shares)
+    return figure, (axes[0], axes[1])
+
+
+def _figure(height: float, shares: tuple[float, ...]) -> tuple[Figure, list[Axes]]:
+    from matplotlib import rc_context  # noqa: PLC0415 - heavy
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        grid = figure.subplots(
+            len(shares), 1, squeeze=False, sharex=True, height_ratios=list(shares)
+        )
+    return figure, list(grid[:, 0])
+
+
+class TimeAxes:
+    """Axes over the frames of a run; lines break at `jumps` (n,), which are no motion."""
+
+    def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
+        self._axes, self._series = axes, series
+        self._breaks = series.breaks if jumps is None else series.breaks | jumps
+        self._as_pixels = len(series.x) > _MANY
+        gaps = np.diff(series.x)
+        self._half_step = 0.5 * float(np.median(gaps)) if gaps.size else 0.5
+
+    def frame(self) -> None:
+        """Show all frames, those without a value too."""
+        x = self._series.x
+        if x.size:
+            margin = max(0.01 * float(x[-1] - x[0]), self._half_step)
+            self._axes.set_xlim(float(x.min()) - margin, float(x.max()) + margin)
+
+    def draw(self, values: Floats, look: dict[str, Any] = POSE) -> None:
+        """Draw a line that breaks where frames are lost or left out."""
+        line(self._axes, self._series.x, values, self._breaks, look)
+
+    def band(self, values: Floats, half_width: Floats) -> None:
+        """Fill the band about values."""
+        x, y, width = (_broken(each, self._breaks) for each in (self._series.x, values, half_width))
+        self._axes.fill_between(
+            x,
+            y - width,
+            y + width,
+            color=_BLUE,
+            alpha=0.25,
+            linewidth=0,
+            rasterized=self._as_pixels,
+        )
+
+    def mark_ambiguous(self, values: Floats) -> None:
+        """Mark the values of ambiguous frames."""
+        mark_ambiguous(self._axes, self._series.x, values, self._series)
+
+    def mark_lost(self) -> None:
+        """Shade the stretches of lost frames from top to bottom."""
+        lost = self._series.status == "lost"
+        edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
+        x = self._series.x
+        stretches = [
+            (x[first] - self._half_step, x[last - 1] - x[first] + 2 * self._half_step)
+            for first, last in edges.reshape(-1, 2)
+        ]
+        if stretches:
+            self._axes.broken_barh(
+                stretches,
+                (0.0, 1.0),
+                transform=self._axes.get_xaxis_transform(),
+                color=_RED,
+                alpha=0.3,
+                linewidth=0,
+                rasterized=self._as_pixels,
+            )
+
+
+def line(axes: Axes, x: Floats, y: Floats, breaks: Flags, look: dict[str, Any] = POSE) -> None:
+    """Draw a line that leaves out breaks and missing values, and dots where it would not show."""
+    many, dotted = len(x) > _MANY, len(x) <= _DOTS
+    x, y = _broken(x, breaks), _broken(y, breaks)
+    look = {"linewidth": 1.3, "marker": "o", "markersize": 2.5, "rasterized": many, **look}
+    if not dotted:
+        known = np.isfinite(x + y)
+        beside = np.r_[False, known[:-1]] | np.r_[known[1:], False]
+        look["markevery"] = np.flatnonzero(known & ~beside).tolist()
+    axes.plot(x, y, **look)
+
+
+def mark_ambiguous(axes: Axes, x: Floats, y: Floats, series: Series) -> None:
+    """Mark ambiguous frames at places (x, y) of all n frames; smaller where they are many."""
+    doubtful = series.status == "ambiguous"
+    size = 3.5 * np.clip(np.sqrt(_DOTS / max(len(x), 1)), 0.4, 1.0)
+    look = {**_AMBIGUOUS, "markersize": size, "rasterized": len(x) > _MANY}
+    axes.plot(x[doubtful], y[doubtful], **look)
+
+
+def _broken(values: Floats, breaks: Flags) -> Floats:
+    """Values with a NaN before each break."""
+    return np.insert(values, np.flatnonzero(breaks), np.nan)
+
+
+def drawn(figure: Figure) -> str:
+    """An ``<svg>`` element that names nothing outside itself."""
+    from matplotlib import rc_context  # noqa: PLC0415
+
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", transparent=True, dpi=200, metadata=nothing)
+    text = buffer.getvalue()
+    width, height = 72 * figure.get_size_inches()
+    inside = text[text.index(">", text.index("<svg")) + 1 :]
+    inside = re.sub(r"<style.*?</style>|<!--.*?-->", "", inside, flags=re.DOTALL)
+    inside = re.sub(r'<g id="[^"]*"', "<g", inside)
+    # figures share a page, so the names of their parts must differ
+    prefix = hashlib.sha256(inside.encode()).hexdigest()[:12]
+    inside = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", inside)
+    inside = inside.replace(_INK, "var(--ink)").replace(_RULE, "var(--rule)")
+    return f'<svg viewBox="0 0 {width:g} {height:g}" aria-hidden="true">{inside.strip()}'
 
 
 @dataclass(frozen=True)
@@ -67,7 +242,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
     for name, rms in series.rms.items():
         explained = series.explained[name]
         unit = unit_of(name)
-        figure, (upper, lower) = drawing.stacked((1.0, 1.0))
+        figure, (upper, lower) = stacked((1.0, 1.0))
         for axes, values, label in ((upper, rms, f"rms, {unit}"), (lower, explained, "explained")):
             _draw(axes, series, values)
             axes.set_ylabel(label)
@@ -75,7 +250,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         upper.tick_params(labelbottom=False)
         lower.set_xlabel(series.x_label)
         alt = f"{_spoken(f'{name}: rms, {unit}', rms)}; {_spoken('explained share', explained)}"
-        charts.append(Chart(name, alt, drawing.drawn(figure)))
+        charts.append(Chart(name, alt, drawn(figure)))
     return charts
 
 
@@ -87,7 +262,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
             continue
         rows = np.array(list(residuals.values()))[:_MOST_ROWS]
         met = np.isfinite(rows)
-        figure, axes = drawing.blank()
+        figure, axes = blank()
         largest = float(np.quantile(rows[met], 0.98)) if met.any() else 1.0
         steps = np.diff(series.x)
         half = 0.5 * (float(np.median(steps)) if steps.size else 1.0)
@@ -99,12 +274,11 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         axes.pcolormesh(x, y, unmet, vmin=0.0, vmax=1.0, cmap="Reds", rasterized=True)
         figure.colorbar(mesh, ax=axes, label=f"off by, {unit_of(name)}")
         axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)])
-        axes.set_xlabel(series.x_label)
-        axes.set_ylabel("feature; red: not met")
+        axes.set(xlabel=series.x_label, ylabel="feature; red: not met")
         met_by = {name: each[np.isfinite(each)] for name, each in residuals.items()}
         worst = max(met_by, key=lambda each: np.median(met_by[each]) if met_by[each].size else 0.0)
         alt = f"{name}: how far off each feature is met over time; the farthest off is {worst}"
-        charts.append(Chart(f"{name}: features", alt, drawing.drawn(figure)))
+        charts.append(Chart(f"{name}: features", alt, drawn(figure)))
     return charts
 
 
@@ -123,7 +297,7 @@ def latency(series: Series) -> list[Chart]:
     low, high = float(known.min()), float(known.max())
     low, high = (low / 1.5, high * 1.5) if high < 1.5 * low else (low, high)
     edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
-    figure, axes = drawing.blank()
+    figure, axes = blank()
     axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     axes.set_xscale("log")
@@ -131,10 +305,9 @@ def latency(series: Series) -> list[Chart]:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel("latency, ms")
-    axes.set_ylabel("frames")
+    axes.set(xlabel="latency, ms", ylabel="frames")
     title = "Time per frame"
-    return [Chart(title, _spoken("Time per frame, ms", known), drawing.drawn(figure))]
+    return [Chart(title, _spoken("Time per frame, ms", known), drawn(figure))]
 
 
 def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
@@ -144,10 +317,10 @@ def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
         ("Rotation error, deg", errors.rotation_deg),
         (f"Position error, {series.unit}", errors.distance),
     ):
-        figure, axes = drawing.blank()
+        figure, axes = blank()
         _draw(axes, series, values)
         axes.set_xlabel(series.x_label)
-        charts.append(Chart(title, _spoken(title, values), drawing.drawn(figure)))
+        charts.append(Chart(title, _spoken(title, values), drawn(figure)))
     return charts
 
 
@@ -162,12 +335,12 @@ def _draw(axes: Axes, series: Series, values: Floats) -> None:
 
 
 def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
-    figure, axes = drawing.blank(height=3.6)
+    figure, axes = blank(height=3.6)
     position = series.position
     if errors is not None:
-        drawing.line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
-    drawing.line(axes, position[:, a], position[:, b], series.breaks)
-    drawing.mark_ambiguous(axes, position[:, a], position[:, b], series)
+        line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
+    line(axes, position[:, a], position[:, b], series.breaks)
+    mark_ambiguous(axes, position[:, a], position[:, b], series)
     known = position[series.status != "lost"]
     if len(known):
         ink = {"linestyle": "none", "color": POSE["color"], "zorder": 5}
@@ -175,18 +348,17 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
         axes.plot(*known[-1, [a, b]], marker="s", markersize=7, fillstyle="none", **ink)
     axes.set_aspect("equal", adjustable="datalim")
     axes.ticklabel_format(useOffset=False)
-    axes.set_xlabel(f"{AXES[a]}, {series.unit}")
-    axes.set_ylabel(f"{AXES[b]}, {series.unit}")
+    axes.set(xlabel=f"{AXES[a]}, {series.unit}", ylabel=f"{AXES[b]}, {series.unit}")
     title = f"Plane {AXES[a]}{AXES[b]}"
     spoken = [_spoken(AXES[k], position[:, k]) for k in (a, b)]
-    return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawing.drawn(figure))
+    return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawn(figure))
 
 
 def _values(
     series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
 ) -> str:
     """Values with their band above, the band's half-width alone below."""
-    figure, (upper, lower) = drawing.stacked((3.0, 1.2))
+    figure, (upper, lower) = stacked((3.0, 1.2))
     panel = TimeAxes(upper, series, jumps)
     panel.mark_lost()
     panel.band(values, half_width)
@@ -207,9 +379,8 @@ def _values(
         lower.set_yscale("log")
     else:
         lower.set_ylim(0.0, 1.15 * float(positive.max()) if positive.size else 1.0)
-    lower.set_ylabel("± 95 %")
-    lower.set_xlabel(series.x_label)
-    return drawing.drawn(figure)
+    lower.set(xlabel=series.x_label, ylabel="± 95 %")
+    return drawn(figure)
 
 
 def _limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:

@@ -200,23 +200,15 @@ def _ranges_text(series: Series, status: Status) -> str:
 def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
     found = [Figure("frames", str(len(series.frames)), _span(series))]
     if evaluation is not None and evaluation.rotation_deg and evaluation.translation:
-        rotation, translation = evaluation.rotation_deg, evaluation.translation
-        found += [
-            Figure(
-                "rotation error, RMS",
-                f"{_short(rotation.rms)}°",
-                f"at most {_short(rotation.max)}°",
-            ),
-            Figure(
-                "position error, RMS",
-                f"{_short(translation.rms)} {series.unit}",
-                f"at most {_short(translation.max)} {series.unit}",
-            ),
-        ]
-    position, turn = series.half_width[:, :3], series.half_width[:, 3:]
+        for name, errors, unit in (
+            ("rotation error, RMS", evaluation.rotation_deg, "°"),
+            ("position error, RMS", evaluation.translation, f" {series.unit}"),
+        ):
+            most = f"at most {_short(errors.max)}{unit}"
+            found.append(Figure(name, f"{_short(errors.rms)}{unit}", most))
     for name, widths, unit in (
-        ("position, 95 %", position, f" {series.unit}"),
-        ("turn, 95 %", turn, "°"),
+        ("position, 95 %", series.half_width[:, :3], f" {series.unit}"),
+        ("turn, 95 %", series.half_width[:, 3:], "°"),
     ):
         widest = widths.max(axis=1) if len(widths) else np.empty(0)
         if np.isfinite(widest).any():

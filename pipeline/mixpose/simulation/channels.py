@@ -16,16 +16,17 @@ from mixpose.session import SensorSetup, Session
 from mixpose.simulation.motion import Motion, Shutter
 from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
-from mixpose.simulation.render import ImageFormat, ProfileFormat
-from mixpose.simulation.scenery import Scenery
-from mixpose.simulation.visible_spots import View, brightness_levels
-from mixpose.simulation.writers import (
+from mixpose.simulation.render import (
     DetectionWriter,
+    ImageFormat,
     ImageWriter,
+    ProfileFormat,
     ProfileWriter,
     SensorWriter,
     VideoWriter,
 )
+from mixpose.simulation.scenery import Scenery
+from mixpose.simulation.visible_spots import View, brightness_levels
 
 _LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
 _CLOUD_NOISE = 0.2  # of sigma, which is a tolerance

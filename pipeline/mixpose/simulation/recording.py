@@ -25,10 +25,10 @@ from mixpose.simulation.channels import Channel, check_setup, plan_channel
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
+from mixpose.simulation.render import SensorWriter
 from mixpose.simulation.scenery import Actor, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
 from mixpose.simulation.visible_spots import VisibleSpots, displacements, later, look
-from mixpose.simulation.writers import SensorWriter
 
 TRUTH_NAME = "truth.jsonl"
 
