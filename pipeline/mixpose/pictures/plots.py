@@ -287,7 +287,12 @@ def objective_around(
         curves = np.array([values(sigmas, twists) for sigmas in levels])
         slices.append(Slice(k, offsets, curves))
     maps = []
-    for i, j in _pairs(free, covariance):
+    pairs = list(combinations(free, 2))
+    if covariance is not None and np.isfinite(covariance).all():
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        related = np.abs(covariance / deviations / deviations[:, None])
+        pairs.sort(key=lambda pair: -related[pair])
+    for i, j in pairs[:_MAPS]:
         across, up = (_half_width(_NARROW * unit[k], k) * np.linspace(-1, 1, _SIDE) for k in (i, j))
         grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
         surface = values(levels[-1], grid @ np.eye(6)[[i, j]])
@@ -313,13 +318,3 @@ def _one_blur(
             keenest = np.maximum(keenest, (J**2).sum(axis=1).mean(axis=0))
     usual = np.repeat([0.02 * body.radius, np.radians(1.0)], 3)
     return np.where(keenest > 0, 1 / np.sqrt(np.maximum(keenest, 1e-300)), usual)
-
-
-def _pairs(free: Sequence[int], covariance: Floats | None) -> list[tuple[int, int]]:
-    """The pairs of directions that depend on each other most."""
-    pairs = list(combinations(free, 2))
-    if covariance is not None and np.isfinite(covariance).all():
-        deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        related = np.abs(covariance / deviations / deviations[:, None])
-        pairs.sort(key=lambda pair: -related[pair])
-    return pairs[:_MAPS]

@@ -157,8 +157,13 @@ class Channel:
             except OSError as error:
                 self._began = None
                 self._backlog.put_back(message)
-                if not (is_connected and self._backlog.has_ended):
-                    self._is_now_away(error)
+                if not (self._is_away or (is_connected and self._backlog.has_ended)):
+                    self._is_away = True
+                    reason = error.strerror or str(error) or type(error).__name__
+                    self._tell(
+                        f"warning: --publish {self._address.text}: the receiver is away: {reason}; "
+                        "the run goes on, and tries to reach it"
+                    )
                 is_connected = False
                 self._sender.close()
                 if self._backlog.waits_for_end(self._rules.retry_s):
@@ -172,15 +177,6 @@ class Channel:
             if message.moment is not None:
                 self._latencies.append(message.late_s)
                 self._stamped_by = message.moment.of
-
-    def _is_now_away(self, error: OSError) -> None:
-        if not self._is_away:
-            self._is_away = True
-            reason = error.strerror or str(error) or type(error).__name__
-            self._tell(
-                f"warning: --publish {self._address.text}: the receiver is away: {reason}; the run "
-                "goes on, and tries to reach it"
-            )
 
 
 class Publishing:

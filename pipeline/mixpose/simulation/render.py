@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -167,18 +167,6 @@ def _shares(cells: range, centre: float, sigma: float) -> Floats:
     return np.asarray(np.diff(0.5 * erf((edges - centre) / (np.sqrt(2) * sigma))))
 
 
-class SensorWriter(Protocol):
-    """Writes what one sensor records."""
-
-    def write(
-        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
-    ) -> None:
-        """Record one frame; numbers ascend."""
-
-    def close(self) -> None:
-        """Finish the file."""
-
-
 def _made(files: SourceFiles, folder: Path) -> Path:
     """The one file of a source, in a folder that is there."""
     path = folder / files.path
@@ -309,3 +297,7 @@ class DetectionWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+SensorWriter: TypeAlias = ImageWriter | VideoWriter | ProfileWriter | DetectionWriter
+"""Writes what one sensor records, frame by frame by ascending numbers, until it is closed."""

@@ -87,7 +87,11 @@ def plan_scenery(
     R, t = motion.T_world_object[:3, :3], motion.T_world_object[:3, 3]
     middle = R @ motion.pivot + t
     front = _unit(np.mean([_unit(camera.towards(middle)) for camera in cameras], axis=0))
-    down = _unit(np.mean([_down(camera, middle) for camera in cameras], axis=0))
+    downs = []  # where rows of images go in the world: a small step that is seen below
+    for camera in cameras:
+        _, J, _ = camera.linearise(middle)
+        downs.append(_unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300)))
+    down = _unit(np.mean(downs, axis=0))
     side = _unit(np.cross(front, down))
     stage = _Stage(body, middle, np.stack([side, down, front]), options, rng)
     lamps = [stage.lamp() for _ in range(options.lamps)]
@@ -107,12 +111,6 @@ def plan_scenery(
 
 def _unit(vector: Floats) -> Floats:
     return np.asarray(vector / np.linalg.norm(vector))
-
-
-def _down(camera: Sensor, middle: Floats) -> Floats:
-    """Where the image's rows go, in the world about a point: a small step that is seen below."""
-    _, J, _ = camera.linearise(middle)
-    return _unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300))
 
 
 @dataclass(frozen=True)

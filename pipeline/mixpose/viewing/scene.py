@@ -209,7 +209,14 @@ class Scene:
         everything = np.concatenate([sensors, bodies, bodies - radius, bodies + radius])
         middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
         at = self._scale * middle
-        eye = at + self._scale * _distance(everything - middle, away, up) * away
+        # from where all places are seen
+        right = np.cross(up, away)
+        right /= np.linalg.norm(right)
+        half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
+        places = everything - middle
+        across = np.abs(places @ right) / (_ASPECT * half)
+        upwards = np.abs(places @ np.cross(away, right)) / half
+        eye = at + self._scale * float((places @ away + np.maximum(across, upwards)).max()) * away
         cameras = [client.camera for client in self._server.get_clients().values()]
         for camera in (self._server.initial_camera, *cameras):
             camera.fov = np.deg2rad(_FOV_DEG)
@@ -219,16 +226,6 @@ class Scene:
                 camera.up = up
             camera.position = eye
             camera.look_at = at
-
-
-def _distance(places: Floats, away: Floats, up: Floats) -> float:
-    """From how far away all places (n, 3) about the origin are seen, along a unit vector."""
-    right = np.cross(up, away)
-    right /= np.linalg.norm(right)
-    half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
-    across = np.abs(places @ right) / (_ASPECT * half)
-    upwards = np.abs(places @ np.cross(away, right)) / half
-    return float((places @ away + np.maximum(across, upwards)).max())
 
 
 def _skeleton(points: Floats) -> Floats:
