@@ -311,22 +311,20 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
 def _about_measurements(finding: Finding, body: Body) -> list[str]:
     """Advice for tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
-    lines = []
     if finding.points is None:
-        if finding.count > 2 * len(body):
-            lines.append(
-                "far more echoes than features: noise fills the profile; take its floor off, or "
-                "raise sigma in [extract]"
-            )
-        return lines
+        if finding.count <= 2 * len(body):
+            return []
+        return [
+            "far more echoes than features: noise fills the profile; take its floor off, or raise "
+            "sigma in [extract]"
+        ]
     if expected is None:
-        return lines
-    lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
-    if lost:
+        return []
+    lines = []
+    if lost := np.flatnonzero(expected.seen & ~expected.met).tolist():
         names = _some(lost, body)
         lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
-    extra = int(expected.unexplained.sum())
-    if extra:
+    if extra := int(expected.unexplained.sum()):
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
     return lines
 

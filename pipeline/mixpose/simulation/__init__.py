@@ -7,9 +7,5 @@ Of all that estimates poses, simulation knows only the sensors and the object mo
 estimate is checked against itself.
 """
 
-from __future__ import annotations
-
-from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.recording import simulate
-
-__all__ = ["SimulationOptions", "simulate"]
+from mixpose.simulation.options import SimulationOptions as SimulationOptions
+from mixpose.simulation.recording import simulate as simulate

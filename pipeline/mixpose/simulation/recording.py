@@ -63,10 +63,8 @@ def simulate(
 
     The folder, made if it is not there, then holds ``session.toml``, the marker and calibration
     files that it names, frames for the source of each sensor, and ``truth.jsonl``. The same
-    session, options and seed give the same bytes. `progress` is called with the number of frames
-    done, after each.
-
-    A `SessionError` if the session cannot be simulated, or the folder holds a recording that is not
+    session, options and seed give the same bytes. `progress` is told the number of frames done. A
+    `SessionError` if the session cannot be simulated, or the folder holds a recording that is not
     to be overwritten, or cannot be written.
     """
     folder = Path(folder)
