@@ -98,7 +98,7 @@ def _panel(
     if isinstance(data, np.ndarray):
         inset = cut_out(canvas.displayable(data), larger, (side, side), cv2.INTER_NEAREST)
     _mark_detections(inset, data, larger)
-    put_into(panel, part, _draw_bodies(posed, setup, inset, larger), box)
+    put_into(panel, part, draw_camera(posed, setup, inset, larger, captioned=False), box)
     return panel
 
 
@@ -175,35 +175,21 @@ def draw_camera(
     found: Floats | None = None,
     *,
     named: bool = True,
+    captioned: bool = True,
 ) -> Picture:
     """Draw the bodies of a moment, and features `found` (M, 2), on a frame of `backdrop`."""
-    picture = _draw_bodies(posed, setup, picture, part, found, named=named)
-    first = posed[0][1]
-    if len(posed) == 1:
-        overlay.caption(picture, first.status, first.frame)
-    else:
-        overlay.legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
-    return picture
-
-
-def _draw_bodies(
-    posed: Sequence[tuple[Body, Estimate]],
-    setup: SensorSetup,
-    picture: Picture,
-    part: Part,
-    found: Floats | None = None,
-    *,
-    named: bool = True,
-) -> Picture:
-    """The same without words about the frame: on a new picture."""
-    colours = (
-        overlay.BODY_COLOURS if len(posed) > 1 else (overlay.STATUS_COLOURS[posed[0][1].status],)
-    )
+    several = len(posed) > 1
+    colours = overlay.BODY_COLOURS if several else (overlay.STATUS_COLOURS[posed[0][1].status],)
     for k, (body, one) in enumerate(posed):
         picture = overlay.draw_pose(
             picture, setup.sensor, body, one.T_world_object, one.covariance,
             part=part, colour=colours[k % len(colours)], found=None if k else found, named=named,
         )  # fmt: skip
+    first = posed[0][1]
+    if captioned and several:
+        overlay.legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
+    elif captioned:
+        overlay.caption(picture, first.status, first.frame)
     return picture
 
 

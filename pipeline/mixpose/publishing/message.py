@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
-from typing import Protocol
 
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import header_line, pose_line
@@ -64,7 +63,7 @@ def path_word(label: str) -> str:
     return f"_{word}" if word[:1].isdigit() else word
 
 
-class Sender(Protocol):
+class Sender:
     """Sends poses by one protocol.
 
     It is made with an `Address` and the `Header` of the run, and refuses with a `SessionError` what
@@ -72,15 +71,14 @@ class Sender(Protocol):
     `OSError` says that the receiver is not there, or has gone away.
     """
 
-    @property
-    def dropped(self) -> int:
-        """Poses that some receiver did not get because it is slower than others."""
+    dropped = 0  # poses that some receiver did not get because it is slower than others
 
     def connect(self) -> None:
-        """Reach the receiver; called again after it was away."""
+        """Reach the receiver, where it does not come by itself; again after it was away."""
 
     def send(self, message: Message) -> bool:
         """Send a pose, and return whether anybody was there to hear it."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Let go of the receiver.  Called from another thread, it ends a `send` that waits."""

@@ -95,7 +95,7 @@ def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
     ]
 
 
-class RosNodeSender:
+class RosNodeSender(Sender):
     """A node ``mixpose`` that publishes to the topics of ``ros2://topic``."""
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -110,10 +110,6 @@ class RosNodeSender:
             topic: self._node.create_publisher(_type(kind), topic, _DEPTH)
             for topic, kind in kinds.items()
         }
-        self.dropped = 0
-
-    def connect(self) -> None:
-        """Nothing to do: ROS finds its receivers."""
 
     def send(self, message: Message) -> bool:
         """Publish the pose of one body and its transform."""
@@ -148,7 +144,7 @@ def _filled(message: Any, fields: dict[str, Any]) -> Any:
     return message
 
 
-class RosbridgeSender:
+class RosbridgeSender(Sender):
     """Publishes to the topics of ``ros2://topic?bridge=host:port``."""
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -161,7 +157,6 @@ class RosbridgeSender:
         self._topics = topics(address, header)
         self._connection: ClientConnection | None = None
         self._is_sending = False
-        self.dropped = 0
 
     def connect(self) -> None:
         """Connect, and advertise the topics."""

@@ -11,7 +11,7 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, header_text, path_word
+from mixpose.publishing.message import Message, Sender, header_text, path_word
 
 HEADER_S = 1.0
 """The header, which says the unit, is repeated so often: nobody knows who listens since when."""
@@ -37,7 +37,7 @@ def force_down(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-class Datagrams:
+class Datagrams(Sender):
     """Datagrams to a host and a port, whether anybody listens there or not (RFC 768)."""
 
     def __init__(self, place: tuple[str, int]) -> None:
@@ -61,7 +61,7 @@ class Datagrams:
             self._socket.close()
 
 
-class TcpSender:
+class TcpSender(Sender):
     """Connects to ``tcp://host:port``, where a receiver listens; the header comes first."""
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -69,7 +69,6 @@ class TcpSender:
         self._place = address.place("tcp://127.0.0.1:9870")
         self._header = f"{header_text(header)}\n".encode()
         self._socket: socket.socket | None = None
-        self.dropped = 0
 
     def connect(self) -> None:
         """Connect, and send the header."""
@@ -97,7 +96,6 @@ class UdpSender(Datagrams):
         super().__init__(address.place("udp://127.0.0.1:9870"))
         self._header = header_text(header).encode()
         self._told = float("-inf")
-        self.dropped = 0
 
     def send(self, message: Message) -> bool:
         """Send a line, and from time to time the header before it."""
@@ -122,7 +120,6 @@ class OscSender(Datagrams):
         address.needs("pythonosc", "osc")
         super().__init__(address.place("osc://127.0.0.1:9000"))
         self._prefix = f"/{address.path or 'mixpose'}"
-        self.dropped = 0
 
     def send(self, message: Message) -> bool:
         """Send the message of one body."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, header_text
+from mixpose.publishing.message import Message, Sender, header_text
 from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class _Client:
         return self.began is not None and now - self.began > PublishingRules.stuck_s
 
 
-class WebSocketSender:
+class WebSocketSender(Sender):
     """Listens at ``ws://host:port/path``; who connects there gets the header and further lines.
 
     Each gets what it is quick enough for.  Who asks for another path is refused, so that a path
@@ -64,10 +64,6 @@ class WebSocketSender:
         self._end = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="mixpose-ws", daemon=True)
         self._thread.start()
-        self.dropped = 0
-
-    def connect(self) -> None:
-        """Nothing to do: receivers come by themselves."""
 
     def send(self, message: Message) -> bool:
         """Hand a line to all who are there."""

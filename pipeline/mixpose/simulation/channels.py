@@ -65,38 +65,109 @@ def check_setup(session: Session) -> None:
             )
 
 
-def plan_channel(
-    setup: SensorSetup,
-    files: SourceFiles,
-    body: Body,
-    motion: Motion,
-    options: SimulationOptions,
-    *,
-    fps: float,
-    index: int,
-    scenery: Scenery = Scenery(),
-    step_s: float = 0.0,
-) -> Channel:
-    """Prepare one sensor of a session that `check_setup` has passed.
+@dataclass(frozen=True)
+class Planner:
+    """Prepares the sensors of a session that `check_setup` has passed."""
 
-    Its place in the session, `index`, keys its random numbers; it is `step_s` later than the first,
-    and says so; cameras see `scenery`, too. A `SessionError` if it cannot be simulated.
-    """
-    shutter = shutter_of(setup, options, step_s)
-    is_profile = setup.range_min is not None and setup.bin_size is not None
-    is_table = files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile)
-    if is_table:
-        channel = _table_channel(setup, files, body, motion, options)
-    elif setup.sensor.dimension == 1:
-        channel = _profile_channel(setup, files, body, motion, options, index)
-    else:
-        channel = _camera_channel(setup, files, body, options, fps, index)
-    view = replace(channel.view, shutter=shutter)
-    if setup.sensor.dimension == 2:
-        if is_table:  # a detection is where the middle of a streak is
-            shutter = replace(shutter, exposure_s=0.0)
-        view = replace(view, shutter=shutter, scenery=scenery)
-    return replace(channel, view=view, step_s=step_s)
+    body: Body
+    motion: Motion
+    options: SimulationOptions
+    fps: float
+    scenery: Scenery  # that cameras see, too
+
+    def channel(self, setup: SensorSetup, files: SourceFiles, index: int, step_s: float) -> Channel:
+        """A sensor, or a `SessionError` where it cannot be simulated.
+
+        Its place in the session, `index`, keys its random numbers; it is `step_s` later than the
+        first, and says so.
+        """
+        shutter = shutter_of(setup, self.options, step_s)
+        is_profile = setup.range_min is not None and setup.bin_size is not None
+        is_table = files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile)
+        if is_table:
+            channel = self._table(setup, files)
+        elif setup.sensor.dimension == 1:
+            channel = self._profiles(setup, files, index)
+        else:
+            channel = self._camera(setup, files, index)
+        view = replace(channel.view, shutter=shutter)
+        if setup.sensor.dimension == 2:
+            if is_table:  # a detection is where the middle of a streak is
+                shutter = replace(shutter, exposure_s=0.0)
+            view = replace(view, shutter=shutter, scenery=self.scenery)
+        return replace(channel, view=view, step_s=step_s)
+
+    def _camera(self, setup: SensorSetup, files: SourceFiles, index: int) -> Channel:
+        assert setup.resolution is not None, "check_setup refuses this"
+        options = self.options
+        optics = _SPOT_SIGMA_PX if self.body.radii is None else _OPTICS_PX
+        spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
+        form = ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
+
+        def start(folder: Path) -> SensorWriter:
+            if files.kind == "images":
+                return ImageWriter(files, folder, options, form)
+            return VideoWriter(files, folder, options, form, self.fps)
+
+        bounds = setup.sensor.lower, setup.sensor.upper
+        return Channel(files, self._view(setup, bounds, spot_sigma, index), options, start)
+
+    def _profiles(self, setup: SensorSetup, files: SourceFiles, index: int) -> Channel:
+        options, range_min, bin_size = self.options, setup.range_min, setup.bin_size
+        assert range_min is not None
+        assert bin_size is not None
+        nearest, farthest = self._around(setup)
+        width = options.range_width or setup.extract.spot_sigma or _PEAK_BINS * bin_size
+        bins = ceil((farthest[0] + _PEAK_REACH * width - range_min) / bin_size) + 1
+        if farthest[0] < range_min:
+            raise SessionError(
+                f"sensor {setup.name!r}: range_min: found {range_min:g}; the object is at "
+                f"ranges from {nearest[0]:g} to {farthest[0]:g}"
+            )
+        form = ProfileFormat(bins, range_min, bin_size, width)
+        view = self._view(setup, (np.maximum(nearest, range_min), farthest), width, index)
+        return Channel(files, view, options, lambda at: ProfileWriter(files, at, options, form))
+
+    def _table(self, setup: SensorSetup, files: SourceFiles) -> Channel:
+        sensor, sigma, options = setup.sensor, setup.extract.sigma, self.options
+        if sensor.dimension == 2:
+            bounds, spacing = (sensor.lower, sensor.upper), _TABLE_SPACING_PX
+            noise = options.pixel_noise
+        else:
+            # lines become detections about as far apart as these are exact
+            bounds, spacing = self._around(setup), sigma
+            usual = sigma if sensor.dimension == 1 else _CLOUD_NOISE * sigma
+            noise = usual if options.range_noise is None else options.range_noise
+        view = View(sensor, *bounds, np.ones(len(self.body)), spacing)
+        coordinates = _COORDINATES[sensor.dimension]
+        return Channel(
+            files,
+            view,
+            replace(options, brightness_spread=0.0),
+            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
+        )
+
+    def _view(
+        self, setup: SensorSetup, bounds: tuple[Floats, Floats], sigma: float, index: int
+    ) -> View:
+        """The view of a sensor whose spots have a standard deviation."""
+        # the same throughout a recording
+        rng = generator(self.options.seed, Purpose.BRIGHTNESS, index)
+        levels = brightness_levels(len(self.body), self.options.brightness_spread, rng)
+        spacing = _LINE_SPACING * sigma
+        # spots this far apart are together as bright as one spot alone
+        ridge = float(spacing / (np.sqrt(2 * np.pi) * sigma))
+        return View(setup.sensor, *bounds, levels, spacing, ridge)
+
+    def _around(self, setup: SensorSetup) -> tuple[Floats, Floats]:
+        """Bounds (m,), (m,) of lengths along a sensor's axes that the moving body can have."""
+        motion, points = self.motion, self.body.nodes.points
+        pivot_world = motion.T_world_object[:3, :3] @ motion.pivot + motion.T_world_object[:3, 3]
+        middle, _ = setup.sensor.project(pivot_world)
+        reach = motion.reach + np.linalg.norm(points - motion.pivot, axis=1).max()
+        reach += 4 * self.body.spread if self.options.deform else 0.0
+        nearest = middle - reach
+        return np.maximum(nearest, 0.0) if setup.sensor.dimension == 1 else nearest, middle + reach
 
 
 def shutter_of(setup: SensorSetup, options: SimulationOptions, step_s: float) -> Shutter:
@@ -108,105 +179,3 @@ def shutter_of(setup: SensorSetup, options: SimulationOptions, step_s: float) ->
     if setup.resolution is None:
         return Shutter(late)
     return Shutter(late, readout, exposure, setup.resolution[1])
-
-
-def _camera_channel(
-    setup: SensorSetup,
-    files: SourceFiles,
-    body: Body,
-    options: SimulationOptions,
-    fps: float,
-    index: int,
-) -> Channel:
-    assert setup.resolution is not None, "check_setup refuses this"
-    optics = _SPOT_SIGMA_PX if body.radii is None else _OPTICS_PX
-    spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
-    form = ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
-
-    def start(folder: Path) -> SensorWriter:
-        if files.kind == "images":
-            return ImageWriter(files, folder, options, form)
-        return VideoWriter(files, folder, options, form, fps)
-
-    bounds = setup.sensor.lower, setup.sensor.upper
-    return Channel(files, _view(setup, body, bounds, spot_sigma, options, index), options, start)
-
-
-def _profile_channel(
-    setup: SensorSetup,
-    files: SourceFiles,
-    body: Body,
-    motion: Motion,
-    options: SimulationOptions,
-    index: int,
-) -> Channel:
-    range_min, bin_size = setup.range_min, setup.bin_size
-    assert range_min is not None
-    assert bin_size is not None
-    nearest, farthest = _around(setup, body, motion, options)
-    width = options.range_width or setup.extract.spot_sigma or _PEAK_BINS * bin_size
-    bins = ceil((farthest[0] + _PEAK_REACH * width - range_min) / bin_size) + 1
-    if farthest[0] < range_min:
-        raise SessionError(
-            f"sensor {setup.name!r}: range_min: found {range_min:g}; the object is at "
-            f"ranges from {nearest[0]:g} to {farthest[0]:g}"
-        )
-    form = ProfileFormat(bins, range_min, bin_size, width)
-    bounds = np.maximum(nearest, range_min), farthest
-    view = _view(setup, body, bounds, width, options, index)
-    return Channel(files, view, options, lambda folder: ProfileWriter(files, folder, options, form))
-
-
-def _table_channel(
-    setup: SensorSetup, files: SourceFiles, body: Body, motion: Motion, options: SimulationOptions
-) -> Channel:
-    sensor, sigma = setup.sensor, setup.extract.sigma
-    if sensor.dimension == 2:
-        bounds, spacing, noise = (
-            (sensor.lower, sensor.upper),
-            _TABLE_SPACING_PX,
-            options.pixel_noise,
-        )
-    else:
-        # lines become detections about as far apart as these are exact
-        bounds, spacing = _around(setup, body, motion, options), sigma
-        usual = sigma if sensor.dimension == 1 else _CLOUD_NOISE * sigma
-        noise = usual if options.range_noise is None else options.range_noise
-    view = View(sensor, *bounds, np.ones(len(body)), spacing)
-    coordinates = _COORDINATES[sensor.dimension]
-    return Channel(
-        files,
-        view,
-        replace(options, brightness_spread=0.0),
-        lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
-    )
-
-
-def _view(
-    setup: SensorSetup,
-    body: Body,
-    bounds: tuple[Floats, Floats],
-    sigma: float,
-    options: SimulationOptions,
-    index: int,
-) -> View:
-    """The view of a sensor whose spots have a standard deviation."""
-    # the same throughout a recording
-    rng = generator(options.seed, Purpose.BRIGHTNESS, index)
-    levels = brightness_levels(len(body), options.brightness_spread, rng)
-    spacing = _LINE_SPACING * sigma
-    # spots this far apart are together as bright as one spot alone
-    ridge = float(spacing / (np.sqrt(2 * np.pi) * sigma))
-    return View(setup.sensor, *bounds, levels, spacing, ridge)
-
-
-def _around(
-    setup: SensorSetup, body: Body, motion: Motion, options: SimulationOptions
-) -> tuple[Floats, Floats]:
-    """Bounds (m,), (m,) of lengths along the axes of a sensor that the moving body can have."""
-    pivot_world = motion.T_world_object[:3, :3] @ motion.pivot + motion.T_world_object[:3, 3]
-    middle, _ = setup.sensor.project(pivot_world)
-    reach = motion.reach + np.linalg.norm(body.nodes.points - motion.pivot, axis=1).max()
-    reach += 4 * body.spread if options.deform else 0.0
-    nearest = middle - reach
-    return np.maximum(nearest, 0.0) if setup.sensor.dimension == 1 else nearest, middle + reach

@@ -21,7 +21,7 @@ from mixpose.simulation.central_pose import (
     plan_companions,
     swinging,
 )
-from mixpose.simulation.channels import Channel, check_setup, plan_channel
+from mixpose.simulation.channels import Channel, Planner, check_setup
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
@@ -94,20 +94,9 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         scenery = plan_scenery(session.body, motion, cameras, options)
         companions = plan_companions(session, motion, options)
         scenery = replace(scenery, actors=(*companions, *scenery.actors))
-        channels = tuple(
-            plan_channel(
-                setup,
-                own,
-                session.body,
-                motion,
-                options,
-                fps=fps,
-                index=i,
-                scenery=scenery,
-                step_s=step,
-            )
-            for i, (setup, own, step) in enumerate(zip(setups, files, steps))
-        )
+        planner = Planner(session.body, motion, options, fps, scenery)
+        numbered = enumerate(zip(setups, files, steps))
+        channels = tuple(planner.channel(a, own, i, step) for i, (a, own, step) in numbered)
     except SessionError as error:  # which key is known there, which file here
         raise SessionError(f"{session.path}: {error}") from error
     return _Plan(session, options, copied, numbers, fps, motion, channels, companions)
