@@ -23,8 +23,9 @@ _SHARES = np.array([0.7, 0.3])
 _FREQUENCIES = np.array([[0.6, 1.1], [1.5, 2.3]])  # from, to; in swings per period
 # Every axis begins a little off the centre: near a session's [start], not on it.
 _FIRST = 0.07
-# The pose (4, 4) so many seconds after the common time of the frame.
-PoseAfter: TypeAlias = Callable[[float], Floats]
+
+PoseAt: TypeAlias = Callable[[float], Floats]
+"""The pose (4, 4) at a time, or so many seconds after that of a frame."""
 
 _ROUNDS = 6  # each leaves the share of a readout in which a feature crosses a row: a thousandth
 _BLUR_STEPS = 9  # positions of a moving marker whose light a frame adds up
@@ -124,7 +125,7 @@ class Shutter:
         """Whether all is seen at the common time."""
         return not (self.late_s or self.readout_s or self.exposure_s)
 
-    def poses(self, sensor: Sensor, point: Floats, pose_after: PoseAfter) -> list[Floats]:
+    def poses(self, sensor: Sensor, point: Floats, pose_after: PoseAt) -> list[Floats]:
         """The poses at which a point (3,) of a body is seen, one for each part of the exposure."""
         if self.is_ideal:
             return [pose_after(0.0)]
@@ -135,7 +136,7 @@ class Shutter:
             for share in shares.tolist()
         ]
 
-    def _moment(self, sensor: Sensor, point: Floats, pose_after: PoseAfter, within: float) -> float:
+    def _moment(self, sensor: Sensor, point: Floats, pose_after: PoseAt, within: float) -> float:
         first = moment = self.late_s + within
         if not self.readout_s:
             return moment

@@ -6,9 +6,8 @@ from a seed.  Sensors of ranges know nothing of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -16,10 +15,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import Sensor
-from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.motion import Motion, PoseAt, plan_motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
-
-PoseAt: TypeAlias = Callable[[float], Floats]
 
 _LAMP = 0.12  # of the body's radius
 _LAMP_LEVEL = 3.0  # of a marker: the image is white there

@@ -20,9 +20,9 @@ from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import CloudSensor, Sensor
-from mixpose.simulation.motion import PoseAfter, Shutter
+from mixpose.simulation.motion import PoseAt, Shutter
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.scenery import PoseAt, Scenery
+from mixpose.simulation.scenery import Scenery
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
 _CORE = 0.45  # of a body's radius: what others are hidden behind
@@ -78,7 +78,7 @@ def look(
     rng: np.random.Generator,
     *,
     offsets: Floats | None = None,
-    pose_after: PoseAfter | None = None,
+    pose_after: PoseAt | None = None,
     time_s: float = 0.0,
     is_away: bool = False,
 ) -> VisibleSpots:
@@ -156,7 +156,7 @@ def hidden_behind(
     return hidden
 
 
-def later(pose: PoseAt, time_s: float) -> PoseAfter:
+def later(pose: PoseAt, time_s: float) -> PoseAt:
     """Poses so many seconds after a time."""
     return lambda seconds: pose(time_s + seconds)
 
@@ -176,7 +176,7 @@ class _Spots:
         body: Body,
         feature: int,
         owner: int,
-        pose_after: PoseAfter,
+        pose_after: PoseAt,
         level: float,
         offset: Floats | None = None,
         mirror: Floats | None = None,
