@@ -151,7 +151,15 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
 
 def displayable(image: NDArray[Any]) -> Picture:
     """A grey image (H, W) of any type with its contrast stretched, brightened where it is dark."""
-    low, high, exponent = _stretch(image)
+    # grey values that become black and white, and the exponent in between
+    step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
+    middle = float(np.median(np.asarray(image[::step, ::step], dtype=np.float64)))
+    few = int(_BEYOND * image.size)
+    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]].tolist()
+    whole = np.issubdtype(image.dtype, np.integer)
+    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
+    share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
+    exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
 
     def curve(values: NDArray[Any]) -> NDArray[np.uint8]:
         share = (values.astype(np.float32) - np.float32(low)) / np.float32(high - low)
@@ -162,18 +170,3 @@ def displayable(image: NDArray[Any]) -> Picture:
     else:
         grey = curve(image)
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-
-
-def _stretch(image: NDArray[Any]) -> tuple[float, float, float]:
-    """Grey values that become black and white, and the exponent in between."""
-    step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
-    sample = np.asarray(image[::step, ::step], dtype=np.float64)
-    middle = float(np.median(sample))
-    few = int(_BEYOND * image.size)
-    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]]
-    low, high = float(low), float(high)
-    whole = np.issubdtype(image.dtype, np.integer)
-    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
-    share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
-    exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
-    return low, high, exponent

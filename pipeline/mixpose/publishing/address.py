@@ -38,13 +38,10 @@ class Address:
 
     def allow(self, *names: str) -> None:
         """Raise an error for options other than these, and those that all addresses have."""
-        self._one_of("option", set(self.options), {*names, "only"})
-        if "only" in self.options:
-            self._one_of("only", {self.options["only"]}, {"ok"})
-
-    def _one_of(self, what: str, found: Collection[str], allowed: Collection[str]) -> None:
-        for each in found:
-            if each not in allowed:
+        values = {self.options["only"]} if "only" in self.options else set()
+        checks = ("option", set(self.options), {*names, "only"}), ("only", values, {"ok"})
+        for what, found, allowed in checks:
+            for each in found - allowed:
                 listed = ", ".join(sorted(allowed))
                 raise self.error(f"{what}: found {each}; allowed: {listed}")
 

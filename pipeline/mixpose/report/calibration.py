@@ -91,7 +91,14 @@ def _above(found: Calibration, unit: str) -> Chart:
 
 def _residuals(found: Calibration, kind: str) -> Chart:
     """Residuals of each frame, as dots, or of each feature, as bars."""
-    numbers, values = _grouped(found, kind)
+    # root mean square by number, in standard deviations
+    keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+    for index, sights in found.sights.items():
+        keys.append(getattr(sights, kind))
+        squares.append((sights.offset**2).sum(axis=1) / found.noise[index] ** 2)
+    numbers, inverse = np.unique(np.concatenate(keys), return_inverse=True)
+    totals, counts = np.bincount(inverse, np.concatenate(squares)), np.bincount(inverse)
+    values = np.sqrt(totals / np.maximum(counts, 1))
     figure, axes = blank()
     if kind == "frame":
         axes.plot(numbers, values, ".", markersize=4, **POSE)
@@ -108,15 +115,3 @@ def _residuals(found: Calibration, kind: str) -> Chart:
     if len(values):
         alt = f"worst: {kind} {numbers[int(np.argmax(values))]}, {values.max():.3g}"
     return Chart(f"Residual of each {kind}", alt, drawn(figure))
-
-
-def _grouped(found: Calibration, kind: str) -> tuple[Any, Any]:
-    """Root mean square residual in standard deviations by frame or feature."""
-    keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for index, sights in found.sights.items():
-        keys.append(getattr(sights, kind))
-        squares.append((sights.offset**2).sum(axis=1) / found.noise[index] ** 2)
-    key, squared = np.concatenate(keys), np.concatenate(squares)
-    numbers, inverse = np.unique(key, return_inverse=True)
-    mean = np.bincount(inverse, squared) / np.maximum(np.bincount(inverse), 1)
-    return numbers, np.sqrt(mean)

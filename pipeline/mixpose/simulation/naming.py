@@ -150,15 +150,8 @@ def _source_files(
         raise SessionError(
             f'{_where(setup.name)}: missing; name what is to be written, like "{setup.name}*.png"'
         )
-    if setup.sensor.dimension == 1:
-        return _range_files(setup, source)
-    if setup.sensor.dimension == 3:
-        path = _filled(source) if isinstance(source, str) else ""
-        if PurePosixPath(path).suffix.casefold() != ".csv":
-            raise SessionError(
-                f"{_where(setup.name)}: found {source!r}; allowed for clouds: a .csv table"
-            )
-        return SourceFiles(setup.name, "detections", path)
+    if setup.sensor.dimension != 2:
+        return _table_files(setup, source)
     files = _camera_files(setup.name, source, numbers)
     if files.path.casefold().endswith(".mp4") and any(n % 2 for n in setup.resolution or ()):
         raise SessionError(
@@ -168,22 +161,22 @@ def _source_files(
     return files
 
 
-def _range_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
+def _table_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
     path = _filled(source) if isinstance(source, str) else ""
     suffix = PurePosixPath(path).suffix.casefold()
-    if suffix == ".npy" and setup.bin_size is None:
+    are_ranges, binned = setup.sensor.dimension == 1, setup.bin_size is not None
+    if are_ranges and suffix == ".npy" and not binned:
         raise SessionError(
             f"sensor {setup.name!r}: bin_size: missing; profiles ({path}) need "
             "range_min and bin_size"
         )
-    if suffix == ".npy" or (suffix == ".csv" and setup.bin_size is not None):
+    if are_ranges and (suffix == ".npy" or (suffix == ".csv" and binned)):
         return SourceFiles(setup.name, "profiles", path)
     if suffix == ".csv":
         return SourceFiles(setup.name, "detections", path)
-    raise SessionError(
-        f"{_where(setup.name)}: found {source!r}; allowed for ranges: a .csv table, or profiles "
-        "as .npy or .csv"
-    )
+    allowed = "ranges: a .csv table, or profiles as .npy or .csv"
+    allowed = allowed if are_ranges else "clouds: a .csv table"
+    raise SessionError(f"{_where(setup.name)}: found {source!r}; allowed for {allowed}")
 
 
 def _camera_files(

@@ -315,19 +315,13 @@ def coverage(polygon: Floats, shape: tuple[int, int]) -> tuple[slice, slice, Flo
     if not height or not width:
         return rows, columns, np.zeros((height, width))
     lines = (np.arange(height * _ROWS_PER_PIXEL) + 0.5) / _ROWS_PER_PIXEL - 0.5 + low[1]
-    left, right = _spans(polygon, lines)
+    # where horizontal lines enter and leave it; alike where they miss it
+    top, bottom = int(polygon[:, 1].argmin()), int(polygon[:, 1].argmax())
+    turned, turn = np.roll(polygon, -top, axis=0), (bottom - top) % len(polygon)
+    sides = [turned[: turn + 1], np.concatenate([turned[turn:], turned[:1]])[::-1]]
+    one, other = (np.interp(lines, side[:, 1], side[:, 0]) for side in sides)
+    left, right = np.minimum(one, other), np.maximum(one, other)
+    right = np.where((lines < polygon[top, 1]) | (lines > polygon[bottom, 1]), left, right)
     edges = np.arange(width) + low[0] - 0.5
     within = np.clip(right[:, None] - edges, 0, 1) - np.clip(left[:, None] - edges, 0, 1)
     return rows, columns, within.reshape(height, _ROWS_PER_PIXEL, width).mean(axis=1)
-
-
-def _spans(polygon: Floats, lines: Floats) -> tuple[Floats, Floats]:
-    """Where horizontal lines v enter and leave a convex polygon; alike where they miss it."""
-    top, bottom = int(polygon[:, 1].argmin()), int(polygon[:, 1].argmax())
-    turned = np.roll(polygon, -top, axis=0)
-    turn = (bottom - top) % len(polygon)
-    sides = [turned[: turn + 1], np.concatenate([turned[turn:], turned[:1]])[::-1]]
-    one, other = (np.interp(lines, side[:, 1], side[:, 0]) for side in sides)
-    missed = (lines < polygon[top, 1]) | (lines > polygon[bottom, 1])
-    left, right = np.minimum(one, other), np.maximum(one, other)
-    return left, np.where(missed, left, right)
