@@ -6,7 +6,7 @@ A range sensor's frame is a strip: what it measured, and where the pose has the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeAlias, cast
 
 import cv2
@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.pictures import canvas, overlay
-from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, polyline, stroke, words
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
 from mixpose.pictures.overlay import Part
 from mixpose.records import (
     Estimate,
@@ -284,18 +284,18 @@ def draw_ranges(
     def across(ranges: Floats) -> Floats:
         return np.asarray(_MARGIN_PX + width * (ranges - low) / (high - low))
 
-    _draw_scale(picture, low, high, across(_ticks(low, high)))
+    _draw_scale(picture, low, high, across)
     text = name if pattern is not None else f"{name}: no frame"
-    words(picture, text, (_MARGIN_PX, 22), WHITE if pattern is not None else GREY)
+    canvas.words(picture, text, (_MARGIN_PX, 22), WHITE if pattern is not None else GREY)
     if isinstance(pattern, GridPattern):
         ranges = pattern.origin[0] + pattern.step * np.arange(pattern.values.shape[1])
         share = np.clip(pattern.values[0] / max(float(pattern.values[0].max()), 1e-30), -0.1, 1.0)
         heights = size[1] * (_BASE - (_BASE - _TOP) * share)
-        polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.FOUND)
+        canvas.polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.FOUND)
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
             bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
-            polyline(picture, bar, overlay.FOUND, width=2)
+            canvas.polyline(picture, bar, overlay.FOUND, width=2)
     if T_world_object is not None:
         colour = overlay.STATUS_COLOURS[status or "ok"]
         spread = half_widths_95(sensor, body, T_world_object, covariance)
@@ -343,20 +343,21 @@ def _round_number(least: float) -> float:
     return unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= least)
 
 
-def _ticks(low: float, high: float) -> Floats:
-    """Round numbers between two ends."""
-    step = _round_number((high - low) / _TICKS)
-    first = np.ceil(low / step - 1e-9)
-    return np.asarray(step * np.arange(int(first), int(np.floor(high / step + 1e-9)) + 1))
-
-
-def _draw_scale(picture: Picture, low: float, high: float, places: Floats) -> None:
+def _draw_scale(
+    picture: Picture, low: float, high: float, across: Callable[[Floats], Floats]
+) -> None:
+    """A line with round numbers between two ends."""
     height = picture.shape[0]
     ends = np.array([[_MARGIN_PX, _BASE * height], [picture.shape[1] - _MARGIN_PX, _BASE * height]])
-    polyline(picture, ends, GREY)
-    for value, u in zip(_ticks(low, high), places, strict=True):
-        polyline(picture, np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]]), GREY)
-        words(picture, f"{value:g}", (u - 8, 0.96 * height), GREY, size=0.8)
+    canvas.polyline(picture, ends, GREY)
+    step = _round_number((high - low) / _TICKS)
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    ticks = np.asarray(step * np.arange(first, last + 1))
+    for value, u in zip(ticks, across(ticks), strict=True):
+        canvas.polyline(
+            picture, np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]]), GREY
+        )
+        canvas.words(picture, f"{value:g}", (u - 8, 0.96 * height), GREY, size=0.8)
 
 
 def _draw_expected(
@@ -364,17 +365,17 @@ def _draw_expected(
 ) -> None:
     """Triangles that point at the expected ranges, names above, and 95 % where wide enough."""
     height = picture.shape[0]
-    tip, half = (_TOP - 0.02) * height, 5.0 * stroke(picture)
+    tip, half = (_TOP - 0.02) * height, 5.0 * canvas.stroke(picture)
     previous = -np.inf
     for i in np.argsort(places):
         u = places[i]
         if not np.isfinite(u):
             continue
         corners = np.array([[u, tip], [u - half, tip - 1.6 * half], [u + half, tip - 1.6 * half]])
-        polyline(picture, corners, colour, closed=True)
+        canvas.polyline(picture, corners, colour, closed=True)
         if spread[i] > half:
             ends = np.array([[u - spread[i], tip], [u + spread[i], tip]])
-            polyline(picture, ends, WHITE)
+            canvas.polyline(picture, ends, WHITE)
         if u - previous > 3 * half:  # else numbers would lie upon each other
-            words(picture, labels[i], (u - 4, tip - 2.2 * half), colour, size=0.8)
+            canvas.words(picture, labels[i], (u - 4, tip - 2.2 * half), colour, size=0.8)
             previous = u

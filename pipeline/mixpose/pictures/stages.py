@@ -24,7 +24,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, matched_objective, region_of_interest
 from mixpose.objective.paper import sampled_terms
 from mixpose.pictures import canvas, overlay
-from mixpose.pictures.canvas import WHITE, Colour, Picture, in_grid, line_height, stacked, words
+from mixpose.pictures.canvas import WHITE, Colour, Picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.scene import backdrop, cut_out
@@ -213,9 +213,9 @@ def densities_picture(
         top = max(peaks) or 1.0  # where nothing was found about the body, all is black
         bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
         drawn = [titled(_coloured(one.values, bottom, top), one.title) for one in panels]
-        row = in_grid(drawn, len(drawn))
+        row = canvas.in_grid(drawn, len(drawn))
         rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
-    return stacked(rows)
+    return canvas.stacked(rows)
 
 
 def panels_of(
@@ -281,7 +281,7 @@ def _coloured(values: Floats, bottom: float, top: float) -> Picture:
 
 def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
     """The scale of a row of panels as a bar, with the powers of ten on it."""
-    line = line_height(panel)
+    line = canvas.line_height(panel)
     shares = np.linspace(0, 1, width)
     bar = np.tile(bottom * (top / bottom) ** shares, (max(round(0.4 * line), 4), 1))
     picture = np.zeros((round(_BAR_LINES * line), width, 3), np.uint8)
@@ -292,6 +292,6 @@ def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
         u = width * (power - np.log10(bottom)) / np.log10(top / bottom)
         if u < width - 8 * line:
             picture[: len(bar), max(round(u) - 1, 0) : round(u) + 1] = 255
-            words(picture, f"1e{power:.0f}", (u, baseline), WHITE, size=0.8)
-    words(picture, f"{top:.1e} / px²", (width - 5 * line, baseline), WHITE, size=0.8)
+            canvas.words(picture, f"1e{power:.0f}", (u, baseline), WHITE, size=0.8)
+    canvas.words(picture, f"{top:.1e} / px²", (width - 5 * line, baseline), WHITE, size=0.8)
     return picture

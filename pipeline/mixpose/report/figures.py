@@ -72,17 +72,12 @@ _BINS = 40
 
 def blank(height: float = _HEIGHT) -> tuple[Figure, Axes]:
     """An empty figure with one pair of axes; `height` in inches."""
-    figure, axes = _figure(height, (1.0,))
-    return figure, axes[0]
+    figure, (axes,) = stacked((1.0,), height)
+    return figure, axes
 
 
-def stacked(shares: tuple[float, float]) -> tuple[Figure, tuple[Axes, Axes]]:
-    """A figure with two pairs of axes, one above the other, with a common time axis."""
-    figure, axes = _figure(_HEIGHT * 1.15, shares)
-    return figure, (axes[0], axes[1])
-
-
-def _figure(height: float, shares: tuple[float, ...]) -> tuple[Figure, list[Axes]]:
+def stacked(shares: tuple[float, ...], height: float = 1.15 * _HEIGHT) -> tuple[Figure, list[Axes]]:
+    """A figure with pairs of axes one above the other, with a common time axis."""
     from matplotlib import rc_context  # noqa: PLC0415 - heavy
     from matplotlib.figure import Figure  # noqa: PLC0415
 
