@@ -13,13 +13,11 @@ import pytest
 
 from mixpose.body import Body, PointFeature
 from mixpose.checking import geometry_doubts, survey
-from mixpose.checking.adjusted import Adjustment, adjusted, promise
 from mixpose.checking.changes import Change, of_units
-from mixpose.checking.evidence import best_pose
-from mixpose.checking.meetings import Seen
+from mixpose.checking.evidence import Seen, best_pose
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
-from mixpose.checking.values import unknowns
+from mixpose.checking.values import Adjustment, adjusted, promise, unknowns
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import PointPattern

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose.density import Atlas, observation
 from mixpose.objective import View, project_body
-from mixpose.pictures.densities import densities_picture
+from mixpose.pictures.stages import densities_picture
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import run
 from mixpose.selection import Selection

@@ -80,7 +80,7 @@ def test_whatever_is_imported_is_declared_and_what_is_extra_only_where_it_is_nee
             used.add(distribution)
             if at_once and distribution not in always:
                 with_extra.add(name)
-    page = {f"mixpose.viewing.{name}" for name in ("page", "scene", "series", "server")}
+    page = {f"mixpose.viewing.{name}" for name in ("page", "scene", "server")}
     assert with_extra == {"mixpose.rerun_file"} | page
     assert not [name for name in needed if name not in with_extra and needed[name] & with_extra]
     assert used == (always | extra) - {"mixpose"}  # and nothing is declared that nobody imports

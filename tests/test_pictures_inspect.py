@@ -23,12 +23,12 @@ from mixpose.fit import EstimatorOptions
 from mixpose.frames import pair
 from mixpose.objective import ObjectiveName, View
 from mixpose.pictures.advice import describe
-from mixpose.pictures.densities import densities_picture, panels_of
 from mixpose.pictures.finding import Finding, find
 from mixpose.pictures.overlay import Part
+from mixpose.pictures.plots import objective_around
 from mixpose.pictures.sheet import fitted_blurs
 from mixpose.pictures.signature import write_png
-from mixpose.pictures.slices import objective_around
+from mixpose.pictures.stages import densities_picture, panels_of
 from mixpose.records import Estimate, PointPattern, Status
 from mixpose.rigid import transform
 from mixpose.runner import begin, observe, open_sources, run

@@ -29,8 +29,7 @@ from mixpose.pictures.overlay import (
     projected_covariances,
     projected_features,
 )
-from mixpose.pictures.ranges import draw_ranges
-from mixpose.pictures.scene import draw_scene
+from mixpose.pictures.scene import draw_ranges, draw_scene
 from mixpose.pictures.signature import is_ours
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
 from mixpose.rigid import from_parts, perturb, transform

@@ -18,10 +18,9 @@ from mixpose.errors import SessionError
 from mixpose.poses.header import Header
 from mixpose.publishing import SENDERS, Publishing, address
 from mixpose.publishing.address import parse
-from mixpose.publishing.backlog import Backlog
+from mixpose.publishing.channel import Backlog
 from mixpose.publishing.message import Message
-from mixpose.publishing.ros_messages import ros_messages, topics
-from mixpose.publishing.ros_node import RosNodeSender
+from mixpose.publishing.ros2 import RosNodeSender, ros_messages, topics
 from mixpose.records import Estimate, Hypothesis, Moment
 from mixpose.rigid import from_rotation_vector, perturb, twist_between
 from mixpose.session import load_session

@@ -21,7 +21,7 @@ from command_line import lines_of, started, wait_until
 
 from mixpose.poses.header import Header
 from mixpose.publishing import Publishing
-from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.channel import PublishingRules
 from mixpose.records import Estimate, FrameSet, Moment, RawFrame, SensorReport
 
 CLIP = Path(__file__).parents[1] / "data" / "synthetic" / "one_camera_video" / "camera.avi"

@@ -13,7 +13,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Status
-from mixpose.report.drawing import TimeAxes, blank
+from mixpose.report.figures import TimeAxes, blank
 from mixpose.report.overlays import chosen_frames
 from mixpose.report.series import (
     errors_of,

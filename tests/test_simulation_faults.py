@@ -18,8 +18,8 @@ from mixpose.frames import read_image
 from mixpose.records import Image, PointPattern
 from mixpose.session import load_session
 from mixpose.simulation import SimulationOptions, simulate
-from mixpose.simulation.outlines import centroid, coverage, outline
 from mixpose.simulation.recording import TRUTH_NAME
+from mixpose.simulation.visible_spots import centroid, coverage, outline
 
 Floats = NDArray[np.float64]
 

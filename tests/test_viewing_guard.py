@@ -13,8 +13,7 @@ from command_line import assert_one_line, mixpose
 
 from mixpose.cli.optional_values import with_values
 from mixpose.errors import SessionError
-from mixpose.viewing.address import Place, listen
-from mixpose.viewing.guard import Guard
+from mixpose.viewing.address import Guard, Place, listen
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 LOCAL = Guard(8080, None)

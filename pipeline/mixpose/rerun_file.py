@@ -29,7 +29,6 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mixpose import rigid
-from mixpose.body import Body
 from mixpose.density import Observation, Window, render
 from mixpose.frames import Source, pair
 from mixpose.poses.poseline import PoseLine
@@ -55,20 +54,9 @@ def write_rerun_file(
 ) -> None:
     """Write the recording of the frames that have a pose line.
 
-    Parameters
-    ----------
-    path : Path
-    session : Session
-        That the poses were estimated with.
-    sources : mapping of str to Source
-        Its recordings, opened.
-    lines : sequence of PoseLine
-        By ascending frame number, in the unit of the session.
-
-    Raises
-    ------
-    RecordingError
-        If a frame cannot be read; the file then holds the frames before it.
+    Its sources are opened; lines are by ascending frame number, in the unit of the session that the
+    poses were estimated with. A `RecordingError` if a frame cannot be read; the file then holds the
+    frames before it.
     """
     stream = rr.RecordingStream("mixpose", send_properties=False)
     stream.set_log_time_enabled(False)
@@ -98,7 +86,7 @@ class _Scene:
         for one in self.session.objects:
             for label in one.labels:
                 points = rr.Points3D(one.body.means)
-                self._log(["world", label, "points"], points, static=True)
+                self.stream.log(["world", label, "points"], points, static=True)
 
     def play(self, sources: Mapping[str, Source], lines: Sequence[PoseLine]) -> None:
         """Log frame by frame; poses of frames that no source has come last."""
@@ -123,25 +111,22 @@ class _Scene:
         for line in lines:
             self._pose(line)
 
-    def _log(self, place: Sequence[str], *what: Any, static: bool = False) -> None:
-        self.stream.log(list(place), *what, static=static)
-
     def _sensor(self, setup: SensorSetup, lines: Sequence[PoseLine]) -> None:
         sensor = setup.sensor
         place = ["world", setup.name]
         if isinstance(sensor, RangeSensor):
-            self._log(place, rr.Points3D([sensor.position], labels=[setup.name]), static=True)
+            self.stream.log(place, rr.Points3D([sensor.position], labels=[setup.name]), static=True)
             return
         if not isinstance(sensor, PinholeCamera | FisheyeCamera):
             return
         T_world_sensor = rigid.inverse(sensor.T_sensor_world)
-        self._log(place, _transform(T_world_sensor), static=True)
+        self.stream.log(place, _transform(T_world_sensor), static=True)
         K = sensor.camera_matrix.copy()
         K[:2, 2] += _HALF
         resolution = sensor.resolution or tuple(np.round(2 * K[:2, 2]).astype(int))
         origins = [line.T_world_object for line in lines if line.T_world_object is not None]
         away = [np.linalg.norm(T[:3, 3] - T_world_sensor[:3, 3]) for T in origins[:1]]
-        self._log(
+        self.stream.log(
             [*place, "image"],
             rr.Pinhole(
                 image_from_camera=K,
@@ -158,73 +143,69 @@ class _Scene:
         size = setup.resolution
         place = ["world", setup.name, "image"]
         if not isinstance(frame.data, PointPattern | GridPattern):
-            self._log(place, _jpeg(_eight_bits(frame.data)))
+            self.stream.log(place, _jpeg(_eight_bits(frame.data)))
             size = (frame.data.shape[1], frame.data.shape[0])
         observation = observation_of(self.session, setup, frame)
         pattern = observation.pattern
         if isinstance(pattern, PointPattern) and pattern.dimension == 2:
             found, radius = pattern.points + _HALF, rr.Radius.ui_points(4)
-            self._log([*place, "features"], rr.Points2D(found, radii=radius, colors=_FOUND))
+            self.stream.log([*place, "features"], rr.Points2D(found, radii=radius, colors=_FOUND))
         density = _density(observation, size)
         if density is not None:
-            self._log(["density", setup.name], density)
+            self.stream.log(["density", setup.name], density)
 
     def _pose(self, line: PoseLine) -> None:
         # of several bodies each has entities of its own
         own = [line.label] if len(self.session.labels) > 1 else []
         said = f"{line.label} " if own else ""
         score = line.score if line.score is not None else 1.0
-        self._log(["plots", "score", *own], rr.Scalars(score))
-        self._log(["status", *own], rr.TextLog(f"frame {line.frame}: {said}{line.status}"))
-        places = (["world", line.label], ["world", f"{line.label} covariance"])
+        self.stream.log(["plots", "score", *own], rr.Scalars(score))
+        self.stream.log(["status", *own], rr.TextLog(f"frame {line.frame}: {said}{line.status}"))
+        places = ["world", line.label], ["world", f"{line.label} covariance"]
         T = line.T_world_object
         predicted = [
             ["world", setup.name, "image", "predicted", *own] for setup in self.session.sensors
         ]
         if T is None:
             for place in (*places, *predicted):
-                self._log(place, rr.Clear(recursive=False))
+                self.stream.log(place, rr.Clear(recursive=False))
             # a transform that is cleared leaves the points where the world's origin is
-            self._log(["world", line.label, "points"], rr.Points3D.from_fields(radii=[0.0]))
+            self.stream.log(["world", line.label, "points"], rr.Points3D.from_fields(radii=[0.0]))
             return
-        body = self._body_of(line)
+        bodies = {one.body.name: one.body for one in self.session.objects}
+        body = bodies.get(line.object, self.session.body)
         colour = _COLOURS[line.status]
         labels = self.session.labels
         if own and line.status == "ok" and line.label in labels:
             colour = _BODY_COLOURS[labels.index(line.label) % len(_BODY_COLOURS)]
-        self._log(places[0], _transform(T))
+        self.stream.log(places[0], _transform(T))
         shown = rr.Points3D.from_fields(radii=[0.03 * body.radius], colors=[colour])
-        self._log([*places[0], "points"], shown)
+        self.stream.log([*places[0], "points"], shown)
         if line.covariance is None:
-            self._log(places[1], rr.Clear(recursive=False))
+            self.stream.log(places[1], rr.Clear(recursive=False))
         else:
-            self._log(places[1], _ellipsoid(T[:3, 3], line.covariance, colour))
+            # where the position is with 95 %
+            half_axes, axes = rigid.position_ellipsoid_95(line.covariance)
+            turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
+            ellipsoid = rr.Ellipsoids3D(
+                half_sizes=[half_axes],
+                centers=[T[:3, 3]],
+                quaternions=[rr.Quaternion(xyzw=turn)],
+                colors=[colour],
+            )
+            self.stream.log(places[1], ellipsoid)
         world = rigid.transform(T, body.means)
         for setup, place in zip(self.session.sensors, predicted, strict=True):
             if setup.sensor.dimension == 2:
                 points, seen = setup.sensor.project(world)
                 radius = rr.Radius.ui_points(2)
-                self._log(place, rr.Points2D(points[seen] + _HALF, radii=radius, colors=colour))
-
-    def _body_of(self, line: PoseLine) -> Body:
-        bodies = {one.body.name: one.body for one in self.session.objects}
-        return bodies.get(line.object, self.session.body)
+                self.stream.log(
+                    place, rr.Points2D(points[seen] + _HALF, radii=radius, colors=colour)
+                )
 
 
 def _transform(T_parent_child: Floats) -> Any:
     return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
-
-
-def _ellipsoid(centre: Floats, covariance: Floats, colour: tuple[int, int, int]) -> Any:
-    """Where the position is with 95 %; `covariance` is (6, 6)."""
-    half_axes, axes = rigid.position_ellipsoid_95(covariance)
-    turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
-    return rr.Ellipsoids3D(
-        half_sizes=[half_axes],
-        centers=[centre],
-        quaternions=[rr.Quaternion(xyzw=turn)],
-        colors=[colour],
-    )
 
 
 def _eight_bits(image: Image) -> NDArray[np.uint8]:

@@ -28,7 +28,7 @@ _SIMULATION = (
     ),
     Mutant(
         "simulation-one-generator-for-all-frames",
-        "simulation/draws.py",
+        "simulation/options.py",
         "[seed, int(purpose), *key]",
         "[seed, int(purpose)]",
         "every frame has the same noise",
@@ -112,7 +112,7 @@ _SIMULATION = (
     ),
     Mutant(
         "simulation-weightless-frames-left-out",
-        "simulation/writers.py",
+        "simulation/render.py",
         "points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)",
         "points, weights = np.zeros((0, len(self._coordinates))), np.zeros(0)",
         "a frame without detections is missing from its table",
@@ -132,7 +132,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-values-cost-nothing-and-have-no-prior",
-        "checking/adjusted.py",
+        "checking/values.py",
         "b[-k:] = np.eye(k), -values / unknown.deviations",
         "b[-k:] = 1e9 * np.eye(k), -values / unknown.deviations",
         "values stay where they are, and no size is found",
@@ -180,7 +180,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-displaced-images-are-not-met",
-        "checking/meetings.py",
+        "checking/evidence.py",
         "if _count(pairs) < _MISSED * expected:",
         "if _count(pairs) < 0:",
         "a camera with the principal point of another is not found out",
@@ -245,14 +245,14 @@ _CHECKING = (
     ),
     Mutant(
         "checking-one-of-two-is-too-few",
-        "checking/advice.py",
+        "checking/keys.py",
         "if count < min(_FEW * least, least - 1):",
         "if count < _FEW * least:",
         "a single hidden feature of two is warned about",
     ),
     Mutant(
         "checking-middle-at-the-corner",
-        "checking/sensor_keys.py",
+        "checking/keys.py",
         "np.abs((cx, cy) - (size - 1) / 2)",
         "np.abs((cx, cy) - (size - 1))",
         "every good calibration is doubted",
@@ -266,7 +266,7 @@ _CHECKING = (
     ),
     Mutant(
         "checking-half-of-the-image",
-        "checking/typical.py",
+        "checking/placement.py",
         "return max(round(2 * u) + 1, 1), max(round(2 * v) + 1, 1)",
         "return max(round(u) + 1, 1), max(round(v) + 1, 1)",
         "an image of unknown size is taken for a quarter of it",
@@ -335,14 +335,14 @@ _RUNNER = (
 _PUBLISHING = (
     Mutant(
         "publishing-newest-goes",
-        "publishing/backlog.py",
+        "publishing/channel.py",
         "self._messages.popleft()\n                self.dropped += 1",
         "self._messages.pop()\n                self.dropped += 1",
         "a receiver that was away gets what is old",
     ),
     Mutant(
         "publishing-put-back-at-the-end",
-        "publishing/backlog.py",
+        "publishing/channel.py",
         "self._messages.appendleft(message)",
         "self._messages.append(message)",
         "poses arrive out of their order after a receiver was away",

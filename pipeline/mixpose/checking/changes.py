@@ -14,43 +14,28 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, PointFeature
-from mixpose.checking.evidence import Views
+from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
 
+_OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
+
 
 @dataclass(frozen=True)
 class Change:
-    """A change of a session, and what it would mean.
+    """A change of a session, and what it would mean."""
 
-    Attributes
-    ----------
-    what : str
-        What is wrong, with a verb that "may be" can replace in ``{is}`` or ``{are}``.
-    remedy : str
-        What explains the frames: "with ...".
-    views : callable
-        What is seen, and by which sensors, by what is given.
-    body : callable
-        The body by the one given.
-    cost : float
-        Nats that the choice of its values costs.
-    values : int
-        How many are chosen.
-    feature : int or None
-        The only one that is changed.
-    """
-
-    what: str
-    remedy: str
+    what: str  # is wrong, with a verb that "may be" can replace in ``{is}`` or ``{are}``
+    remedy: str  # what explains the frames: "with ..."
+    # what is seen, and by which sensors, by what is given
     views: Callable[[Views], Views] = lambda views: views
-    body: Callable[[Body], Body] = lambda body: body
-    cost: float = 0.0
-    values: int = 0
-    feature: int | None = None
+    body: Callable[[Body], Body] = lambda body: body  # by the one given
+    cost: float = 0.0  # nats that the choice of its values costs
+    values: int = 0  # how many are chosen
+    feature: int | None = None  # the only one that is changed
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
@@ -82,32 +67,35 @@ def changes(session: Session) -> Iterator[Change]:
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
             lenses = {a: _with_lens(sensors[a], sensors[b]), b: _with_lens(sensors[b], sensors[a])}
-            yield Change(
+            yield _of_sensors(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
-                lambda views, lenses=lenses: [  # type: ignore[misc]
-                    with_sensor(view, lenses.get(view.name, view.sensor)) for view in views
-                ],
+                (a, b),
+                lambda view, lenses=lenses: with_sensor(view, lenses[view.name]),  # type: ignore[misc]
             )
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
     for names in _all_or_one(list(sized)):
-        yield Change(
+        yield _of_sensors(
             f"images of {called(names)} {{are}} mirrored",
             "with left and right of them exchanged",
-            lambda views, names=names: [  # type: ignore[misc]
-                _flipped(view, sized[view.name]) if view.name in names else view for view in views
-            ],
+            names,
+            lambda view: _flipped(view, sized[view.name]),
         )
     for names in _all_or_one([setup.name for setup in cameras]):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
-            yield Change(
+            yield _of_sensors(
                 f"camera_matrix of {called(names)} {{is}} that of images {images} as large",
                 f"with fx, fy, cx and cy {done}",
-                lambda views, names=names, factor=factor: [  # type: ignore[misc]
-                    with_sensor(view, scaled(view.sensor, factor)) if view.name in names else view
-                    for view in views
-                ],
+                names,
+                lambda view, k=factor: with_sensor(view, scaled(view.sensor, k)),  # type: ignore[misc]
             )
+
+
+def _of_sensors(
+    what: str, remedy: str, names: Sequence[str], changed: Callable[[View], View]
+) -> Change:
+    """A change of the views of some sensors."""
+    return Change(what, remedy, lambda views: [changed(v) if v.name in names else v for v in views])
 
 
 def scaled(sensor: Any, factor: float) -> Any:
@@ -174,13 +162,12 @@ def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
         if not np.allclose(each.T_sensor_world, np.eye(4), atol=1e-5)
     ]
     for names in _all_or_one(far):
-        yield Change(
+        yield _of_sensors(
             f"T_sensor_world of {called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
             "(it maps world to sensor coordinates)",
             "with the inverse",
-            lambda views, names=names: [  # type: ignore[misc]
-                _inverted(view) if view.name in names else view for view in views
-            ],
+            names,
+            _inverted,
         )
 
 
@@ -211,3 +198,41 @@ def _flipped(view: View, width: int) -> View:
     points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
     flipped = replace(pattern, points=np.asarray(points))
     return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))
+
+
+def other_sizes(session: Session, frames: Frames) -> Iterator[Change]:
+    """A body of the size that cameras see where each alone finds it.
+
+    Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
+    in two cameras that stand at (R, t) to each other.
+    """
+    body = session.body
+    if not all(isinstance(feature, PointFeature) for feature in body.features):
+        return
+    middle = np.append(body.means.mean(axis=0), 1.0)
+    found = []
+    for number, views in frames:
+        places = [(view.sensor, _alone(session, number, view)) for view in views]
+        seen = [(each, T) for each, T in places if T is not None]
+        for (a, T_a), (b, T_b) in combinations(seen, 2):
+            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)  # type: ignore[attr-defined]
+            p_a = (a.T_sensor_world @ T_a @ middle)[:3]  # type: ignore[attr-defined]
+            p_b = (b.T_sensor_world @ T_b @ middle)[:3]  # type: ignore[attr-defined]
+            apart = p_b - T_ba[:3, :3] @ p_a
+            found.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
+    size, (least, most) = float(np.median(found or [1.0])), _OTHER_SIZE
+    if abs(size - 1) > least and 1 / most < size < most:
+        yield Change(
+            OTHER_SIZE,
+            f"with points {size:.3g} times as large",
+            body=lambda body: of_size(body, size),
+            values=1,
+        )
+
+
+def _alone(session: Session, number: int, view: View) -> Floats | None:
+    """T_world_object (4, 4) that one camera finds by itself."""
+    if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
+        return None
+    pose = best_pose(anywhere(session), session.body, number, [view])
+    return None if pose is None else pose.T_world_object

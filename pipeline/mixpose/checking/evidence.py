@@ -1,21 +1,27 @@
-"""How well frames are explained by a body and sensors, as they are given or as they may be."""
+"""How well frames are explained by a body and sensors, as they are given or as they may be.
+
+And which feature was met by which detection, for values that are fitted to several frames.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.checking.lookalikes import NOISE_OF_SIGMA
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
+from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, PointPattern
 from mixpose.runner import begin
+from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.frame import Start
@@ -23,6 +29,14 @@ from mixpose.tracking.likelihood import likelihood_of
 
 Views: TypeAlias = Sequence[View]
 Frames: TypeAlias = Sequence[tuple[int, Views]]
+Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # as in `Seen`
+Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
+
+_MISSED = 0.3  # of the body: a camera that meets less mostly misses it
+_REACH = 3.0  # times sigma, from a displaced feature to its detection
+_BESIDE = 10.0  # times sigma, from a feature that is missed to a detection that may be its own
+_AWAY = 0.15  # of the image, the longest displacement
+_DISPLACEMENTS = 2000  # that are tried
 
 
 @dataclass(frozen=True)
@@ -60,11 +74,9 @@ def evidence_of(pose: ScoredPose | None) -> float:
 
 
 def rms_of(pose: ScoredPose, feature: int | None = None) -> float:
-    """Root mean square of the offsets of a pose, or of a feature there, in sigma; NaN of none.
-
-    A cut spot counts as far as it is exact.
-    """
+    """Root mean square offset of a pose, or of a feature there, in sigma; NaN of none."""
     matches, noise = pose.matches, NOISE_OF_SIGMA**2
+    # a cut spot counts as far as it is exact
     shares = (matches.shares * (noise / (noise + matches.extra)))[:, _columns(feature)]
     total = float(shares.sum())
     squares = float((shares * matches.squared[:, _columns(feature)]).sum())
@@ -121,3 +133,116 @@ def pose_near(
             return None
         likelihood, start = likelihood_of(data), Start(T_world_object, data.close)
         return likelihood.judge(likelihood.fit(start), start)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one camera met of the body in a frame."""
+
+    name: str
+    features: Indices  # (n,)
+    observed: Floats  # (n, 2)
+    noise: Floats  # (n,) standard deviations, in sensor units; of cut spots larger ones
+
+
+def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
+    """What poses met, frame by frame and camera by camera.
+
+    A camera that mostly misses the body may see it elsewhere, and about as far off in all frames:
+    by the displacement that brings most of the predicted features upon detections.
+    """
+    cameras: dict[str, list[tuple[int, View]]] = {}
+    for f, (views, pose) in enumerate(frames):
+        for view in views:
+            if is_camera(view) and view.name in pose.matches.names:
+                cameras.setdefault(view.name, []).append((f, view))
+    seen: list[list[Seen]] = [[] for _ in frames]
+    for name, own in cameras.items():
+        matches = [frames[f][1].matches for f, _ in own]
+        rows = [each.names.index(name) for each in matches]
+        pairs = [_met(each, k) for each, k in zip(matches, rows)]
+        expected = sum(float(each.expected[k]) for each, k in zip(matches, rows))
+        if _count(pairs) < _MISSED * expected:
+            predicted = [
+                (np.flatnonzero(each.weights[k] > 0), each.places[k])
+                for each, k in zip(matches, rows)
+            ]
+            pairs = max(pairs, _shifted([view for _, view in own], predicted), key=_count)
+        for (f, _), met in zip(own, pairs):
+            if len(met[0]):
+                seen[f].append(Seen(name, *met))
+    return seen
+
+
+def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
+    """Features that were missed, with the nearest detection that belongs to none."""
+    found = []
+    for views, pose in frames:
+        matches, own = pose.matches, list[Seen]()
+        for view in filter(is_camera, views):
+            if view.name not in matches.names:
+                continue
+            k = matches.names.index(view.name)
+            features = np.flatnonzero((matches.weights[k] > 0) & (matches.shares[k] <= 0.5))
+            taken = matches.detections[k, matches.shares[k] > 0.5]  # by which features are met
+            free = np.setdiff1d(np.arange(len(_pattern(view).points)), taken)
+            if len(features) and len(free):
+                near = _BESIDE * view.observation.sigma
+                away, at = cKDTree(_pattern(view).points[free]).query(
+                    matches.places[k, features], distance_upper_bound=near
+                )
+                is_near = np.isfinite(away)
+                own.append(Seen(view.name, *_pairs(view, features[is_near], free[at[is_near]])))
+        found.append(own)
+    return found
+
+
+def is_camera(view: View) -> bool:
+    """Whether a view holds points in the image of a camera with a centre."""
+    return isinstance(view.sensor, PinholeCamera | FisheyeCamera) and isinstance(
+        view.observation.pattern, PointPattern
+    )
+
+
+def _pattern(view: View) -> PointPattern:
+    pattern = view.observation.pattern
+    assert isinstance(pattern, PointPattern)
+    return pattern
+
+
+def _pairs(view: View, features: Indices, detections: Indices) -> Pairs:
+    pattern, noise = _pattern(view), NOISE_OF_SIGMA * view.observation.sigma
+    deviations = np.hypot(noise, np.broadcast_to(pattern.deviations, pattern.size))
+    return features, pattern.points[detections], deviations[detections]
+
+
+def _count(pairs: Sequence[Pairs]) -> int:
+    return sum(len(features) for features, *_ in pairs)
+
+
+def _met(matches: Matches, k: int) -> Pairs:
+    features = np.flatnonzero(matches.shares[k] > 0.5)
+    observed = matches.places[k, features] + matches.sigmas[k] * matches.offsets[k, features]
+    deviations = np.sqrt(NOISE_OF_SIGMA**2 + matches.extra[k, features])
+    return features, observed, matches.sigmas[k] * deviations
+
+
+def _shifted(views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]) -> list[Pairs]:
+    """Features and the detections upon which one displacement of all brings them."""
+    detections, sensor = [_pattern(view).points for view in views], views[0].sensor
+    assert isinstance(sensor, PinholeCamera | FisheyeCamera)
+    differences = np.concatenate(
+        [(d[:, None] - y[None, i]).reshape(-1, 2) for d, (i, y) in zip(detections, predicted)]
+    )
+    far = _AWAY * 2 * float(sensor.camera_matrix[0, 2])
+    differences = differences[np.linalg.norm(differences, axis=1) < far][:_DISPLACEMENTS]
+    trees, near = [cKDTree(d) for d in detections], _REACH * views[0].observation.sigma
+
+    def hits(shift: Any) -> list[Pairs]:
+        found = []
+        for tree, view, (i, y) in zip(trees, views, predicted):
+            away, at = tree.query(y[i] + shift, distance_upper_bound=near)
+            found.append(_pairs(view, i[np.isfinite(away)], at[np.isfinite(away)]))
+        return found
+
+    return max(map(hits, differences), key=_count, default=[])

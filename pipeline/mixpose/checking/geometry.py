@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking.advice import judge
 from mixpose.checking.changes import Change, of_units
 from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
+from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
@@ -25,7 +25,7 @@ from mixpose.records import FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin, observe
 from mixpose.sensors import FisheyeCamera, PinholeCamera
-from mixpose.session import SensorSetup, Session
+from mixpose.session import Session
 
 CAUSES = (
     "is one of them out of step, or its calibration, T_sensor_world or source that of another? Or "
@@ -38,35 +38,16 @@ _FIRST = 40  # frames of videos among which they are: to get far into one takes 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What frames tell of a session.
-
-    Attributes
-    ----------
-    warnings : tuple of str
-    explains : bool
-        Whether a change was found with which frames are explained: numbers of features that are
-        unlike what the body has are no more odd then.
-    """
+    """What frames tell of a session."""
 
     warnings: tuple[str, ...] = ()
-    explains: bool = False
+    explains: bool = False  # whether a change does: numbers of features are no more odd then
 
 
 def geometry_doubts(
     session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
 ) -> Doubts:
-    """What of a session is most likely wrong, by a few frames of its recording.
-
-    Nothing is said of several bodies, and of streams, which are read once.
-
-    Parameters
-    ----------
-    session : Session
-    sources : mapping of str to Source
-        By sensor name.
-    surveys : mapping of str to Survey
-        What their frames hold.
-    """
+    """What of a session of one body, and not of streams, is most likely wrong, by a few frames."""
     streams = any(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()
@@ -74,19 +55,17 @@ def geometry_doubts(
     cameras = any(isinstance(s.sensor, PinholeCamera | FisheyeCamera) for s in session.sensors)
     if len(session.labels) > 1 or streams or not (cameras or len(sources) > 1):
         return Doubts()
-    count = DiagnosisRules().frames
-    chosen = list(_shared(session, sources, surveys, count))
-    frames = [(each.number, observe(session, each)) for each in chosen]
+    recording, count = _Recording(session, sources, surveys), DiagnosisRules().frames
+    frames = [(each.number, observe(session, each)) for each in recording.shared(count)]
     if not frames:
         return Doubts()
-    others = _otherwise(session, sources, surveys, [number for number, _ in frames])
+    others = _otherwise(recording, [number for number, _ in frames])
     if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
-        return _at_the_start(session, sources, surveys)
+        return _at_the_start(recording)
 
     def further() -> Frames:
         """As many frames again, between those."""
-        known = {number for number, _ in frames}
-        more = _shared(session, sources, surveys, 2 * count, known)
+        more = recording.shared(2 * count, {number for number, _ in frames})
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
     found = diagnosis(session, frames, others, further)
@@ -94,7 +73,63 @@ def geometry_doubts(
         return Doubts((f"{found.change}, {found.gain}",), explains=True)
     if not found.good and len(sources) > 1:
         return Doubts(_contradiction(session, frames))
-    return _at_the_start(session, sources, surveys)
+    return _at_the_start(recording)
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """The frames of a session, and what was found in them."""
+
+    session: Session
+    sources: Mapping[str, Source]
+    surveys: Mapping[str, Survey]
+
+    def shared(self, count: int, known: Container[int] = ()) -> Iterator[FrameSet]:
+        """A few frames all over the recording, those that show most first, without those known."""
+        shown = self._shown()
+
+        def richness(number: int) -> float:
+            return sum(each[number] for each in shown)
+
+        parts = np.array_split(np.array(self.numbers(), dtype=int), count)
+        best = [max(part.tolist(), key=richness) for part in parts if len(part)]
+        best = [number for number in best if number not in known]
+        yield from self.read(sorted(best, key=lambda n: (-richness(n), n)))
+
+    def numbers(self) -> list[int]:
+        """Frames in which all sensors see something, or that they have."""
+        shown = self._shown()
+        full = [{n for n, count in each.items() if count} for each in shown]
+        numbers = sorted(set.intersection(*full) or set.intersection(*[{*each} for each in shown]))
+        is_video = any(isinstance(source, Video) for source in self.sources.values())
+        return numbers[:_FIRST] if is_video else numbers
+
+    def _shown(self) -> list[dict[int, float]]:
+        """How much of the body each frame may show, by sensor."""
+        shown = []
+        for setup in self.session.sensors:
+            found = self.surveys[setup.name]
+            counts = found.counts or [1] * len(found.counted)
+            most, empty = expected_count(setup, self.session), {*found.empty}
+            pairs = zip(found.counted, counts, strict=True)
+            shown.append({n: 0.0 if n in empty else float(min(k, most)) for n, k in pairs})
+        return shown
+
+    def read(self, numbers: Sequence[int]) -> Iterator[FrameSet]:
+        """Frames with what was found in them; none after one that cannot be read."""
+        for number in numbers:
+            frames = {}
+            for name, source in self.sources.items():
+                if name in self.surveys and number in self.surveys[name].found:
+                    frames[name] = self.surveys[name].found[number]
+                    continue
+                try:
+                    with closing(source.frames(number, number + 1)) as found:
+                        frames[name] = next(found)
+                except (RecordingError, StopIteration):  # said of the recording
+                    return
+            times = [each.time_s for each in frames.values() if each.time_s is not None]
+            yield FrameSet(number, min(times, default=None), frames)
 
 
 def _can_tell(views: Views) -> bool:
@@ -104,12 +139,10 @@ def _can_tell(views: Views) -> bool:
     return len(points) < len(patterns) or sum(each.size for each in points) > len(TWIST_NAMES)
 
 
-def _at_the_start(
-    session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
-) -> Doubts:
+def _at_the_start(recording: _Recording) -> Doubts:
     """Whether the first frame has the body at [start] only if points are in another unit."""
-    rules, start = DiagnosisRules(), session.start
-    first = next(_read(sources, surveys, _numbers(session, surveys, sources)[:1]), None)
+    rules, session, start = DiagnosisRules(), recording.session, recording.session.start
+    first = next(recording.read(recording.numbers()[:1]), None)
     if start is None or first is None:
         return Doubts()
     number, views, T = first.number, observe(session, first), start.T_world_object
@@ -146,98 +179,25 @@ def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
     )
 
 
-def _otherwise(
-    session: Session,
-    sources: Mapping[str, Source],
-    surveys: Mapping[str, Survey],
-    numbers: Sequence[int],
-) -> list[tuple[Change, Frames]]:
+def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:
     """The other polarity, where images hold too few features or too many."""
-    odd = [
-        setup
-        for setup in session.sensors
-        if (counts := surveys[setup.name].counts)
-        and surveys[setup.name].size is not None
-        and setup.extract.method in ("blobs", "log")
-        and judge(float(np.median(counts)), *_expected(setup, session)) is not None
-    ]
-    if len(odd) < len(session.sensors):
-        return []
-    polarity: Literal["bright", "dark"] = (
-        "dark" if odd[0].extract.polarity == "bright" else "bright"
-    )
+    session, surveys = recording.session, recording.surveys
+    for setup in session.sensors:
+        counts, expected = surveys[setup.name].counts, expected_count(setup, session)
+        is_odd = (
+            counts
+            and surveys[setup.name].size is not None
+            and setup.extract.method in ("blobs", "log")
+            and judge(float(np.median(counts)), expected, fewest_count(setup, session)) is not None
+        )
+        if not is_odd:
+            return []
+    is_bright = session.sensors[0].extract.polarity == "bright"
+    polarity: Literal["bright", "dark"] = "dark" if is_bright else "bright"
     setups = [replace(s, extract=replace(s.extract, polarity=polarity)) for s in session.sensors]
     changed = replace(session, sensors=tuple(setups))
     change = Change(
         f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
     )
-    seen = [(each.number, observe(changed, each)) for each in _read(sources, {}, numbers)]
-    return [(change, seen)]
-
-
-def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
-    return expected_count(setup, session), fewest_count(setup, session)
-
-
-def _shared(
-    session: Session,
-    sources: Mapping[str, Source],
-    surveys: Mapping[str, Survey],
-    count: int,
-    known: Container[int] = (),
-) -> Iterator[FrameSet]:
-    """A few frames all over the recording, in which sensors see most, the richest first.
-
-    Those that are known are left out.
-    """
-    shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
-    numbers = _numbers(session, surveys, sources)
-
-    def richness(number: int) -> float:
-        return sum(each[number] for each in shown)
-
-    parts = np.array_split(np.array(numbers, dtype=int), count)
-    best = [max(part.tolist(), key=richness) for part in parts if len(part)]
-    best = [number for number in best if number not in known]
-    yield from _read(sources, surveys, sorted(best, key=lambda n: (-richness(n), n)))
-
-
-def _numbers(
-    session: Session, surveys: Mapping[str, Survey], sources: Mapping[str, Source]
-) -> list[int]:
-    """Frames in which all sensors see something, or that they have."""
-    shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
-    full = [{n for n, count in each.items() if count} for each in shown]
-    numbers = sorted(set.intersection(*full) or set.intersection(*[{*each} for each in shown]))
-    if any(isinstance(source, Video) for source in sources.values()):
-        numbers = numbers[:_FIRST]
-    return numbers
-
-
-def _read(
-    sources: Mapping[str, Source], surveys: Mapping[str, Survey], numbers: Sequence[int]
-) -> Iterator[FrameSet]:
-    """Frames by their numbers, with what was found in them; none after one that cannot be read."""
-    for number in numbers:
-        frames = {}
-        for name, source in sources.items():
-            if name in surveys and number in surveys[name].found:
-                frames[name] = surveys[name].found[number]
-                continue
-            try:
-                with closing(source.frames(number, number + 1)) as found:
-                    frames[name] = next(found)
-            except (RecordingError, StopIteration):  # said of the recording
-                return
-        times = [each.time_s for each in frames.values() if each.time_s is not None]
-        yield FrameSet(number, min(times, default=None), frames)
-
-
-def _shown(session: Session, found: Survey, setup: SensorSetup) -> dict[int, float]:
-    """How much of the body each frame may show."""
-    counts = found.counts or [1] * len(found.counted)
-    most, empty = expected_count(setup, session), {*found.empty}
-    return {
-        n: 0.0 if n in empty else float(min(count, most))
-        for n, count in zip(found.counted, counts, strict=True)
-    }
+    anew = replace(recording, surveys={}).read(numbers)
+    return [(change, [(each.number, observe(changed, each)) for each in anew])]

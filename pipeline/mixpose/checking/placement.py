@@ -1,16 +1,20 @@
-"""Where sensors stand, where they look, and whether the body starts in their view."""
+"""Where sensors stand, where they look, and whether the body starts in their view.
+
+Where the session names no start, typical poses have the body in view, turned at random.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mixpose.checking.typical import typical_poses
 from mixpose.records import Floats, Mask
-from mixpose.rigid import inverse, rotation_angle_deg, transform
+from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.sensors import (
     CloudSensor,
     FisheyeCamera,
@@ -20,6 +24,7 @@ from mixpose.sensors import (
     Sensor,
 )
 from mixpose.session import SensorSetup, Session
+from mixpose.simulation.central_pose import count_seen, pivot_of, places
 from mixpose.simulation.visible_spots import facing
 
 Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
@@ -29,6 +34,7 @@ _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
 _LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
 _AVERTED = 0.2  # cosine: a feature that is turned away further is hardly seen
 _SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
+_TRIED = 64
 
 
 def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
@@ -54,10 +60,10 @@ def placement_warnings(session: Session) -> list[str]:
     T = session.start.T_world_object
     seen = {s.name: _seen(s.sensor, session, T) for s in session.sensors}
     unseen = [setup for setup in session.sensors if not seen[setup.name].any()]
-    hint = _inverted(session, unseen)
+    hint = _inverted(session, unseen, T)
     for setup in unseen:
         warnings.append(
-            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session)}"
+            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session, T)}"
         )
     for setup in session.sensors:
         count = int(seen[setup.name].sum())
@@ -66,7 +72,7 @@ def placement_warnings(session: Session) -> list[str]:
                 f"sensor {setup.name!r}: only {count} of {len(session.body)} features are in view "
                 "at [start]"
             )
-        warnings += _too_small(setup, session, seen[setup.name])
+        warnings += _too_small(setup, session, T, seen[setup.name])
     return warnings + hint
 
 
@@ -146,31 +152,28 @@ def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
     return [setup for setup in cameras if not _seen(setup.sensor, session, poses[0]).any()]
 
 
-def _inverted(session: Session, unseen: list[SensorSetup]) -> list[str]:
+def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> list[str]:
     """A hint where the inverse of what is written would put the body in view."""
     if not unseen:
         return []
-    assert session.start is not None
-    T = session.start.T_world_object
-    cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
-    placed = [
-        setup
-        for setup in cameras
-        if isinstance(setup.sensor, Looking)
-        and not np.allclose(setup.sensor.T_sensor_world, np.eye(4))
-    ]
+    cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
+    placed = {
+        name: sensor
+        for name, sensor in cameras.items()
+        if not np.allclose(sensor.T_sensor_world, np.eye(4))
+    }
     names = {setup.name for setup in unseen}
     # only where the inverse mends every camera, chance is no likely reason
-    if placed and all(setup.name in names for setup in placed):
-        flipped = [_with_inverse(setup.sensor) for setup in placed]
-        if all(_seen(sensor, session, T).all() for sensor in flipped):
+    if placed and names.issuperset(placed):
+        flipped = map(_with_inverse, placed.values())
+        if all(_seen(sensor, session, T_start).all() for sensor in flipped):
             return [
                 "T_sensor_world looks inverted: with its inverse the body at [start] would be in "
-                f"view of {_names(placed)}; {_MAPS}"
+                f"view of {', '.join(map(repr, placed))}; {_MAPS}"
             ]
-    back = inverse(T)
+    back = inverse(T_start)
     if len(unseen) == len(session.sensors) and all(
-        _seen(setup.sensor, session, back).all() for setup in cameras
+        _seen(sensor, session, back).all() for sensor in cameras.values()
     ):
         return [
             "start.T_world_object looks inverted: with its inverse the body would be in view of "
@@ -184,9 +187,8 @@ def _with_inverse(sensor: Sensor) -> Sensor:
     return replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world))
 
 
-def _why_unseen(sensor: Sensor, session: Session) -> str:
-    assert session.start is not None
-    points = transform(session.start.T_world_object, session.body.means)
+def _why_unseen(sensor: Sensor, session: Session, T_start: Floats) -> str:
+    points = transform(T_start, session.body.means)
     if not isinstance(sensor, Looking):
         return "out of reach: check position, range_min and the unit of lengths"
     in_sensor = transform(sensor.T_sensor_world, points)
@@ -201,12 +203,11 @@ def _why_unseen(sensor: Sensor, session: Session) -> str:
     return f"out of its view: {keys}"
 
 
-def _too_small(setup: SensorSetup, session: Session, seen: Mask) -> list[str]:
+def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask) -> list[str]:
     """A body of a few pixels: mostly two units of length in one file."""
     if not isinstance(setup.sensor, Looking) or not seen.any():
         return []
-    assert session.start is not None
-    y, _ = setup.sensor.project(transform(session.start.T_world_object, session.body.means))
+    y, _ = setup.sensor.project(transform(T_start, session.body.means))
     extent = float(np.ptp(y[seen], axis=0).max()) if seen.sum() > 1 else np.inf
     if extent > _SMALL * setup.extract.sigma:
         return []
@@ -258,3 +259,61 @@ def _numbers(values: Floats, digits: int = 4) -> str:
 
 def _names(setups: list[SensorSetup]) -> str:
     return ", ".join(repr(setup.name) for setup in setups)
+
+
+def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | None]) -> Session:
+    """A session whose cameras know the size of their images, as the recordings have them by name.
+
+    Where neither the session nor the recording says, the optical axis is taken to meet the middle
+    of the image.
+    """
+    setups = []
+    for setup in session.sensors:
+        sensor = setup.sensor
+        size = setup.resolution or sizes.get(setup.name) or _size_by_axis(sensor)
+        if isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
+            sensor = replace(sensor, resolution=size)
+        setups.append(replace(setup, resolution=size, sensor=sensor))
+    return replace(session, sensors=tuple(setups))
+
+
+def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:
+    if isinstance(sensor, PinholeCamera | FisheyeCamera):
+        u, v = sensor.camera_matrix[:2, 2]
+    elif isinstance(sensor, ParallelBeam):
+        u, v = sensor.principal_point
+    else:
+        return None
+    return max(round(2 * u) + 1, 1), max(round(2 * v) + 1, 1)
+
+
+def typical_poses(
+    session: Session, count: int, *, away: float = 1.0, seed: int = 0
+) -> list[Floats]:
+    """Poses T_world_object in the sensors' common view, if any, those that show most features.
+
+    Every camera has a resolution. One alone is `away` times as far away as where the body fills
+    half of the image's smaller side.
+    """
+    rotations = Rotation.random(_TRIED, rng=np.random.default_rng(seed)).as_matrix()
+    pivot = pivot_of(session.body)
+    seen_at_best = 0
+    chosen: list[Floats] = []
+    for place in places(session):
+        if depends_on_distance(session):
+            centre = session.sensors[0].sensor.towards(place)
+            place = place + (1 - away) * centre  # noqa: PLW2901
+        poses = [from_parts(R, place - R @ pivot) for R in rotations]
+        seen = np.array([count_seen(session, T) for T in poses])
+        if seen.max() > seen_at_best:
+            seen_at_best = int(seen.max())
+            best = np.argsort(-seen, kind="stable")[:count]
+            chosen = [poses[int(i)] for i in best if seen[i]]
+    return chosen
+
+
+def depends_on_distance(session: Session) -> bool:
+    """Whether nothing but the distance from one camera says how well poses are seen."""
+    return len(session.sensors) == 1 and isinstance(
+        session.sensors[0].sensor, PinholeCamera | FisheyeCamera
+    )

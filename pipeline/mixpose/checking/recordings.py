@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -27,39 +27,18 @@ _COUNTED = 20
 
 @dataclass(frozen=True)
 class Survey:
-    """What the frames of one sensor hold.
+    """What the frames of one sensor hold."""
 
-    Attributes
-    ----------
-    numbers : tuple of int
-        Frames that could be read, ascending.
-    counted : tuple of int
-        Those of them in which features were looked for.
-    counts : tuple of int or None
-        Features found in each of these; None where frames are grey values or profiles, in which
-        nothing is counted.
-    empty : tuple of int
-        Those of them without any feature, or of one value all over.
-    size : (int, int) or None
-        Width and height of the images in px.
-    damage : tuple of str
-        Why a frame could not be read, a line each.
-    damaged : tuple of int
-        Their numbers, as far as known.
-    is_whole : bool
-        Whether all frames were looked at.
-    found : mapping of int to RawFrame
-        Frames that were counted, with the points found in place of an image.
-    """
-
-    numbers: tuple[int, ...]
-    counted: tuple[int, ...]
+    numbers: tuple[int, ...]  # frames that could be read, ascending
+    counted: tuple[int, ...]  # those of them in which features were looked for
+    # features found in each of these; None of grey values or profiles, which are not counted
     counts: tuple[int, ...] | None
-    empty: tuple[int, ...]
-    size: tuple[int, int] | None = None
-    damage: tuple[str, ...] = ()
-    damaged: tuple[int, ...] = ()
-    is_whole: bool = True
+    empty: tuple[int, ...]  # those of them without any feature, or of one value all over
+    size: tuple[int, int] | None = None  # width and height of the images in px
+    damage: tuple[str, ...] = ()  # why a frame could not be read, a line each
+    damaged: tuple[int, ...] = ()  # their numbers, as far as known
+    is_whole: bool = True  # whether all frames were looked at
+    # frames that were counted, with the points found in place of an image
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
     @property
@@ -82,23 +61,9 @@ def survey(
 ) -> Survey:
     """Read the frames of a sensor as a run would, past damaged images.
 
-    Parameters
-    ----------
-    session : Session
-    setup : SensorSetup
-    source : Source
-        The sensor's recording.
-    quick : bool
-        Look at a few frames only, as is always done of a stream, which has no end.
-    looked_at : collection of int or None
-        Frames whose images are searched for features; None for all that are read.
-    done : callable
-        Called after each frame.
-
-    Raises
-    ------
-    SessionError
-        If a function of the user's that extracts features fails.
+    `quick` looks at a few frames only, as is always done of a stream, which has no end. Features
+    are searched for in the images of frames `looked_at`, None for all. `done` is called after each
+    frame. A `SessionError` if a function of the user's that extracts features fails.
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: list[tuple[int | None, str]] = []
@@ -140,16 +105,18 @@ def survey(
 
 
 def some_of(sources: Mapping[str, Source]) -> set[int] | None:
-    """Frames all over a recording that are enough to count features in; None for all.
-
-    They are the same of all sensors, as far as their frames pair.
-    """
+    """The same frames of all sensors that are enough to count features in; None for all."""
     known = [found for source in sources.values() if (found := numbers_of(source))]
     if not known:
         return None
     numbers = sorted(set.intersection(*known) or set.union(*known))
-    places = np.linspace(0, len(numbers) - 1, min(_COUNTED, len(numbers)))
-    return {numbers[int(place)] for place in places}
+    return set(_spread(numbers, _COUNTED))
+
+
+def _spread(numbers: Sequence[int], most: int) -> list[int]:
+    """Some of the numbers from the first to the last."""
+    places = np.linspace(0, len(numbers) - 1, min(most, len(numbers)))
+    return [numbers[int(place)] for place in places]
 
 
 def image_of(source: Source, number: int) -> Image | None:
@@ -172,29 +139,27 @@ def _frames(
     source: Source, damage: list[tuple[int | None, str]], *, quick: bool
 ) -> Generator[RawFrame, None, None]:
     """The frames that can be read; what is said of the others is put into `damage`."""
-    frames: Iterator[RawFrame] = _readable(source, damage, quick=quick)
-    if quick and not isinstance(source, ImageSequence):
-        frames = islice(frames, _QUICK)
-    if source.ahead and not quick:
-        frames = prefetch(frames, source.ahead)
-    yield from frames
+    if isinstance(source, ImageSequence):
+        frames = _images(source, damage, quick=quick)
+    else:
+        frames = _whole(source, damage)
+        frames = islice(frames, _QUICK) if quick else frames
+    yield from prefetch(frames, source.ahead) if source.ahead and not quick else frames
 
 
-def _readable(
-    source: Source, damage: list[tuple[int | None, str]], *, quick: bool
+def _whole(source: Source, damage: list[tuple[int | None, str]]) -> Iterator[RawFrame]:
+    try:
+        yield from source.frames()
+    except RecordingError as error:
+        damage.append((None, str(error)))
+
+
+def _images(
+    source: ImageSequence, damage: list[tuple[int | None, str]], *, quick: bool
 ) -> Iterator[RawFrame]:
-    if not isinstance(source, ImageSequence):
-        try:
-            yield from source.frames()
-        except RecordingError as error:
-            damage.append((None, str(error)))
-        return
-    # each image by itself: after a damaged one the next can be read all the same
+    """Each image by itself: after a damaged one the next can be read all the same."""
     numbers = source.numbers
-    if quick:
-        places = np.linspace(0, len(numbers) - 1, min(_QUICK, len(numbers)))
-        numbers = tuple(numbers[int(place)] for place in places)
-    for number in numbers:
+    for number in _spread(numbers, _QUICK) if quick else numbers:
         try:
             for frame in source.frames(number, number + 1):
                 if source.resolution is None and isinstance(frame.data, np.ndarray):

@@ -12,48 +12,43 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
-from mixpose.checking.adjusted import Adjustment, Unknown, adjusted, promise
-from mixpose.checking.changes import Change, changes, of_points, with_sensor
+import numpy as np
+
+from mixpose.checking.changes import Change, changes, of_points, other_sizes, with_sensor
 from mixpose.checking.evidence import (
     Explained,
     Frames,
     Views,
     anywhere,
+    beside,
     best_pose,
     evidence_of,
     is_explained,
     is_well_explained,
     pose_near,
+    seen_by,
 )
-from mixpose.checking.late import late_sensor
-from mixpose.checking.meetings import beside, seen_by
-from mixpose.checking.other_sizes import other_sizes
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.values import unknowns
+from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
+from mixpose.runner import begin
 from mixpose.session import Session
+
+_FRAMES = 3  # in a row
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a few frames say of a session.
+    """What a few frames say of a session."""
 
-    Attributes
-    ----------
-    change : str
-        What is wrong, and with what change frames are explained; empty where nothing is.
-    gain : str
-        What is explained by it.
-    good : int
-        How many frames are explained as the session is.
-    """
-
+    # what is wrong, and with what change frames are explained; empty where nothing is
     change: str = ""
-    gain: str = ""
-    good: int = 0
+    gain: str = ""  # what is explained by it
+    good: int = 0  # how many frames are explained as the session is
 
 
 @dataclass
@@ -70,11 +65,6 @@ class _Runner:
         body = self.change.body(session.body)
         seen, guesses = self.change.views(views), DiagnosisRules().guesses
         self.poses.append(best_pose(session, body, number, seen, guesses))
-
-    def is_ahead(self, rules: DiagnosisRules) -> bool:
-        """Whether it explains the last frame that it tried."""
-        last = self.poses[-1] if self.poses else None
-        return last is not None and is_explained(last, rules)
 
     def gain(self, before: Explained) -> float:
         """Nats by which it explains the frames that it tried better."""
@@ -95,18 +85,11 @@ def diagnosis(
     others: Sequence[tuple[Change, Frames]] = (),
     further: Callable[[], Frames] = lambda: (),
 ) -> Diagnosis:
-    """What is most likely wrong with a session, by frames of its recording.
+    """What is most likely wrong with a session of one body, by frames of its recording.
 
-    Parameters
-    ----------
-    session : Session
-        Of one body.
-    frames : sequence of (int, sequence of View)
-        By number; those that show most first.
-    others : sequence of (Change, sequence of (int, sequence of View))
-        Changes of how features are extracted, with what is extracted then.
-    further : callable
-        Frames that are looked at, too, where these leave a change by values undecided.
+    Frames are by number, those that show most first. `others` are changes of how features are
+    extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
+    change by values undecided.
     """
     rules, began = DiagnosisRules(), time.process_time()
 
@@ -122,7 +105,12 @@ def diagnosis(
         in_part = partial(is_late, rules.whole)  # the rest is for values
         tried += _without_values(session, frames, before, others, in_part)
     # values only follow the noise where all frames are explained to within it without any
-    if not any(_is_all_explained(one, rules) for one in tried):
+    if not any(
+        all(is_well_explained(pose, rules) for pose in one.explained.poses)
+        and not one.change.values
+        and one.gain > rules.margin
+        for one in tried
+    ):
         tried += _with_values(session, frames, before, is_late)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
@@ -136,13 +124,8 @@ def diagnosis(
 def explanation(session: Session, frames: Frames) -> str | None:
     """The change that explains frames, in words; None where none of those tried does.
 
-    Parameters
-    ----------
-    session : Session
-        Of one body.
-    frames : sequence of (int, sequence of View)
-        Frames, by number, that are not explained as they are; three in a row tell of a sensor that
-        is one late.
+    The frames, by number, of a session of one body are not explained as they are; three in a row
+    tell of a sensor that is one late.
     """
     return late_sensor(session, frames) or diagnosis(session, frames).change or None
 
@@ -157,12 +140,6 @@ def _as_it_is(session: Session, frames: Frames, is_late: Callable[[], bool]) -> 
     return Explained(tuple(poses))
 
 
-def _is_all_explained(one: Tried, rules: DiagnosisRules) -> bool:
-    """Whether a change without values explains all frames to within what good recordings err by."""
-    well = all(is_well_explained(pose, rules) for pose in one.explained.poses)
-    return well and not one.change.values and one.gain > rules.margin
-
-
 def _without_values(
     session: Session,
     frames: Frames,
@@ -170,10 +147,7 @@ def _without_values(
     others: Sequence[tuple[Change, Frames]],
     is_late: Callable[[], bool],
 ) -> Iterator[Tried]:
-    """Changes that explain frames better than they are: a race, frame by frame.
-
-    All changes try the first frame; those that gain far less than the best drop out after each.
-    """
+    """Changes that explain frames better: a race in which those far behind the best drop out."""
     rules, runners = DiagnosisRules(), [_Runner(*each) for each in others]
     runners += [_Runner(change, frames) for change in changes(session)]
     for k in range(len(frames)):
@@ -181,7 +155,9 @@ def _without_values(
             if is_late() and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
             runner.advance(session)
-        if k == 0 and not is_late() and not any(r.is_ahead(rules) for r in runners):
+        firsts = [runner.poses[-1] for runner in runners if runner.poses]
+        is_ahead = any(pose is not None and is_explained(pose, rules) for pose in firsts)
+        if k == 0 and not is_late() and not is_ahead:
             sizes = [_Runner(change, frames) for change in other_sizes(session, frames[:2])]
             for runner in sizes:
                 runner.advance(session)
@@ -305,12 +281,9 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
         if one.change.values == change.values and one.change.what != change.what
     ]
     words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
-    text = f"{change.what.format(**words)}: {change.remedy}"
-    if rivals:
-        text = f"{change.what.format(**words)}, or {rivals[0].change.what.format(**words)}: " + (
-            f"{change.remedy}, or {rivals[0].change.remedy}"
-        )
-    return Diagnosis(text, gain, good)
+    told_of = [change, *(one.change for one in rivals[:1])]
+    what = ", or ".join(each.what.format(**words) for each in told_of)
+    return Diagnosis(f"{what}: {', or '.join(each.remedy for each in told_of)}", gain, good)
 
 
 def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
@@ -333,3 +306,28 @@ def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
         return ""
     what = "features are met" if feature is None else "images show it"
     return f"{more} more {what} in {count} frames"
+
+
+def late_sensor(session: Session, frames: Frames) -> str | None:
+    """The sensor that is a frame late, in words; None of frames that are not in a row."""
+    frames = frames[:_FRAMES]
+    numbers = [number for number, _ in frames]
+    if len(numbers) < _FRAMES or len({*np.diff(numbers).tolist()}) != 1:
+        return None
+    for setup in session.sensors:
+        name = setup.name
+        given = [  # the views of a frame, that of one sensor from the frame after
+            [view for view in now if view.name != name] + [v for v in after if v.name == name]
+            for (_, now), (_, after) in pairwise(frames)
+        ]
+        if all(_is_ok(session, n, views) for n, views in zip(numbers, given)):
+            return f"{name!r} is a frame late: with each of its frames given to the one before"
+    return None
+
+
+def _is_ok(session: Session, number: int, views: Views) -> bool:
+    tracker, track = begin(anywhere(session))
+    with np.errstate(all="ignore"):
+        _, estimate = tracker.advance(track, number, None, views)
+    shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]
+    return estimate.status == "ok" and min(shares, default=0.0) > 0.1

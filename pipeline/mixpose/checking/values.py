@@ -1,21 +1,29 @@
-"""Values of a session that may be off: the body's size, lenses, poses of cameras, markers."""
+"""Values of a session that may be off: the body's size, lenses, poses of cameras, markers.
+
+They are adjusted by least squares over the matches of several frames, together with the poses of
+all frames; outlying matches are weighed down as by Huber's loss.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mixpose.body import PointFeature
-from mixpose.checking.adjusted import Unknown
 from mixpose.checking.changes import OTHER_SIZE, called
+from mixpose.checking.evidence import Seen
 from mixpose.records import Floats
 from mixpose.rigid import perturb
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import PinholeCamera, Sensor
 from mixpose.session import SensorSetup, Session
 
+_ITERATIONS = 8
+_OUTLYING = 3.0  # deviations from which a match counts less
+_STEP = 1e-4  # of a deviation, for derivatives
+_FEWEST = 4  # coordinates beyond those of poses and values that are asked for
 _SIZE = 0.1  # deviations: of the body's size
 _FOCAL, _CENTRE = 0.1, 0.05  # of the focal length, and of the image
 _BENT = 0.1  # what a lens moves the corners of its image by, of their distance
@@ -23,6 +31,145 @@ _MOVED, _TURNED = 1.0, 0.1  # cameras, in radii of the body and rad
 _MARKER = 0.05  # radii, that a marker is off: spots beside a hidden one are further
 _LEFT_OUT = 6.0  # nats for distortion where none is given: lenses distort
 _COPIED = 30.0  # nats for one of two cameras with the very same calibration: no two lenses have
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Values of a session that may be other than it says, 0 where it is right."""
+
+    what: str  # is wrong, as in `Change`
+    remedy: Callable[[Floats], str]  # what values (k,) explain the frames by
+    deviations: Floats  # (k,), how far off they may be
+    # points (N, 3) of the body by those given and values (k,)
+    points: Callable[[Floats, Floats], Floats] = lambda points, _: points
+    # a sensor by its name, the one given and values (k,)
+    sensor: Callable[[str, Any, Floats], Any] = lambda _, sensor, __: sensor
+    feature: int | None = None  # the only one that is changed
+    cost: float = 0.0  # nats against it, beside what its values cost
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Frames to which poses and values are fitted."""
+
+    points: Floats  # (N, 3) of the body as it is given
+    sensors: Mapping[str, Sensor]  # as they are given, by name
+    frames: Sequence[Sequence[Seen]]
+    poses: Sequence[Floats]  # (4, 4) where to begin, one of each frame
+    beside: Sequence[Sequence[Seen]] = field(default_factory=list)  # for a feature by itself
+
+    def of(self, unknown: Unknown) -> Adjustment:
+        """With what may have met a feature that was missed, for values of that feature."""
+        sensors: Mapping[str, Any] = self.sensors
+        endless = {  # cameras without the bounds of their images
+            name: replace(each, resolution=None) if hasattr(each, "resolution") else each
+            for name, each in sensors.items()
+        }
+        frames = [list(frame) for frame in self.frames]
+        for own, others in zip(frames, self.beside):
+            for seen in others if unknown.feature is not None else ():
+                is_it = seen.features == unknown.feature
+                if is_it.any():
+                    parts = seen.features[is_it], seen.observed[is_it], seen.noise[is_it]
+                    own.append(Seen(seen.name, *parts))
+        return replace(self, sensors=endless, frames=frames)
+
+    def has(self, unknown: Unknown) -> bool:
+        """Whether anything may have met its feature that was missed."""
+        feature, frames = unknown.feature, self.beside
+        return feature is not None and any(feature in s.features for own in frames for s in own)
+
+    @property
+    def count(self) -> int:
+        """Number of coordinates that are met."""
+        return 2 * sum(len(seen.features) for frame in self.frames for seen in frame)
+
+
+def promise(unknown: Unknown, given: Adjustment) -> float:
+    """Nats that values are likely to gain, by one step of least squares."""
+    given, k = given.of(unknown), len(unknown.deviations)
+    if given.count < 6 * len(given.frames) + k + _FEWEST:
+        return 0.0
+    step, scales = _step(unknown, given, given.poses, np.zeros(k)), _scales(unknown, given)
+    gain, F = 0.0, len(given.poses)
+    for f in range(F):
+        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
+        r, J = _linearised(unknown, given, f, given.poses[f], np.zeros(k), scales[own])
+        # what is far off may be of clutter, and gains no more than what is outlying
+        gain += float((_loss(r) - _loss(r + J @ step[own])).sum())
+    return gain
+
+
+def _loss(residuals: Floats) -> Floats:
+    return np.asarray(0.5 * np.minimum(np.abs(residuals), _OUTLYING) ** 2)
+
+
+def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:
+    """Values (k,) and poses (4, 4) that suit the matches best; None where these are too few."""
+    given, k = given.of(unknown), len(unknown.deviations)
+    if given.count < 6 * len(given.frames) + k + _FEWEST:
+        return None
+    poses, values = list(given.poses), np.zeros(k)
+    for _ in range(_ITERATIONS):
+        scales = _scales(unknown, given)
+        step = _step(unknown, given, poses, values) * scales
+        if not np.isfinite(step).all():
+            return None
+        poses = [perturb(T, step[6 * f : 6 * f + 6]) for f, T in enumerate(poses)]
+        values = values + step[-k:]
+        if np.abs(step / scales).max() < 1e-4:
+            break
+    return values, poses
+
+
+def _scales(unknown: Unknown, given: Adjustment) -> Floats:
+    """Units (6 F + k,) in which poses and values are fitted: the body's size, radians."""
+    size = float(np.linalg.norm(given.points - given.points.mean(axis=0), axis=1).max())
+    pose = np.array([size] * 3 + [1.0] * 3)
+    return np.concatenate([np.tile(pose, len(given.frames)), unknown.deviations])
+
+
+def _step(unknown: Unknown, given: Adjustment, poses: Sequence[Floats], values: Floats) -> Floats:
+    """A step (6 F + k,) of poses and values by least squares, in their scales."""
+    k, F = len(values), len(poses)
+    A, b = np.zeros((6 * F + k, 6 * F + k)), np.zeros(6 * F + k)
+    A[-k:, -k:], b[-k:] = np.eye(k), -values / unknown.deviations
+    scales = _scales(unknown, given)
+    for f in range(F):
+        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
+        r, J = _linearised(unknown, given, f, poses[f], values, scales[own])
+        w = _OUTLYING / np.maximum(np.abs(r), _OUTLYING)
+        A[np.ix_(own, own)] += J.T @ (w[:, None] * J)
+        b[own] -= J.T @ (w * r)
+    return np.asarray(np.linalg.solve(A + 1e-9 * np.eye(len(b)), b))
+
+
+def _linearised(
+    unknown: Unknown, given: Adjustment, f: int, T: Floats, values: Floats, scales: Floats
+) -> tuple[Floats, Floats]:
+    """Residuals (R,) of a frame in the noise, and their derivatives (R, 6 + k), in scales."""
+    points, steps = unknown.points(given.points, values), _STEP * np.diag(unknown.deviations)
+    lever = points @ T[:3, :3].T
+    world = lever + T[:3, 3]
+    moved = np.zeros((len(points), 3, len(scales)))  # of a point in the world, by pose and values
+    moved[:, :, :3] = np.eye(3) * scales[:3]
+    moved[:, :, 3:6] = np.cross(np.eye(3), lever[:, None]).swapaxes(1, 2) * scales[3:6]
+    for j, step in enumerate(steps if points is not given.points else ()):
+        by_step = unknown.points(given.points, values + step) - points
+        moved[:, :, 6 + j] = by_step @ T[:3, :3].T / _STEP
+    parts, columns = [np.zeros(0)], [np.zeros((0, len(scales)))]
+    for seen in given.frames[f]:
+        at = world[seen.features]
+        sensor = unknown.sensor(seen.name, given.sensors[seen.name], values)
+        y, J, visible = sensor.linearise(at)
+        by_all = J @ moved[seen.features]
+        for j, step in enumerate(steps if sensor is not given.sensors[seen.name] else ()):
+            other = unknown.sensor(seen.name, given.sensors[seen.name], values + step)
+            by_all[:, :, 6 + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
+        off, noise = np.where(visible[:, None], y - seen.observed, 0.0), seen.noise[:, None]
+        parts.append((off / noise).ravel())
+        columns.append((by_all / noise[..., None]).reshape(-1, len(scales)))
+    return np.concatenate(parts), np.concatenate(columns)
 
 
 def unknowns(session: Session) -> Iterator[Unknown]:
@@ -100,9 +247,16 @@ def _distortion(names: Sequence[str]) -> Unknown:
 
 def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
     """Focal length, principal point and two coefficients of the distortion of a camera."""
-    twins = [o.name for o in cameras if o is not setup and _are_twins(setup.sensor, o.sensor)]
     camera: Any = setup.sensor
     given, name = camera.camera_matrix, setup.name
+    others: dict[str, Any] = {each.name: each.sensor for each in cameras if each is not setup}
+    twins = [
+        other
+        for other, each in others.items()
+        if np.array_equal(given, each.camera_matrix)
+        and np.array_equal(camera.distortion, each.distortion)
+        and np.any(camera.distortion)
+    ]
     centre = _CENTRE * 2 * float(given[0, 2])
 
     def matrix(K: Floats, v: Floats) -> Floats:
@@ -128,11 +282,6 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
         sensor=other,
         cost=-_COPIED if twins else 0.0,
     )
-
-
-def _are_twins(a: Any, b: Any) -> bool:
-    same = np.array_equal(a.camera_matrix, b.camera_matrix)
-    return same and np.array_equal(a.distortion, b.distortion) and bool(np.any(a.distortion))
 
 
 def _bent(sensor: Any, v: Floats) -> Any:

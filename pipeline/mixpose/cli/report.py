@@ -9,8 +9,7 @@ from mixpose.cli.notices import say
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
-from mixpose.report.origin import find_session
-from mixpose.report.page import MARK, render
+from mixpose.report.page import MARK, find_session, render
 from mixpose.whole_files import appearing_whole
 
 _PAGES = (".html", ".htm")

@@ -1,8 +1,4 @@
 """Pictures of frames and poses, to tune an extraction by looking and to trust a pose."""
 
-from __future__ import annotations
-
-from mixpose.pictures.display import displayable
-from mixpose.pictures.overlay import Part, draw_pose
-
-__all__ = ["Part", "displayable", "draw_pose"]
+from mixpose.pictures.canvas import displayable as displayable
+from mixpose.pictures.overlay import Part as Part, draw_pose as draw_pose

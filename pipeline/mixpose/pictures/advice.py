@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,15 +28,7 @@ _LISTED = 6  # features that are named one by one
 
 
 def describe(finding: Finding, body: Body, unit: str) -> list[str]:
-    """Lines for people about one sensor: counts first, then advice.
-
-    Parameters
-    ----------
-    finding : Finding
-    body : Body
-    unit : str
-        Of lengths.
-    """
+    """Lines for people about one sensor: counts first, then advice; `unit` is of lengths."""
     if finding.frame is None:
         return [f"{finding.name}: no frame of this number"]
     lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
@@ -41,13 +36,12 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
     if isinstance(data, PointPattern | GridPattern):
         advice = _about_measurements(finding, body)
     else:
-        lines.append(_threshold(data, finding.setup.extract))
-        method = finding.setup.extract.method
-        advice = (
-            _about_spots(finding, data, body)
-            if method in ("blobs", "intensity")
-            else _about_others(finding, body)
-        )
+        light = _Light(data, finding.setup.extract)
+        lines.append(_threshold(light))
+        if light.options.method in ("blobs", "intensity"):
+            advice = _about_spots(finding, light, body)
+        else:
+            advice = _about_others(finding, body)
     return lines + [f"  {line}" for line in [*advice, *_about_sigma(finding)]]
 
 
@@ -69,20 +63,69 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
     return f"{text}; {100 * expected.explained:.0f} % of the density explained"
 
 
-def _threshold(image: Image, options: ExtractOptions) -> str:
+@dataclass(frozen=True)
+class _Light:
+    """An image as blobs and intensity are extracted from it."""
+
+    image: Image
+    options: ExtractOptions
+
+    @cached_property
+    def scene(self) -> Foreground:
+        height, width = self.image.shape
+        return foreground(self.image, self.options, (0, 0, width, height))
+
+    @cached_property
+    def above(self) -> NDArray[np.uint8]:
+        return above(self.scene.grey, self.scene.zero + self.scene.level)
+
+    @property
+    def share(self) -> float:
+        """Of the pixels above the threshold."""
+        return float(np.mean(self.above))
+
+    @cached_property
+    def raw(self) -> Floats:
+        """Grey values with features bright."""
+        return np.asarray(self.in_image(self.image.astype(np.float64)))
+
+    def in_image(self, level: Any) -> Any:
+        """A grey level of `raw` as the session file wants it, and the reverse."""
+        if self.options.polarity == "bright":
+            return level
+        if self.image.dtype == np.float32:
+            return float(self.image.max()) - level
+        return (255.0 if self.image.dtype == np.uint8 else 65535.0) - level
+
+    @cached_property
+    def level(self) -> float:
+        """The grey level in the image above which, or below, something is a feature."""
+        # a background that varies is out of `scene.grey`; its middle stands for it
+        base = float(np.median(self.raw)) if self.scene.judged else 0.0
+        return float(self.in_image(base + self.scene.level))
+
+    @cached_property
+    def pieces(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Connected pieces above the threshold: a label per pixel, and areas; 0 is none."""
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(self.above)
+        areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
+        areas[0] = 0
+        return np.asarray(labels, dtype=np.int32), areas
+
+
+def _threshold(light: _Light) -> str:
     """The threshold that was used, in the grey levels of the image."""
-    if options.method == "corners":
+    options = light.options
+    if options.method in ("corners", "log"):
+        thing, step = "corner", "bright to dark fields"
+        if options.method == "log":
+            thing, step = "spot", "a spot to what is around it"
         if isinstance(options.threshold, str):
-            return '  threshold "auto": clear of the noise, and a fifth of the clearest corner'
-        return f"  threshold {options.threshold:g} grey levels from bright to dark fields"
-    if options.method == "log":
-        if isinstance(options.threshold, str):
-            return '  threshold "auto": clear of the noise, and a fifth of the clearest spot'
-        return f"  threshold {options.threshold:g} grey levels from a spot to what is around it"
+            return f'  threshold "auto": clear of the noise, and a fifth of the clearest {thing}'
+        return f"  threshold {options.threshold:g} grey levels from {step}"
     if options.method not in ("blobs", "intensity"):
         return f"  method {options.method} has a threshold of its own"
-    scene = _scene(image, options)
-    share = 100 * float(np.mean(above(scene.grey, scene.zero + scene.level)))
+    scene = light.scene
     side = "above" if options.polarity == "bright" else "below"
     if scene.judged:
         text = (
@@ -91,39 +134,39 @@ def _threshold(image: Image, options: ExtractOptions) -> str:
             f"{scene.least_peak:.1f}"
         )
     else:
-        text = f"  threshold {_in_image(scene.level, image, options):g}, {side} which is feature"
-    return f"{text}; {share:.2g} % of the pixels"
+        text = f"  threshold {light.in_image(scene.level):g}, {side} which is feature"
+    return f"{text}; {100 * light.share:.2g} % of the pixels"
 
 
-def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
+def _about_spots(finding: Finding, light: _Light, body: Body) -> list[str]:
     """Advice for blobs and intensity."""
-    options = finding.setup.extract
-    scene = _scene(image, options)
-    share = float(np.mean(above(scene.grey, scene.zero + scene.level)))
-    level = _level(scene, image, options)
+    options = light.options
     lines = []
-    if share > _FLOODED and finding.points is not None and len(finding.points) > 3 * len(body):
+    if (
+        light.share > _FLOODED
+        and finding.points is not None
+        and len(finding.points) > 3 * len(body)
+    ):
+        stricter = _direction(options, lower=False, level=light.level)
+        if options.method == "blobs":
+            stricter += f", raise min_area = {options.min_area:g} or set max_area"
         lines.append(
-            f"too much of the image counts as feature: {_stricter(options, level)}, or set "
+            f"too much of the image counts as feature: {stricter}, or set "
             'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
     if expected is None:
-        return lines + _about_number(finding, body, scene, level)
-    lines += _about_missing(finding, expected, image, scene, body)
+        return lines + _about_number(finding, body, light)
+    lines += _about_missing(finding, expected, light, body)
     if options.method == "blobs":
-        lines += _about_extra(finding, expected, image, scene)
+        lines += _about_extra(finding, expected, light)
     return lines
 
 
-def _about_missing(
-    finding: Finding, expected: Expectation, image: Image, scene: Foreground, body: Body
-) -> list[str]:
+def _about_missing(finding: Finding, expected: Expectation, light: _Light, body: Body) -> list[str]:
     """Why expected features were not met, and what would find them."""
-    options = finding.setup.extract
-    raw = _bright(image, options)
-    missing = _sorted_out(finding, expected, scene, raw)
-    used = _level(scene, image, options)
+    options = light.options
+    missing = _sorted_out(finding, expected, light)
     lines = []
     if found := missing["nothing"]:
         lines.append(
@@ -131,15 +174,14 @@ def _about_missing(
             "wrong"
         )
     if found := missing["faint"]:
-        level = _between(min(found.values()), raw)
+        level = (min(found.values()) + float(np.median(light.raw))) / 2  # and the background
         lines.append(
-            f"not met, fainter than the threshold: {_some(found, body)}; "
-            f"{_looser(options, level, raw, image)}"
+            f"not met, fainter than the threshold: {_some(found, body)}; {_looser(light, level)}"
         )
     if found := missing["small"]:
         lines.append(
             f"not met, too small: {_some(found, body)}; lower min_area = {options.min_area:g} to "
-            f"{min(found.values()):g}, or {_direction(options, lower=True, level=used)}"
+            f"{min(found.values()):g}, or {_direction(options, lower=True, level=light.level)}"
         )
     if found := missing["large"]:
         lines.append(
@@ -150,17 +192,17 @@ def _about_missing(
         lines.append(
             f"not met though bright there: {_some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
-            f"{_direction(options, lower=False, level=used)}"
+            f"{_direction(options, lower=False, level=light.level)}"
         )
     return lines
 
 
 def _sorted_out(
-    finding: Finding, expected: Expectation, scene: Foreground, raw: Floats
+    finding: Finding, expected: Expectation, light: _Light
 ) -> dict[str, dict[int, float]]:
     """Features that were not met, by why: nothing there, faint (with its peak), or by its area."""
-    options = finding.setup.extract
-    labels, areas = _pieces(scene)
+    options, scene = light.options, light.scene
+    labels, areas = light.pieces
     kinds: dict[str, dict[int, float]] = {
         kind: {} for kind in ("nothing", "faint", "small", "large", "other")
     }
@@ -171,7 +213,7 @@ def _sorted_out(
         if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
             kinds["nothing"][i] = signal
         elif signal <= scene.level:
-            kinds["faint"][i] = float(raw[region].max())
+            kinds["faint"][i] = float(light.raw[region].max())
         elif area < options.min_area:
             kinds["small"][i] = area
         elif options.max_area is not None and area > options.max_area:
@@ -181,19 +223,15 @@ def _sorted_out(
     return kinds
 
 
-def _about_extra(
-    finding: Finding, expected: Expectation, image: Image, scene: Foreground
-) -> list[str]:
+def _about_extra(finding: Finding, expected: Expectation, light: _Light) -> list[str]:
     """What tells found things that belong to no feature from those that do."""
     if finding.points is None or not expected.unexplained.any():
         return []
-    options = finding.setup.extract
-    raw = _bright(image, options)
     sizes, peaks = [], []
-    for blob in find_blobs(scene, options):
-        region = _around(np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi), raw.shape)
+    for blob in find_blobs(light.scene, light.options):
+        place, radius = np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi)
         sizes.append(blob.area)
-        peaks.append(float(raw[region].max()))
+        peaks.append(float(light.raw[_around(place, radius, light.raw.shape)].max()))
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
     unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
@@ -211,20 +249,20 @@ def _about_extra(
         return [f"{text}, all larger than those that do: set max_area = {middle:.0f}"]
     if peak[extra].max() < peak[own].min():
         level = (peak[extra].max() + peak[own].min()) / 2
-        word = "fainter" if options.polarity == "bright" else "less dark"
+        word = "fainter" if light.options.polarity == "bright" else "less dark"
         return [
             f"{text}, all {word} than those that do; they do no harm, and in this frame "
-            f"threshold = {_in_image(level, image, options):.0f} would leave them out"
+            f"threshold = {light.in_image(level):.0f} would leave them out"
         ]
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 
 
-def _about_number(finding: Finding, body: Body, scene: Foreground, level: float) -> list[str]:
+def _about_number(finding: Finding, body: Body, light: _Light) -> list[str]:
     """Advice without a pose: only the number of features is known."""
-    options = finding.setup.extract
+    options = light.options
     if finding.count < 0.8 * len(body):
         lines = []
-        areas = _pieces(scene)[1] if options.method == "blobs" else np.zeros(0, np.int32)
+        areas = light.pieces[1] if options.method == "blobs" else np.zeros(0, np.int32)
         small = areas[(areas > _SPECK_PX) & (areas < options.min_area)]
         if len(small):
             lines.append(
@@ -238,7 +276,7 @@ def _about_number(finding: Finding, body: Body, scene: Foreground, level: float)
                 f"{large.min()} px: raise max_area = {options.max_area:g}"
             )
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
-        return lines or [f"too few: {_direction(options, lower=True, level=level)}{polarity}"]
+        return lines or [f"too few: {_direction(options, lower=True, level=light.level)}{polarity}"]
     if finding.count > 3 * len(body):
         return [
             "too many: look which are markers, and whether they differ from the rest in brightness "
@@ -273,22 +311,20 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
 def _about_measurements(finding: Finding, body: Body) -> list[str]:
     """Advice for tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
-    lines = []
     if finding.points is None:
-        if finding.count > 2 * len(body):
-            lines.append(
-                "far more echoes than features: noise fills the profile; take its floor off, or "
-                "raise sigma in [extract]"
-            )
-        return lines
+        if finding.count <= 2 * len(body):
+            return []
+        return [
+            "far more echoes than features: noise fills the profile; take its floor off, or raise "
+            "sigma in [extract]"
+        ]
     if expected is None:
-        return lines
-    lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
-    if lost:
+        return []
+    lines = []
+    if lost := np.flatnonzero(expected.seen & ~expected.met).tolist():
         names = _some(lost, body)
         lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
-    extra = int(expected.unexplained.sum())
-    if extra:
+    if extra := int(expected.unexplained.sum()):
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
     return lines
 
@@ -304,36 +340,6 @@ def _about_sigma(finding: Finding) -> list[str]:
     ]
 
 
-def _scene(image: Image, options: ExtractOptions) -> Foreground:
-    return foreground(image, options, (0, 0, image.shape[1], image.shape[0]))
-
-
-def _bright(image: Image, options: ExtractOptions) -> Floats:
-    """Grey values with features bright."""
-    values = image.astype(np.float64)
-    return values if options.polarity == "bright" else _highest(image) - values
-
-
-def _in_image(level: float, image: Image, options: ExtractOptions) -> float:
-    """A grey level of `_bright` as the session file wants it."""
-    return level if options.polarity == "bright" else _highest(image) - level
-
-
-def _highest(image: Image) -> float:
-    if image.dtype == np.float32:
-        return float(image.max())
-    return 255.0 if image.dtype == np.uint8 else 65535.0
-
-
-def _pieces(scene: Foreground) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Connected pieces above the threshold: a label per pixel, and the area of each; 0 is none."""
-    mask = above(scene.grey, scene.zero + scene.level)
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
-    areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
-    areas[0] = 0
-    return np.asarray(labels, dtype=np.int32), areas
-
-
 def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """A box about a place in view, at least one pixel."""
     u, v = (int(np.clip(round(x), 0, n - 1)) for x, n in zip(place, shape[::-1], strict=True))
@@ -341,39 +347,15 @@ def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice
     return slice(max(v - r, 0), v + r + 1), slice(max(u - r, 0), u + r + 1)
 
 
-def _between(peak: float, raw: Floats) -> float:
-    """A level between a faint peak and the background."""
-    return (peak + float(np.median(raw))) / 2
-
-
-def _looser(options: ExtractOptions, level: float, raw: Floats, image: Image) -> str:
-    if float(np.mean(raw > level)) > _FLOODED:
+def _looser(light: _Light, level: float) -> str:
+    if float(np.mean(light.raw > level)) > _FLOODED:
         return 'set threshold = "local", as the background is as bright elsewhere'
-    direction = "lower" if options.polarity == "bright" else "raise"
-    return f"{direction} it: threshold = {_in_image(level, image, options):.0f}"
-
-
-def _level(scene: Foreground, image: Image, options: ExtractOptions) -> float:
-    """The grey level in the image above which, or below, something is a feature where it is even.
-
-    A background that varies is out of `scene.grey`; its middle stands for it.
-    """
-    base = float(np.median(_bright(image, options))) if scene.judged else 0.0
-    return _in_image(base + scene.level, image, options)
-
-
-def _stricter(options: ExtractOptions, level: float) -> str:
-    areas = f", raise min_area = {options.min_area:g} or set max_area"
-    return _direction(options, lower=False, level=level) + (
-        areas if options.method == "blobs" else ""
-    )
+    direction = "lower" if light.options.polarity == "bright" else "raise"
+    return f"{direction} it: threshold = {light.in_image(level):.0f}"
 
 
 def _direction(options: ExtractOptions, *, lower: bool, level: float | None = None) -> str:
-    """How the threshold is to be moved, which for dark features is the other way round.
-
-    `level` is the grey level in the image that a rule chose, where it chose one.
-    """
+    """How to move a threshold, for dark features the other way; `level` is what a rule chose."""
     down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
     if isinstance(now, str):

@@ -1,13 +1,15 @@
-"""Marks, lines and words on pictures, each with a dark rim: legible on bright and dark frames.
+"""Pictures: frames made visible, marks, lines and words on them, and several of them in one.
 
-A picture is (H, W, 3) uint8, blue-green-red as OpenCV has it.  Everything here draws in place,
-at places (u, v) in pixels of the picture, pixel centres at integers.
+A picture is (H, W, 3) uint8, blue-green-red as OpenCV has it.  Marks, lines and words have a dark
+rim, so that they are legible on bright and dark frames; they are drawn in place, at places (u, v)
+in pixels of the picture, pixel centres at integers.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -27,6 +29,15 @@ _FAR = 1e5  # px; beyond it those functions overflow
 _REFERENCE_SIDE = 600  # px of a picture on which strokes are one pixel wide
 _TEXT_PX = 15
 _WEIGHT = 600  # of letters; regular is 400
+_GAP_PX = 4
+_GAP_GREY = 70
+# This share of the pixels may be darker than black or brighter than white: a hot pixel or two do
+# not count, a few small spots do.
+_BEYOND = 2e-5
+_LEAST_SPAN = 16.0  # grey levels of an integer image, lest noise fill the picture
+_MIDDLE = 0.2  # where the median grey value of a dark frame is brought to
+_STRONGEST = 0.45  # exponent, lest noise is all one sees
+_SAMPLES = 200_000
 
 
 def stroke(picture: Picture) -> float:
@@ -63,13 +74,7 @@ def cross(picture: Picture, place: Floats, inner: float, outer: float, colour: C
 def words(
     picture: Picture, text: str, place: tuple[float, float], colour: Colour, *, size: float = 1.0
 ) -> float:
-    """Write text whose baseline begins at a place; `size` 1 is for captions.
-
-    Returns
-    -------
-    float
-        Where it ends, u in px.
-    """
+    """Write text from a place on its baseline on; returns where it ends, u in px."""
     pixels = max(round(_TEXT_PX * stroke(picture) * size), 9)
     rim = max(round(pixels / 14), 1)
     u, v = round(place[0]), round(place[1])
@@ -82,6 +87,11 @@ def words(
     return float(left + width)
 
 
+def caption_place(picture: Picture, line: int = 0) -> tuple[float, float]:
+    """Where a line of captions in the upper left corner begins."""
+    return 0.5 * line_height(picture), (line + 1.1) * line_height(picture)
+
+
 def line_height(picture: Picture) -> float:
     """Distance of two lines of captions in px."""
     return 1.5 * _TEXT_PX * stroke(picture)
@@ -90,3 +100,73 @@ def line_height(picture: Picture) -> float:
 @cache
 def _face() -> cv2.FontFace:
     return cv2.FontFace("sans")
+
+
+def columns_for(count: int) -> int:
+    """In how many columns so many pictures are laid out."""
+    return count if count <= 3 else int(np.ceil(np.sqrt(count)))
+
+
+def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
+    """A picture amid black of exactly that width and height, shrunk where it is larger."""
+    width, height = size
+    zoom = min(width / picture.shape[1], height / picture.shape[0], 1.0)
+    if zoom < 1.0:
+        shrunk = max(int(picture.shape[1] * zoom), 1), max(int(picture.shape[0] * zoom), 1)
+        picture = np.asarray(cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA), np.uint8)
+    canvas = np.zeros((height, width, 3), np.uint8)
+    v, u = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    canvas[v : v + picture.shape[0], u : u + picture.shape[1]] = picture
+    return canvas
+
+
+def in_grid(
+    pictures: Sequence[Picture], columns: int, cell: tuple[int, int] | None = None
+) -> Picture:
+    """Pictures row by row with gaps between them, in cells of (width, height) if given."""
+    width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
+    rows = []
+    for k in range(0, len(pictures), columns):
+        row = list(pictures[k : k + columns])
+        height = cell[1] if cell else max(picture.shape[0] for picture in row)
+        cells = [fit_into(picture, (width, height)) for picture in row]
+        cells += [np.zeros((height, width, 3), np.uint8)] * (columns - len(cells))
+        rows.append(_joined(cells, axis=1))
+    return _joined(rows, axis=0)
+
+
+def stacked(pictures: Sequence[Picture]) -> Picture:
+    """Pictures one below the other; narrower ones have black beside them."""
+    width = max(picture.shape[1] for picture in pictures)
+    return _joined([fit_into(each, (width, each.shape[0])) for each in pictures], axis=0)
+
+
+def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
+    shape = [*pictures[0].shape]
+    shape[axis] = _GAP_PX
+    gap = np.full(shape, _GAP_GREY, np.uint8)
+    parts = [part for picture in pictures for part in (gap, picture)][1:]
+    return np.concatenate(parts, axis=axis)
+
+
+def displayable(image: NDArray[Any]) -> Picture:
+    """A grey image (H, W) of any type with its contrast stretched, brightened where it is dark."""
+    # grey values that become black and white, and the exponent in between
+    step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
+    middle = float(np.median(np.asarray(image[::step, ::step], dtype=np.float64)))
+    few = int(_BEYOND * image.size)
+    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]].tolist()
+    whole = np.issubdtype(image.dtype, np.integer)
+    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
+    share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
+    exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
+
+    def curve(values: NDArray[Any]) -> NDArray[np.uint8]:
+        share = (values.astype(np.float32) - np.float32(low)) / np.float32(high - low)
+        return np.asarray(np.round(255 * np.clip(share, 0, 1) ** exponent), dtype=np.uint8)
+
+    if np.issubdtype(image.dtype, np.unsignedinteger):
+        grey = curve(np.arange(np.iinfo(image.dtype).max + 1))[image]  # a look-up is fast
+    else:
+        grey = curve(image)
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)

@@ -20,59 +20,27 @@ from mixpose.session import SensorSetup
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a pose expects of one sensor, and how far that is met.
+    """What a pose expects of one sensor, and how far that is met."""
 
-    Attributes
-    ----------
-    y : (N, m) float64
-        Where the features are expected.
-    seen : (N,) bool
-        Which of them are in view and face the sensor.
-    met : (N,) bool
-        Which of those were found there.
-    unexplained : (M,) bool
-        Which of the found points (if points they are) belong to no feature.
-    explained : float
-        Share of the sensor's density that the pose accounts for.
-    rms : float or None
-        Residual of the met features, sensor units.
-    sure : bool
-        Whether the estimate is "ok": what its features meet are markers then, and not clutter.
-    """
-
-    y: Floats
-    seen: Mask
-    met: Mask
-    unexplained: Mask
-    explained: float
-    rms: float | None
-    sure: bool
+    y: Floats  # (N, m), where the features are expected
+    seen: Mask  # (N,), which of them are in view and face the sensor
+    met: Mask  # (N,), which of those were found there
+    unexplained: Mask  # (M,), which of the found points (if points they are) belong to no feature
+    explained: float  # share of the sensor's density that the pose accounts for
+    rms: float | None  # residual of the met features, sensor units
+    sure: bool  # whether it is "ok": what its features meet are markers then, and not clutter
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One sensor's frame, the features found in it, and what a pose expects.
-
-    Attributes
-    ----------
-    frame : RawFrame or None
-        None where the sensor has no frame of this number.
-    view : View or None
-        None where it has no frame.
-    points : (M, m) float64 or None
-        The features, where the extraction gives points.
-    count : float
-        Number of points found, or of as many points of light as give the energy of a grid.
-    expectation : Expectation or None
-        None without a pose or without features.
-    """
+    """One sensor's frame, the features found in it, and what a pose expects."""
 
     setup: SensorSetup
-    frame: RawFrame | None
-    view: View | None
-    points: Floats | None
-    count: float
-    expectation: Expectation | None
+    frame: RawFrame | None  # None where the sensor has no frame of this number
+    view: View | None  # None where it has no frame
+    points: Floats | None  # (M, m), where the extraction gives points
+    count: float  # points found, or points of light with the energy of a grid
+    expectation: Expectation | None  # None without a pose or without features
 
     @property
     def name(self) -> str:
@@ -139,41 +107,34 @@ def _finding(
 ) -> Finding:
     if view is None:
         return Finding(setup, frame, None, None, 0.0, None)
-    pattern = view.observation.pattern
-    points = pattern.points if isinstance(pattern, PointPattern) else None
-    count = float(len(points)) if points is not None else _features_worth(view)
-    T = estimate.T_world_object
-    sure = estimate.status == "ok"
+    pattern, sigma = view.observation.pattern, view.observation.sigma
+    if isinstance(pattern, PointPattern):
+        points, count = pattern.points, float(len(pattern.points))
+    else:  # so many equal features would have the energy of the grid
+        top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
+        energy = view.observation.energy(sigma)
+        points, count = None, float(top / energy) if energy > 0 else 0.0
+    T, sure = estimate.T_world_object, estimate.status == "ok"
     expectation = None if T is None else _expect(view, body, T, points, sure=sure)
     return Finding(setup, frame, view, points, count, expectation)
 
 
-def _features_worth(view: View) -> float:
-    """How many equal features would have the energy of a grid pattern."""
-    sigma = view.observation.sigma
-    top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
-    energy = view.observation.energy(sigma)
-    return float(top / energy) if energy > 0 else 0.0
-
-
 def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
+    nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
+    met, explained, rms, rules = np.zeros_like(seen), 0.0, None, AssociationRules()
     found = _association(view, body, T)
-    met = np.zeros(len(body), dtype=np.bool_)
     if found is not None:
         shares = np.bincount(body.nodes.feature, found.shares[0], minlength=len(body))
         full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
-        met = seen & (shares > AssociationRules().min_share * full)
+        met = seen & (shares > rules.min_share * full)
+        in_view &= found.weights[0] > 0
+        explained, rms = float(found.explained[0]), found.rms[0]
     unexplained = np.zeros(0, dtype=np.bool_)
     if points is not None:
-        nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
-        if found is not None:
-            in_view &= found.weights[0] > 0
         away = np.linalg.norm(points[:, None] - nodes[in_view], axis=-1)
-        reach = view.observation.sigma * np.sqrt(2 * AssociationRules().reach_squared)
+        reach = view.observation.sigma * np.sqrt(2 * rules.reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
-    explained = 0.0 if found is None else float(found.explained[0])
-    rms = None if found is None else found.rms[0]
     return Expectation(y, seen, met, unexplained, explained, rms, sure)
 
 

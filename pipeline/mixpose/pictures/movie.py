@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol
 
 import cv2
 
 from mixpose.errors import SessionError
 from mixpose.objective import View
-from mixpose.pictures.canvas import Picture
-from mixpose.pictures.layout import fit_into
+from mixpose.pictures.canvas import Picture, fit_into
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours, refuse_foreign, sign_video, write_png
 from mixpose.records import Estimate, FrameSet
@@ -27,31 +24,11 @@ _DEFAULT_FPS = 25.0
 _SLOWEST, _FASTEST = 0.5, 120.0
 
 
-class Sink(Protocol):
-    """Takes the pictures of an overlay, frame by frame."""
-
-    def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
-        """Take the picture of the next frame."""
-
-    def close(self) -> None:
-        """Finish what was written."""
-
-
 class Overlay:
     """Draws every frame of a run and hands the pictures on; a context for ``run(watch=...)``.
 
-    Parameters
-    ----------
-    session : Session
-    path : Path
-        A video by its extension (.mp4, .mkv, .avi), else a folder.
-    resume : bool
-        Go on in a folder.
-
-    Raises
-    ------
-    SessionError
-        If the path is none of these, or holds something that mixpose did not write.
+    It goes into a video by the extension of its path, else into a folder, in which it can `resume`.
+    A `SessionError` if the path is none of these, or holds something that mixpose did not write.
     """
 
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
@@ -62,12 +39,7 @@ class Overlay:
     def __enter__(self) -> Overlay:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._sink.close()
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
@@ -79,7 +51,8 @@ class Overlay:
             self._estimates = []
 
 
-def _sink(path: Path, resume: bool) -> Sink:
+def _sink(path: Path, resume: bool) -> FolderSink | VideoSink:
+    """What takes the pictures of an overlay, frame by frame."""
     if not path.parent.is_dir():
         raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
     suffix = path.suffix.casefold()
@@ -163,7 +136,15 @@ class VideoSink:
         self._writer = None
         try:
             sign_video(self._part)
-            self._see_that_it_is_whole()
+            # FFmpeg does not tell when a disk is full
+            written = cv2.VideoCapture(str(self._part))
+            count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+            written.release()
+            if count < self._count - 1:  # containers that only estimate it may be one off
+                raise SessionError(
+                    f"--overlay {self._path}: {count} of {self._count} frames could be written: "
+                    "is the disk full?"
+                )
             self._part.replace(self._path)
         except OSError as error:
             raise SessionError(
@@ -171,17 +152,6 @@ class VideoSink:
             ) from error
         finally:
             self._part.unlink(missing_ok=True)
-
-    def _see_that_it_is_whole(self) -> None:
-        """FFmpeg does not tell when a disk is full."""
-        written = cv2.VideoCapture(str(self._part))
-        count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
-        written.release()
-        if count < self._count - 1:  # containers that only estimate it may be one off
-            raise SessionError(
-                f"--overlay {self._path}: {count} of {self._count} frames could be written: is "
-                "the disk full?"
-            )
 
     def _open(self, fps: float) -> None:
         if self._first is None:

@@ -4,25 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
-from mixpose.pictures.canvas import (
-    GREY,
-    WHITE,
-    Colour,
-    Picture,
-    cross,
-    line_height,
-    polyline,
-    ring,
-    stroke,
-    words,
-)
-from mixpose.records import Floats, Status
+from mixpose.pictures import canvas
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
+from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
 
@@ -57,18 +47,10 @@ _LEAST_ELLIPSE_PX = 3.0  # of the larger half-axis; smaller ones hide behind the
 
 @dataclass(frozen=True)
 class Part:
-    """What a picture shows of a sensor: pixels from `corner` on, `zoom` times as large.
+    """What a picture shows of a sensor: pixels from `corner` on, `zoom` times as large."""
 
-    Attributes
-    ----------
-    zoom : float
-        Pixels of the picture per pixel of the sensor.
-    corner : (float, float)
-        The sensor's pixel (u, v) in the upper left.
-    """
-
-    zoom: float = 1.0
-    corner: tuple[float, float] = (0.0, 0.0)
+    zoom: float = 1.0  # pixels of the picture per pixel of the sensor
+    corner: tuple[float, float] = (0.0, 0.0)  # the sensor's pixel (u, v) in the upper left
 
     def places(self, y: Floats) -> Floats:
         """Places on the picture of sensor coordinates (..., 2)."""
@@ -93,68 +75,45 @@ def draw_pose(
     colour: Colour | None = None,
     named: bool = True,
 ) -> Picture:
-    """Draw a pose on a camera's frame.
+    """Draw a pose on a camera's frame, and return a new picture.
 
     Parameters
     ----------
     image_bgr : (H, W, 3) uint8
-        The frame, as of `mixpose.pictures.displayable`; it is left as it is.
-    sensor : Sensor
-        A camera.
-    body : Body
+        The frame, as of `mixpose.pictures.displayable`.
     T_world_object : (4, 4) array or None
         None draws no pose, as for a lost frame.
     covariance : (6, 6) array or None
         Of the pose, order of `mixpose.rigid`; draws the ellipse that holds a feature's place with
-        95 %, where it is large enough to be seen.
-    status : {"ok", "ambiguous", "lost"} or None
-        Written in the corner, and the colour of the features.
-    frame : int or None
-        Number of the frame, written in the corner.
+        95 %, where it is large enough to be seen, `magnified` by a factor.
+    status, frame
+        Written in the corner; the status is the colour of the features, too, unless `colour` is.
     part : Part
         What the picture shows of the sensor, where the frame was cut or resized.
     found : (M, 2) array or None
         Features found in the frame, in pixels of the sensor; marked too.
-    magnified : float
-        Factor by which ellipses are drawn larger than they are.
-    colour : Colour or None
-        Of the features, where the status does not give it.
     named : bool
         Whether names stand beside features.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-        A new picture.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
-    radius = _MARK_PX * stroke(picture)
+    pose, radius = None, _MARK_PX * canvas.stroke(picture)
     if T_world_object is not None:
-        radius = mark_radius(picture, sensor, body, T_world_object, part)
+        pose = _DrawnPose(picture, sensor, body, T_world_object, part)
+        radius = pose.radius
     for place in part.places(found) if found is not None else ():
-        cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
-    if T_world_object is not None:
-        colour = colour or STATUS_COLOURS[status or "ok"]
-        _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
-        _draw_features(picture, sensor, body, T_world_object, part, colour, named)
-        _draw_axes(picture, sensor, body, T_world_object, part)
+        canvas.cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
+    if pose is not None:
+        pose.draw_ellipses(covariance, magnified)
+        pose.draw_features(colour or STATUS_COLOURS[status or "ok"], named=named)
+        pose.draw_axes()
     caption(picture, status, frame)
     return picture
 
 
 def projected_features(
     sensor: Sensor, body: Body, T_world_object: Floats
-) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Where a sensor has the features of a body.
-
-    Returns
-    -------
-    y : (N, m) float64
-    inside : (N,) bool
-        Whether the sensor can measure there.
-    seen : (N,) bool
-        Whether the feature also faces the sensor.
-    """
+) -> tuple[Floats, Mask, Mask]:
+    """Places (N, m) of features, which of them can be measured, and which are faced as well."""
     points = transform(T_world_object, body.means)
     y, inside = sensor.project(points)
     return y, inside, inside & facing(sensor, T_world_object, points, body.normals)
@@ -177,40 +136,6 @@ def ellipse_95(covariance: Floats) -> Floats:
     return np.asarray((circle * np.sqrt(CHI2_95[2] * np.maximum(values, 0))) @ vectors.T)
 
 
-def _draw_features(
-    picture: Picture,
-    sensor: Sensor,
-    body: Body,
-    T: Floats,
-    part: Part,
-    colour: Colour,
-    named: bool,
-) -> None:
-    radius = mark_radius(picture, sensor, body, T, part)
-    nodes, inside = sensor.project(transform(T, body.nodes.points))
-    for feature in np.flatnonzero(np.bincount(body.nodes.feature) > 1):
-        along = inside & (body.nodes.feature == feature)
-        polyline(picture, part.places(nodes[along]), colour)
-    y, inside, seen = projected_features(sensor, body, T)
-    for i, place in enumerate(part.places(y)):
-        if not inside[i]:
-            continue
-        if not seen[i]:  # turned away
-            ring(picture, place, radius / 2, GREY)
-            continue
-        ring(picture, place, radius, colour)
-        if named and len(body) <= _MOST_NUMBERS:
-            beside = (place[0] + 1.2 * radius, place[1] - 0.9 * radius)
-            words(picture, body.labels[i], beside, colour, size=0.8)
-
-
-def mark_radius(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> float:
-    """Radius in px of a feature's ring: visible, and clear of the features beside it."""
-    y, _, seen = projected_features(sensor, body, T)
-    usual = _MARK_PX * stroke(picture)
-    return min(usual, max(_CLEAR_SHARE * part.zoom * median_gap(y[seen]), 3.0))
-
-
 def median_gap(y: Floats) -> float:
     """Median distance of places (n, 2) from their nearest neighbours; infinite for a lone one."""
     if len(y) < 2:
@@ -220,66 +145,105 @@ def median_gap(y: Floats) -> float:
     return float(np.median(apart.min(axis=1)))
 
 
-def _draw_ellipses(
-    picture: Picture,
-    sensor: Sensor,
-    body: Body,
-    T: Floats,
-    covariance: Floats | None,
-    part: Part,
-    magnified: float,
-) -> None:
-    if covariance is None or not np.isfinite(covariance).all():
-        return
-    y, _, seen = projected_features(sensor, body, T)
-    spreads = projected_covariances(sensor, body, T, covariance)
-    for place, spread in zip(part.places(y)[seen], spreads[seen], strict=True):
-        outline = magnified * part.zoom * ellipse_95(spread)
-        if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * stroke(picture):
-            polyline(picture, place + outline, WHITE, closed=True)
+@dataclass(frozen=True)
+class _DrawnPose:
+    """A pose on a picture of a part of a sensor."""
 
+    picture: Picture
+    sensor: Sensor
+    body: Body
+    T: Floats
+    part: Part
 
-def _draw_axes(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> None:
-    """The object's axes at its origin, or amid the features where that is out of view."""
-    origin = np.zeros(3)
-    if not sensor.project(transform(T, origin[None]))[1].all():
-        origin = body.means.mean(axis=0)
-    length = _AXIS_SHARE * body.radius
-    centre, seen = sensor.project(transform(T, origin[None]))
-    if not seen.all():
-        return
-    start = part.places(centre[0])
-    # a feature at the origin stays visible
-    y, _, seen = projected_features(sensor, body, T)
-    radius = mark_radius(picture, sensor, body, T, part)
-    marked = np.linalg.norm(part.places(y[seen]) - start, axis=1).min(initial=np.inf) < radius
-    along = np.linspace(0.0, length, _AXIS_PIECES)[:, None]
-    for k, (name, colour) in enumerate(AXES):
-        y, inside = sensor.project(transform(T, origin + along * np.eye(3)[k]))
-        line = part.places(y[: len(inside) if inside.all() else int(np.argmin(inside))])
-        line = line[np.linalg.norm(line - start, axis=1) >= (1.3 * radius if marked else 0)]
-        if len(line) < 2:
-            continue
-        polyline(picture, line, colour, width=2)
-        shift = 0.3 * line_height(picture)
-        if np.linalg.norm(line[-1] - start) < 1.5 * line_height(picture):
-            continue  # letters would hide what they are beside
-        words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
+    @cached_property
+    def features(self) -> tuple[Floats, Mask, Mask]:
+        return projected_features(self.sensor, self.body, self.T)
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius in px of a feature's ring: visible, and clear of the features beside it."""
+        y, _, seen = self.features
+        usual = _MARK_PX * canvas.stroke(self.picture)
+        return min(usual, max(_CLEAR_SHARE * self.part.zoom * median_gap(y[seen]), 3.0))
+
+    def _project(self, points: Floats) -> tuple[Floats, Mask]:
+        """Places on the picture of points (n, 3) of the body, and whether they are in view."""
+        y, inside = self.sensor.project(transform(self.T, points))
+        return self.part.places(y), inside
+
+    def draw_features(self, colour: Colour, *, named: bool) -> None:
+        nodes, inside = self._project(self.body.nodes.points)
+        for feature in np.flatnonzero(np.bincount(self.body.nodes.feature) > 1):
+            along = inside & (self.body.nodes.feature == feature)
+            canvas.polyline(self.picture, nodes[along], colour)
+        y, inside, seen = self.features
+        for i, place in enumerate(self.part.places(y)):
+            if not inside[i]:
+                continue
+            if not seen[i]:  # turned away
+                canvas.ring(self.picture, place, self.radius / 2, GREY)
+                continue
+            canvas.ring(self.picture, place, self.radius, colour)
+            if named and len(self.body) <= _MOST_NUMBERS:
+                beside = (place[0] + 1.2 * self.radius, place[1] - 0.9 * self.radius)
+                canvas.words(self.picture, self.body.labels[i], beside, colour, size=0.8)
+
+    def draw_ellipses(self, covariance: Floats | None, magnified: float) -> None:
+        if covariance is None or not np.isfinite(covariance).all():
+            return
+        y, _, seen = self.features
+        spreads = projected_covariances(self.sensor, self.body, self.T, covariance)
+        for place, spread in zip(self.part.places(y)[seen], spreads[seen], strict=True):
+            outline = magnified * self.part.zoom * ellipse_95(spread)
+            if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * canvas.stroke(
+                self.picture
+            ):
+                canvas.polyline(self.picture, place + outline, WHITE, closed=True)
+
+    def draw_axes(self) -> None:
+        """The object's axes at its origin, or amid the features where that is out of view."""
+        origin = np.zeros((1, 3))
+        if not self._project(origin)[1].all():
+            origin = self.body.means.mean(axis=0, keepdims=True)
+        (start,), in_view = self._project(origin)
+        if not in_view.all():
+            return
+        # a feature at the origin stays visible
+        y, _, seen = self.features
+        away = np.linalg.norm(self.part.places(y[seen]) - start, axis=1)
+        clear = 1.3 * self.radius if away.min(initial=np.inf) < self.radius else 0.0
+        along = np.linspace(0.0, _AXIS_SHARE * self.body.radius, _AXIS_PIECES)[:, None]
+        height = canvas.line_height(self.picture)
+        for k, (name, colour) in enumerate(AXES):
+            line, inside = self._project(origin + along * np.eye(3)[k])
+            line = line[: len(inside) if inside.all() else int(np.argmin(inside))]
+            line = line[np.linalg.norm(line - start, axis=1) >= clear]
+            if len(line) < 2:
+                continue
+            canvas.polyline(self.picture, line, colour, width=2)
+            if np.linalg.norm(line[-1] - start) < 1.5 * height:
+                continue  # letters would hide what they are beside
+            place = line[-1, 0] + 0.3 * height, line[-1, 1] + 0.3 * height
+            canvas.words(self.picture, name, place, colour, size=0.9)
 
 
 def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
     """Write number and status of a frame into the upper left corner, in place."""
-    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
+    u, v = canvas.caption_place(picture)
     if frame is not None:
-        u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
+        u = canvas.words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * canvas.line_height(
+            picture
+        )
     if status is not None:
-        words(picture, status, (u, v), STATUS_COLOURS[status])
+        canvas.words(picture, status, (u, v), STATUS_COLOURS[status])
 
 
 def legend(picture: Picture, bodies: Sequence[tuple[str, Status]], frame: int) -> None:
     """Write the number of a frame, and each body with its status in its colour, in place."""
-    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
-    words(picture, f"frame {frame}", (u, v), WHITE)
+    u, v = canvas.caption_place(picture)
+    canvas.words(picture, f"frame {frame}", (u, v), WHITE)
     for k, (label, status) in enumerate(bodies):
         colour = BODY_COLOURS[k % len(BODY_COLOURS)] if status != "lost" else GREY
-        words(picture, f"{label} {status}", (u, v + (k + 2) * line_height(picture)), colour)
+        canvas.words(
+            picture, f"{label} {status}", (u, v + (k + 2) * canvas.line_height(picture)), colour
+        )

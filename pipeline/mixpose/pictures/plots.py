@@ -1,43 +1,49 @@
-"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib."""
+"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib.
+
+The objective is cut along each direction, and over pairs of directions.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
-from mixpose.objective import View, matched_objective
+from mixpose.fit import EstimatorOptions, free_mask
+from mixpose.objective import View, build_objective, matched_objective, pose_jacobian
 from mixpose.pictures.canvas import Picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import ellipse_95
-from mixpose.pictures.ranges import half_widths_95
-from mixpose.pictures.slices import Map, Slice
+from mixpose.pictures.scene import half_widths_95
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
-from mixpose.rigid import TWIST_NAMES
+from mixpose.rigid import TWIST_NAMES, perturb, transform
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 _DPI = 100
 _MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"
 _AROUND = 0.6  # of the extent of the expected ranges, shown around them
 _LEAST_AROUND = 6.0  # in σ
 _PLACES = 600  # at which C is drawn
+_WIDE = 1.5  # widest blurs to either side of a slice
+_NARROW = 5.0  # finest blurs to either side of a map
+_LEAST_WIDE = 8.0  # finest blurs to either side of a slice
+_POINTS = 241  # of a slice
+_SIDE = 41  # points along a side of a map
+_MAPS = 3
+_BATCH = 512  # poses that are projected at once
+_SAMPLES = 200  # per feature: enough to look at
 
 
 def require_matplotlib() -> None:
-    """Make sure that plots can be made.
-
-    Raises
-    ------
-    SessionError
-        If matplotlib is not installed.
-    """
+    """Make sure that plots can be made, else raise a `SessionError`."""
     try:
         import matplotlib.figure  # noqa: F401, PLC0415
     except ImportError as error:
@@ -57,17 +63,8 @@ def ranges_picture(
 ) -> Picture:
     """Range sensors one below the other: measurement, densities g and C, the ranges of the pose.
 
-    Parameters
-    ----------
-    findings : sequence of Finding
-        Of range sensors.
-    sigmas : sequence of sequence of float
-        Blurs of each sensor whose density is drawn, coarse to fine.
-    body, estimate
-    unit : str
-        Of lengths.
-    width, row_height : int
-        Of the picture and of a sensor, in px.
+    Of each sensor the densities of some blurs `sigmas` are drawn, coarse to fine; `unit` is of
+    lengths, `row_height` that of a sensor in px.
     """
     figure = _figure(width, row_height * len(findings))
     rows = figure.subplots(len(findings), 1, squeeze=False)[:, 0]
@@ -85,20 +82,10 @@ def objective_picture(
     unit: str,
     width: int,
 ) -> Picture:
-    """Slices and maps of the objective.
+    """Slices and maps of the objective as of `objective_around`, a picture of some width in px.
 
-    Parameters
-    ----------
-    slices, maps
-        As of `objective_around`.
-    levels : sequence of float
-        Blur of each level in σ_ε.
-    covariance : (6, 6) array or None
-        Its 95 % ellipses are drawn on the maps.
-    unit : str
-        Of lengths.
-    width : int
-        In px.
+    `levels` are the blurs in σ_ε; 95 % ellipses of the covariance (6, 6) are drawn on the maps;
+    `unit` is of lengths.
     """
     import matplotlib as mpl  # noqa: PLC0415 - heavy
 
@@ -114,8 +101,7 @@ def objective_picture(
             label = "σ" if abs(level - 1) < 0.001 else f"{level:.2g} σ"
             axes.plot(_shown(one.offsets, one.direction), values, color=colour, label=label)
         axes.axvline(0, color="0.6", lw=0.8, ls=":")
-        axes.set_xlabel(_label(one.direction, unit))
-        axes.set_ylim(0, 1.05)
+        axes.set(xlabel=_label(one.direction, unit), ylim=(0, 1.05))
         axes.locator_params(axis="x", nbins=5)
         if k == 0:
             axes.set_ylabel("objective / its largest")
@@ -135,31 +121,27 @@ def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> Non
     title = "finest blur"
     if covariance is not None and np.isfinite(covariance).all():
         outline = ellipse_95(covariance[np.ix_([i, j], [i, j])])
-        scale = _magnification(outline, one)
+        # a round factor that makes it large enough to be seen
+        share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
+        scale = next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
         closed = np.vstack([outline, outline[:1]]) * scale
         axes.plot(_shown(closed[:, 0], i), _shown(closed[:, 1], j), color="white", lw=1.2)
         title += "; 95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
     axes.locator_params(nbins=7)
-    axes.set_xlim(across[0], across[-1])
-    axes.set_ylim(up[0], up[-1])
-    axes.set_xlabel(_label(i, unit))
-    axes.set_ylabel(_label(j, unit))
+    axes.set(xlim=across[[0, -1]], ylim=up[[0, -1]])
+    axes.set(xlabel=_label(i, unit), ylabel=_label(j, unit))
     axes.set_title(title, fontsize=9)
-
-
-def _magnification(outline: Floats, one: Map) -> int:
-    """A round factor that makes an ellipse large enough to be seen on a map."""
-    share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
-    return next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
 
 
 def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
     """One range sensor; each curve is divided by its largest value, which the legend states."""
-    axes.set_title(_range_title(finding), fontsize=9, loc="left")
-    axes.set_yticks([])
-    axes.set_ylim(-0.03, 1.55)
+    title = f"{finding.name}: echoes as of {finding.count:.1f} points"
+    if finding.points is not None:
+        title = f"{finding.name}: {len(finding.points)} ranges"
+    axes.set_title(title, fontsize=9, loc="left")
+    axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
         return
@@ -230,12 +212,6 @@ def _span(finding: Finding) -> tuple[float, float]:
     return float(shown.min()) - margin, float(shown.max()) + margin
 
 
-def _range_title(finding: Finding) -> str:
-    if finding.points is None:
-        return f"{finding.name}: echoes as of {finding.count:.1f} points"
-    return f"{finding.name}: {len(finding.points)} ranges"
-
-
 def _shown(offsets: Floats, direction: int) -> Floats:
     return np.degrees(offsets) if direction >= 3 else offsets
 
@@ -257,3 +233,88 @@ def _raster(figure: Figure) -> Picture:
     canvas.draw()
     rgba = np.asarray(canvas.buffer_rgba())
     return np.ascontiguousarray(rgba[..., 2::-1], dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The objective along one direction."""
+
+    direction: int  # of `mixpose.rigid.TWIST_NAMES`
+    offsets: Floats  # (n,) lengths or radians from the pose
+    values: Floats  # (levels, n) per level of blur, the largest of each level 1
+
+
+@dataclass(frozen=True)
+class Map:
+    """The objective at the finest blur over two directions."""
+
+    directions: tuple[int, int]  # across and up
+    offsets: tuple[Floats, Floats]  # (n,), (n,)
+    values: Floats  # (n, n), rows along the second direction; the largest is 1
+
+
+def objective_around(
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    covariance: Floats | None,
+    options: EstimatorOptions,
+    levels: Sequence[Sequence[float]],
+) -> tuple[list[Slice], list[Map]]:
+    """Cut the objective along every free direction, and over the pairs that depend most.
+
+    There is at least one view, and none with an empty observation. Pairs are chosen by their
+    correlation in the covariance (6, 6); without it they are the first. `levels` are the blurs per
+    level and view, coarse to fine.
+    """
+    free = np.flatnonzero(free_mask(options)).tolist()
+    unit = _one_blur(views, body, T_world_object, levels[-1])
+    widest = max(w / f for w, f in zip(levels[0], levels[-1], strict=True))
+    wide = max(_LEAST_WIDE, _WIDE * widest)
+    samples = body.sample(min(options.samples, _SAMPLES), seed=options.seed)
+
+    def values(sigmas: Sequence[float], twists: Floats) -> Floats:
+        objective = build_objective(options.objective, views, body, samples, sigmas, T_world_object)
+        poses = perturb(T_world_object, twists)
+        parts = [objective.value(poses[k : k + _BATCH]) for k in range(0, len(poses), _BATCH)]
+        found = np.nan_to_num(np.concatenate(parts))
+        return np.asarray(found / max(float(found.max()), 1e-300))
+
+    slices = []
+    for k in free:
+        offsets = _half_width(wide * unit[k], k) * np.linspace(-1, 1, _POINTS)
+        twists = offsets[:, None] * np.eye(6)[k]
+        curves = np.array([values(sigmas, twists) for sigmas in levels])
+        slices.append(Slice(k, offsets, curves))
+    maps = []
+    pairs = list(combinations(free, 2))
+    if covariance is not None and np.isfinite(covariance).all():
+        deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        related = np.abs(covariance / deviations / deviations[:, None])
+        pairs.sort(key=lambda pair: -related[pair])
+    for i, j in pairs[:_MAPS]:
+        across, up = (_half_width(_NARROW * unit[k], k) * np.linspace(-1, 1, _SIDE) for k in (i, j))
+        grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+        surface = values(levels[-1], grid @ np.eye(6)[[i, j]])
+        maps.append(Map((i, j), (across, up), surface.reshape(_SIDE, _SIDE)))
+    return slices, maps
+
+
+def _half_width(offset: float, direction: int) -> float:
+    """An offset, but for turns half a turn at most."""
+    return min(offset, np.pi) if direction >= 3 else offset
+
+
+def _one_blur(
+    views: Sequence[View], body: Body, T_world_object: Floats, sigmas: Sequence[float]
+) -> Floats:
+    """By how much each direction moves the features by one finest blur, in the keenest sensor."""
+    points = body.nodes.points
+    keenest = np.zeros(6)
+    for view, sigma in zip(views, sigmas, strict=True):
+        _, by_world, seen = view.sensor.linearise(transform(T_world_object, points))
+        if seen.any():
+            J = pose_jacobian(by_world, points @ T_world_object[:3, :3].T)[seen] / sigma
+            keenest = np.maximum(keenest, (J**2).sum(axis=1).mean(axis=0))
+    usual = np.repeat([0.02 * body.radius, np.radians(1.0)], 3)
+    return np.where(keenest > 0, 1 / np.sqrt(np.maximum(keenest, 1e-300)), usual)

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.objective import View
-from mixpose.pictures.canvas import WHITE, Picture, words
-from mixpose.pictures.densities import densities_picture
+from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.layout import in_grid, stacked
 from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
-from mixpose.pictures.plots import objective_picture, ranges_picture
-from mixpose.pictures.slices import objective_around
-from mixpose.pictures.stages import features_picture, pose_picture, threshold_picture
+from mixpose.pictures.plots import objective_around, objective_picture, ranges_picture
+from mixpose.pictures.stages import (
+    densities_picture,
+    features_picture,
+    pose_picture,
+    threshold_picture,
+)
 from mixpose.records import Estimate
 from mixpose.session import Session
 
 BODIES = "bodies.png"
 """The frames of all sensors with the poses of several bodies."""
+
+STAGES = ("features", "threshold", "density", "pose")
+"""Pictures of a camera, as they stand on the sheet."""
 
 _LARGE = (1400, 1050)  # room of a picture of its own
 _SMALL = (460, 345)  # and on the sheet
@@ -36,21 +41,7 @@ _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 def inspection_pictures(
     session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
-    """Make all pictures of one body in one frame.
-
-    Parameters
-    ----------
-    session : Session
-    body : Body
-    findings : sequence of Finding
-        One per sensor.
-    estimate : Estimate
-
-    Returns
-    -------
-    dict of str to (H, W, 3) uint8
-        By file name, ``sheet.png`` first.
-    """
+    """All pictures of one body in one frame, by file name; ``sheet.png`` is the first."""
     views = [
         finding.view
         for finding in findings
@@ -59,14 +50,16 @@ def inspection_pictures(
     blurs = fitted_blurs(views, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
-    names = file_names(_names(session))
+    names = file_names([setup.name for setup in session.sensors])
     for finding, name in zip(findings, names, strict=True):
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        made = _camera_pictures(session, finding, body, estimate, sigmas)
+        about = session, finding, body, estimate, sigmas
+        made = _camera_pictures(*about, on_sheet=False)
         pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        rows.append(_camera_row(session, finding, body, estimate, sigmas))
+        made = _camera_pictures(*about, on_sheet=True)
+        rows.append(in_grid([made[stage] for stage in STAGES if stage in made], 4, _SMALL))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
         ends = [_some(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
@@ -75,31 +68,21 @@ def inspection_pictures(
         pictures["ranges.png"] = picture
         rows.append(picture)
     if estimate.T_world_object is not None and views:
-        pictures["objective.png"] = _objective(session, body, views, blurs, estimate)
-        rows.append(pictures["objective.png"])
+        levels = list(zip(*(blurs[view.name] for view in views), strict=True))
+        T, covariance = estimate.T_world_object, estimate.covariance
+        around = objective_around(views, body, T, covariance, session.estimator, levels)
+        finest = [view.observation.sigma for view in views]
+        factors = [max(a / b for a, b in zip(level, finest)) for level in levels]
+        picture = objective_picture(*around, factors, covariance, session.unit, _WIDTH)
+        pictures["objective.png"] = picture
+        rows.append(picture)
     return {"sheet.png": stacked(rows), **pictures}
-
-
-def _objective(
-    session: Session,
-    body: Body,
-    views: Sequence[View],
-    blurs: Mapping[str, Sequence[float]],
-    estimate: Estimate,
-) -> Picture:
-    T, covariance = estimate.T_world_object, estimate.covariance
-    assert T is not None, "without a pose there is nothing to cut the objective around"
-    levels = list(zip(*(blurs[view.name] for view in views), strict=True))
-    slices, maps = objective_around(views, body, T, covariance, session.estimator, levels)
-    finest = [view.observation.sigma for view in views]
-    factors = [max(a / b for a, b in zip(level, finest)) for level in levels]
-    return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
 
 
 def possible_names(session: Session) -> list[str]:
     """Names of all files that may be made of a session's frame."""
-    stages = ("features", "threshold", "density", "pose")
-    names = [f"{name}_{stage}.png" for name in file_names(_names(session)) for stage in stages]
+    sensors = file_names([setup.name for setup in session.sensors])
+    names = [f"{name}_{stage}.png" for name in sensors for stage in STAGES]
     names = ["sheet.png", "objective.png", "ranges.png", *names]
     prefixes = prefixes_of(session.labels)
     return [BODIES, *(prefix + name for prefix in prefixes for name in names)]
@@ -111,10 +94,7 @@ def prefixes_of(labels: Sequence[str]) -> list[str]:
 
 
 def fitted_blurs(views: Sequence[View], estimate: Estimate) -> dict[str, list[float]]:
-    """Blurs that a pose was fitted by, in their order, by sensor.
-
-    Where it was not fitted to this frame, or a sensor was left out, σ_ε, by which it is judged.
-    """
+    """Blurs by sensor that a pose was fitted by, in their order; σ_ε of one that it was not."""
     levels = estimate.blurs or ({},)
     return {
         view.name: [level.get(view.name, view.observation.sigma) for level in levels]
@@ -128,36 +108,23 @@ def _camera_pictures(
     body: Body,
     estimate: Estimate,
     sigmas: Sequence[float],
+    *,
+    on_sheet: bool,
 ) -> dict[str, Picture]:
+    """One camera's pictures by `STAGES`; no densities without blurs."""
+    room = _SMALL if on_sheet else _LARGE
     pictures = {
-        "features": features_picture(finding, _LARGE),
-        "threshold": threshold_picture(finding, _LARGE),
-        "pose": pose_picture(finding, body, estimate, _LARGE),
+        "features": features_picture(finding, room),
+        "threshold": threshold_picture(finding, room),
+        "pose": pose_picture(finding, body, estimate, room),
     }
     if finding.view is not None and sigmas:
-        T, few = estimate.T_world_object, _some(sigmas, _MOST_BLURS)
-        about = finding.view, body, T, few, session.estimator
+        few = _some(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
-        pictures["density"] = densities_picture(*about, (side, side))
+        panel = (_SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
+        about = finding.view, body, estimate.T_world_object, few, session.estimator
+        pictures["density"] = densities_picture(*about, panel)
     return pictures
-
-
-def _camera_row(
-    session: Session,
-    finding: Finding,
-    body: Body,
-    estimate: Estimate,
-    sigmas: Sequence[float],
-) -> Picture:
-    """One camera on the sheet: features, threshold, densities, pose."""
-    panels = [features_picture(finding, _SMALL), threshold_picture(finding, _SMALL)]
-    if finding.view is not None and sigmas:
-        half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX
-        T, few = estimate.T_world_object, _some(sigmas, _BLURS_ON_SHEET)
-        about = finding.view, body, T, few, session.estimator
-        panels.append(densities_picture(*about, half))
-    panels.append(pose_picture(finding, body, estimate, _SMALL))
-    return in_grid(panels, 4, _SMALL)
 
 
 def _heading(session: Session, estimate: Estimate) -> Picture:
@@ -180,10 +147,6 @@ def _some(sigmas: Sequence[float], most: int) -> list[float]:
     """The first and the last blur, and as many between them as there is room for."""
     chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, most)).astype(int))
     return [sigmas[k] for k in chosen] if sigmas else []
-
-
-def _names(session: Session) -> list[str]:
-    return [setup.name for setup in session.sensors]
 
 
 def file_names(wanted: Sequence[str]) -> list[str]:

@@ -19,30 +19,13 @@ _LOOK_AT = 1024  # bytes at either end of a file that are searched for the signa
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Write a picture (H, W, 3) as a PNG with the signature.
-
-    Raises
-    ------
-    SessionError
-        If it cannot be written.
-    """
+    """Write a picture (H, W, 3) as a PNG with the signature, or raise a `SessionError`."""
     encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not encoded:
         raise SessionError(f"{path}: a picture of {picture.shape} cannot be made a PNG")
-    write_signed(path, np.asarray(data).tobytes())
-
-
-def write_signed(path: Path, png: bytes) -> None:
-    """Write the bytes of a PNG with the signature in a text chunk.
-
-    Raises
-    ------
-    SessionError
-        If they cannot be written.
-    """
     try:
         with appearing_whole(path) as part:
-            part.write_bytes(_signed(png))
+            part.write_bytes(_signed(np.asarray(data).tobytes()))
     except OSError as error:
         raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
 
@@ -86,13 +69,7 @@ def is_ours(path: Path) -> bool:
 
 
 def refuse_foreign(path: Path, option: str) -> None:
-    """Make sure that a file about to be written is new, or a picture that mixpose wrote.
-
-    Raises
-    ------
-    SessionError
-        If it is something else.
-    """
+    """Raise a `SessionError` if a file to be written is there, and mixpose did not write it."""
     if path.is_dir():
         raise SessionError(f"{option}: {path} is a folder where a file is to be written")
     if path.is_file() and not is_ours(path):

@@ -1,8 +1,16 @@
-"""Pictures of what happens to one camera's frame: features, threshold, pose."""
+"""Pictures of what happens to one camera's frame: features, threshold, densities, pose.
+
+Densities are those that a frame was estimated with, g and C, blur by blur: g is the observed
+density g0 ∗ ε, and C is g blurred once more, which the matched objective looks up.  Objectives that
+draw samples look g up on a grid around them.  Panels of one kind have one scale, which a bar below
+states: it is logarithmic, as a peak falls with the square of the blur.
+"""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -12,28 +20,14 @@ from mixpose.body import Body
 from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
-from mixpose.objective import View, region_of_interest
-from mixpose.pictures.canvas import (
-    WHITE,
-    Colour,
-    Picture,
-    cross,
-    line_height,
-    stroke,
-    words,
-)
-from mixpose.pictures.display import displayable
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View, matched_objective, region_of_interest
+from mixpose.objective.paper import sampled_terms
+from mixpose.pictures import canvas, overlay
+from mixpose.pictures.canvas import WHITE, Colour, Picture
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.overlay import (
-    FOUND,
-    Part,
-    draw_pose,
-    ellipse_95,
-    median_gap,
-    projected_covariances,
-    projected_features,
-)
-from mixpose.pictures.scene import backdrop
+from mixpose.pictures.overlay import Part
+from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
@@ -46,6 +40,11 @@ _MAGNIFIERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _ELLIPSE_PX = 20.0  # larger half-axis of an ellipse that is easily seen
 _AROUND = 0.35  # of the body's extent, shown around it
 _LEAST_AROUND_PX = 25.0
+
+_STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
+_SHOWN = 1e-3  # of the lowest peak: what is less is black
+_BAR_LINES = 1.6  # height of a bar, lines of captions
+_MARGIN = 4  # widest blurs around the body
 
 
 def features_picture(finding: Finding, room: Size) -> Picture:
@@ -68,26 +67,27 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     window = 0, 0, data.shape[1], data.shape[0]
     if options.method == "corners":
         blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CornerRules().blur)
-        response = np.sqrt(np.maximum(saddle_strength(blurred), 0))
-        picture = displayable(_resized(response, size))
+        values = np.sqrt(np.maximum(saddle_strength(blurred), 0))
         title = "strength of saddles"
     elif options.method == "log":
-        strength = np.maximum(spot_strength(data, options), 0)
-        picture = displayable(_resized(strength, size))
+        values = np.maximum(spot_strength(data, options), 0)
         title = "height of spots"
     elif options.method == "intensity":
-        picture = displayable(_resized(feature_values(data, options, window), size))
+        values = feature_values(data, options, window)
         title = "grey values above the threshold"
     elif options.method == "blobs":
         scene = foreground(data, options, window)
         mask = above(scene.grey, scene.zero + scene.level)
         picture = np.asarray(np.round(_DIMMED * picture), dtype=np.uint8)
         # a pixel of the picture is marked if any of those behind it is
-        shown = cv2.resize(cv2.dilate(mask, _block(part.zoom)), size, None, 0, 0, cv2.INTER_NEAREST)
+        behind = np.ones([max(int(np.ceil(1 / part.zoom)), 1)] * 2, np.uint8)
+        shown = cv2.resize(cv2.dilate(mask, behind), size, None, 0, 0, cv2.INTER_NEAREST)
         picture[shown > 0] = ABOVE
         title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
         return titled(picture, f"{options.method}: its own threshold")
+    if options.method != "blobs":
+        picture = canvas.displayable(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     if options.method != "intensity":
         _mark(picture, part, finding.points)
     return titled(picture, title)
@@ -98,21 +98,13 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     T = estimate.T_world_object
     if finding.view is None or T is None:
         picture, _ = backdrop(finding.setup, finding.frame, room)
-        return draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
-    box = shown_box(finding.view, body, T, None)
-    part, size = fitted(box, room)
-    whole, native = backdrop(finding.setup, finding.frame, None)
-    matrix = np.array(
-        [
-            [native.zoom / part.zoom, 0, native.zoom * (part.corner[0] + 0.5 / part.zoom) - 0.5],
-            [0, native.zoom / part.zoom, native.zoom * (part.corner[1] + 0.5 / part.zoom) - 0.5],
-        ]
-    )
-    way = cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR
-    cut = cv2.warpAffine(whole, matrix, size, flags=way | cv2.WARP_INVERSE_MAP)
-    factor, note = _magnifier(finding, body, estimate, part.zoom, stroke(np.asarray(cut)))
-    drawn = draw_pose(
-        np.asarray(cut, dtype=np.uint8),
+        return overlay.draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
+    part = fitted(shown_box(finding.view, body, T, None), room)
+    whole, _ = backdrop(finding.setup, finding.frame, None)
+    cut = cut_out(whole, part, room, cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR)
+    factor, note = _magnifier(finding, body, estimate, part.zoom, canvas.stroke(cut))
+    drawn = overlay.draw_pose(
+        cut,
         finding.setup.sensor,
         body,
         T,
@@ -124,7 +116,8 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
         magnified=factor,
     )
     if note:
-        words(drawn, note, (0.5 * line_height(drawn), drawn.shape[0] - 8), WHITE, size=0.8)
+        place = canvas.caption_place(drawn)[0], drawn.shape[0] - 8
+        canvas.words(drawn, note, place, WHITE, size=0.8)
     return drawn
 
 
@@ -136,12 +129,12 @@ def _magnifier(
     if T is None or covariance is None or not np.isfinite(covariance).all():
         return 1, ""
     sensor = finding.setup.sensor
-    y, _, seen = projected_features(sensor, body, T)
-    spreads = projected_covariances(sensor, body, T, covariance)[seen]
+    y, _, seen = overlay.projected_features(sensor, body, T)
+    spreads = overlay.projected_covariances(sensor, body, T, covariance)[seen]
     if not len(spreads):
         return 1, ""
-    largest = [np.linalg.norm(ellipse_95(spread), axis=1).max() for spread in spreads]
-    room = min(_ELLIPSE_PX * scale, 0.4 * zoom * median_gap(y[seen]))
+    largest = [np.linalg.norm(overlay.ellipse_95(spread), axis=1).max() for spread in spreads]
+    room = min(_ELLIPSE_PX * scale, 0.4 * zoom * overlay.median_gap(y[seen]))
     allowed = room / max(zoom * float(np.median(largest)), 1e-12)
     factor = max((each for each in _MAGNIFIERS if each <= allowed), default=1)
     enlarged = f", drawn {factor} times as large" if factor > 1 else ""
@@ -165,33 +158,140 @@ def shown_box(
     return region_of_interest(view.sensor, y, margin)
 
 
-def fitted(box: tuple[Floats, Floats], room: Size) -> tuple[Part, Size]:
-    """How a box of sensor coordinates fits into some room."""
+def fitted(box: tuple[Floats, Floats], room: Size) -> Part:
+    """The part of a sensor with a box of its coordinates that fits into some room."""
     extent = np.maximum(box[1] - box[0] + 1, 1)
     zoom = float(min(room[0] / extent[0], room[1] / extent[1]))
     # the box in the middle; what else there is room for is shown too
     corner = np.floor(box[0] - (np.array(room) / zoom - extent) / 2)
-    return Part(zoom, (float(corner[0]), float(corner[1]))), room
+    return Part(zoom, (float(corner[0]), float(corner[1])))
 
 
 def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
     if points is None or not len(points):
         return
-    reach = min(_MARK_PX * stroke(picture), max(0.45 * part.zoom * median_gap(points), 3.0))
+    reach = min(
+        _MARK_PX * canvas.stroke(picture), max(0.45 * part.zoom * overlay.median_gap(points), 3.0)
+    )
     for place in part.places(points):
-        cross(picture, place, reach / 3, reach, FOUND)
+        canvas.cross(picture, place, reach / 3, reach, overlay.FOUND)
 
 
 def titled(picture: Picture, title: str) -> Picture:
     """The picture, with a caption in its upper left corner."""
-    words(picture, title, (0.5 * line_height(picture), 1.1 * line_height(picture)), WHITE, size=0.9)
+    canvas.words(picture, title, canvas.caption_place(picture), WHITE, size=0.9)
     return picture
 
 
-def _resized(values: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+@dataclass(frozen=True)
+class Panel:
+    """A density on a picture."""
+
+    title: str
+    values: Floats  # (H, W) in 1/px², of each pixel the largest
 
 
-def _block(zoom: float) -> NDArray[np.uint8]:
-    side = max(int(np.ceil(1 / zoom)), 1)
-    return np.ones((side, side), np.uint8)
+def densities_picture(
+    view: View,
+    body: Body,
+    T: Floats | None,
+    sigmas: Sequence[float],
+    options: EstimatorOptions,
+    room: Size,
+) -> Picture:
+    """A row of g at the blurs of a fit, a row of C, and the scale of each below it.
+
+    `sigmas` are standard deviations of a feature in px, in the order of the fit, the last σ_ε or
+    less. What there is about the pose is shown, in panels of a size `room`; without a pose, what is
+    about all that was found.
+    """
+    box = shown_box(view, body, T, _MARGIN * max(sigmas))
+    part = fitted(box, room)
+    rows = []
+    for panels in panels_of(view, body, T, sigmas, options, part, room):
+        peaks = [float(one.values.max()) for one in panels]
+        top = max(peaks) or 1.0  # where nothing was found about the body, all is black
+        bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
+        drawn = [titled(_coloured(one.values, bottom, top), one.title) for one in panels]
+        row = canvas.in_grid(drawn, len(drawn))
+        rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
+    return canvas.stacked(rows)
+
+
+def panels_of(
+    view: View,
+    body: Body,
+    T: Floats | None,
+    sigmas: Sequence[float],
+    options: EstimatorOptions,
+    part: Part,
+    size: Size,
+) -> list[list[Panel]]:
+    """The panels of g and those of C, on a picture (width, height) of a part of the image.
+
+    The sampled objectives climb g alone; C is then that at σ_ε, by which the pose is judged.
+    """
+    is_matched = options.objective == "matched"
+    judged = list(sigmas) if is_matched else [view.observation.sigma]
+    lower = np.array(part.corner) - 1.0
+    shown = lower, lower + np.array(size) / part.zoom + 2.0
+    values: NDArray[Any]
+    observed, twice = [], []
+    for sigma in sigmas:
+        places = _places(sigma, part, size)
+        if is_matched or T is None:
+            # exact sums on a grid
+            word, values = "g", view.observation.density(sigma, shown).sample(places)
+        else:
+            # as the objectives that draw samples have it: around these, and 0 elsewhere
+            samples = body.sample(options.samples, seed=options.seed)
+            terms = sampled_terms([view], samples, [sigma], T)
+            word, values = "g sampled", np.zeros(places.shape[:-1])
+            if terms:
+                values = terms[0].density.sample(places)[..., 0]
+        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", _largest(values, size)))
+    for sigma in judged:
+        atlas = matched_objective([view], body, [sigma]).atlas
+        values = atlas.look_up(_places(sigma, part, size)[None])[0, ..., 0]
+        twice.append(Panel(f"C = g ∗ ε, σ = {sigma:.3g} px", _largest(values, size)))
+    return [observed, twice]
+
+
+def _places(sigma: float, part: Part, size: Size) -> Floats:
+    """Places (fine H, fine W, 2) of a picture at which a density is looked up."""
+    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
+    u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    return np.asarray((pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner)
+
+
+def _largest(values: NDArray[Any], size: Size) -> Floats:
+    """Of each pixel of a picture (H, W) the largest of its values, lest peaks be missed."""
+    fine = len(values) // size[1]
+    blocks = np.asarray(values, dtype=np.float64).reshape(size[1], fine, size[0], fine)
+    return np.asarray(np.maximum(blocks.max(axis=(1, 3)), 0.0))
+
+
+def _coloured(values: Floats, bottom: float, top: float) -> Picture:
+    """Densities in colours, black below `bottom` and brightest at `top`."""
+    share = np.log(np.maximum(values, bottom) / bottom) / np.log(top / bottom)
+    grey = np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
+
+
+def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
+    """The scale of a row of panels as a bar, with the powers of ten on it."""
+    line = canvas.line_height(panel)
+    shares = np.linspace(0, 1, width)
+    bar = np.tile(bottom * (top / bottom) ** shares, (max(round(0.4 * line), 4), 1))
+    picture = np.zeros((round(_BAR_LINES * line), width, 3), np.uint8)
+    picture[: len(bar)] = _coloured(bar, bottom, top)
+    first, last = np.ceil(np.log10(bottom)), np.floor(np.log10(top))
+    baseline = picture.shape[0] - 0.3 * line
+    for power in np.arange(first, last + 1):
+        u = width * (power - np.log10(bottom)) / np.log10(top / bottom)
+        if u < width - 8 * line:
+            picture[: len(bar), max(round(u) - 1, 0) : round(u) + 1] = 255
+            canvas.words(picture, f"1e{power:.0f}", (u, baseline), WHITE, size=0.8)
+    canvas.words(picture, f"{top:.1e} / px²", (width - 5 * line, baseline), WHITE, size=0.8)
+    return picture

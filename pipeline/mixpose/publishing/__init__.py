@@ -1,7 +1,7 @@
 """Publishing: poses to other programs while they are estimated.
 
-A new protocol is one file with its `Sender` and one line in `mixpose.publishing.senders`.
+A new protocol is one file with its `Sender` and one line in `mixpose.publishing.message`.
 """
 
-from mixpose.publishing.publishing import Publishing as Publishing
-from mixpose.publishing.senders import SENDERS as SENDERS
+from mixpose.publishing.channel import Publishing as Publishing
+from mixpose.publishing.message import SENDERS as SENDERS

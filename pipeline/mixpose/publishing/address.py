@@ -13,77 +13,40 @@ from mixpose.errors import SessionError
 
 @dataclass(frozen=True)
 class Address:
-    """An address, taken apart.
+    """An address, taken apart."""
 
-    Attributes
-    ----------
-    text : str
-        For messages: without a password.
-    scheme : str
-    host : str
-        Empty where there is none.
-    port : int or None
-    path : str
-        Without a slash before it or behind it.
-    name : str
-        Host and path as they are written, where they are no host but a name.
-    user, password : str or None
-    options : mapping of str to str
-        What stands behind a question mark.
-    """
-
-    text: str
+    text: str  # for messages: without a password
     scheme: str
-    host: str
+    host: str  # empty where there is none
     port: int | None
-    path: str
-    name: str
+    path: str  # without a slash before it or behind it
+    name: str  # host and path as they are written, where they are no host but a name
     user: str | None
     password: str | None
-    options: Mapping[str, str]
+    options: Mapping[str, str]  # what stands behind a question mark
 
     def error(self, reason: str) -> SessionError:
         """An error about this address."""
         return SessionError(f"--publish {self.text}: {reason}")
 
     def place(self, example: str, port: int | None = None) -> tuple[str, int]:
-        """Host and port; this port where none is written.
-
-        Raises
-        ------
-        SessionError
-            If host or port are missing; `example` shows how it is written.
-        """
+        """Host and port, this port where none is written, or an error that shows an example."""
         found = self.port or port
         if not self.host or found is None:
             raise self.error(f"found no host and port; allowed: {example}")
         return self.host, found
 
     def allow(self, *names: str) -> None:
-        """Refuse options other than these, and those that all addresses have.
-
-        Raises
-        ------
-        SessionError
-        """
-        self._one_of("option", set(self.options), {*names, "only"})
-        if "only" in self.options:
-            self._one_of("only", {self.options["only"]}, {"ok"})
-
-    def _one_of(self, what: str, found: Collection[str], allowed: Collection[str]) -> None:
-        for each in found:
-            if each not in allowed:
+        """Raise an error for options other than these, and those that all addresses have."""
+        values = {self.options["only"]} if "only" in self.options else set()
+        checks = ("option", set(self.options), {*names, "only"}), ("only", values, {"ok"})
+        for what, found, allowed in checks:
+            for each in found - allowed:
                 listed = ", ".join(sorted(allowed))
                 raise self.error(f"{what}: found {each}; allowed: {listed}")
 
     def needs(self, package: str, extra: str) -> None:
-        """Make sure that a package is installed.
-
-        Raises
-        ------
-        SessionError
-            Else, naming the extra that installs it.
-        """
+        """Raise an error that names the extra where a package is not installed."""
         if find_spec(package) is None:
             raise self.error(
                 f"needs the package {package}; install it with: "
@@ -92,13 +55,7 @@ class Address:
 
 
 def parse(url: str, schemes: Collection[str]) -> Address:
-    """Take an address apart.
-
-    Raises
-    ------
-    SessionError
-        If it is none, or of a scheme that is not allowed.
-    """
+    """Take an address apart; a `SessionError` if it is none, or of a scheme that is not allowed."""
     allowed = ", ".join(f"{each}://" for each in schemes)
     # a password is for the receiver, not for those who read what is said
     text = re.sub(r"//[^/]*@", "//", url)

@@ -1,32 +1,99 @@
-"""One receiver, served in a thread of its own: whatever it does, the run goes on."""
+"""All receivers of a run, each served in a thread of its own: whatever they do, the run goes on."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import Backlog, PublishingRules
-from mixpose.publishing.message import Message
-from mixpose.publishing.sender import Sender
+from mixpose.constants import constant
+from mixpose.poses.header import Header
+from mixpose.poses.plain import require_finite
+from mixpose.publishing.address import Address, parse
+from mixpose.publishing.message import SENDERS, Message, Sender, sender_for
+from mixpose.records import Estimate, FrameSet
 
 _REMEMBERED = 10_000  # latencies: a live source may run for days
 
+Foresee = Callable[[Estimate], Estimate]
+"""Makes of an estimate the one that is foretold."""
+
+
+@dataclass(frozen=True)
+class PublishingRules:
+    """How long receivers are waited for."""
+
+    waiting: int = constant(
+        100, "poses for one receiver: a second of a camera that gives 100 frames in it"
+    )
+    buffer: int = constant(2**16, "bytes that the system holds of a connection: some 20 poses")
+    retry_s: float = constant(
+        0.5, "between attempts to reach a receiver: 50 frames at 100 a second"
+    )
+    connect_s: float = constant(2.0, "to reach a receiver: a round trip by satellite takes 0.6 s")
+    farewell_s: float = constant(2.0, "for what still waits at the end: as long as to connect")
+    stuck_s: float = constant(
+        0.25, "in one send: longer takes a receiver that does not read, which no end waits for"
+    )
+
+
+class Backlog:
+    """Messages in their order; when there are too many, the oldest goes."""
+
+    def __init__(self, most: int) -> None:
+        self._messages = deque[Message]()
+        self._most = most
+        self._changed = threading.Condition()
+        self.has_ended = False
+        self.dropped = 0
+
+    def put(self, message: Message) -> None:
+        """Add the newest message, at once."""
+        with self._changed:
+            if len(self._messages) == self._most:
+                self._messages.popleft()
+                self.dropped += 1
+            self._messages.append(message)
+            self._changed.notify()
+
+    def put_back(self, message: Message) -> None:
+        """Add again the one that was taken last, if there is room for it."""
+        with self._changed:
+            if len(self._messages) == self._most:
+                self.dropped += 1
+            else:
+                self._messages.appendleft(message)
+
+    def take(self) -> Message | None:
+        """The oldest message, as soon as there is one; None at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages or self.has_ended)
+            return self._messages.popleft() if self._messages else None
+
+    def end(self) -> None:
+        """No further messages come."""
+        with self._changed:
+            self.has_ended = True
+            self._changed.notify_all()
+
+    def waits_for_end(self, seconds: float) -> bool:
+        """Whether the end comes within some seconds."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.has_ended, seconds)
+
+    def give_up(self) -> None:
+        """Drop all that is left."""
+        with self._changed:
+            self.dropped += len(self._messages)
+            self._messages.clear()
+
 
 class Channel:
-    """Sends messages to one receiver, and counts what becomes of them.
-
-    Parameters
-    ----------
-    address : Address
-    sender : Sender
-    tell : callable
-        Says a line to people.
-    """
+    """Sends messages to one receiver, and counts and tells what becomes of them."""
 
     def __init__(
         self,
@@ -90,33 +157,75 @@ class Channel:
             except OSError as error:
                 self._began = None
                 self._backlog.put_back(message)
-                if not (is_connected and self._backlog.has_ended):
-                    self._is_now_away(error)
+                if not (self._is_away or (is_connected and self._backlog.has_ended)):
+                    self._is_away = True
+                    reason = error.strerror or str(error) or type(error).__name__
+                    self._tell(
+                        f"warning: --publish {self._address.text}: the receiver is away: {reason}; "
+                        "the run goes on, and tries to reach it"
+                    )
                 is_connected = False
                 self._sender.close()
                 if self._backlog.waits_for_end(self._rules.retry_s):
                     self._backlog.give_up()
                 continue
-            self._is_now_there()
-            self._count(message, heard)
+            if self._is_away:
+                self._is_away = False
+                self._tell(f"--publish {self._address.text}: the receiver is there")
+            self._sent += heard
+            self._unheard += not heard
+            if message.moment is not None:
+                self._latencies.append(message.late_s)
+                self._stamped_by = message.moment.of
 
-    def _count(self, message: Message, heard: bool) -> None:
-        self._sent += heard
-        self._unheard += not heard
-        if message.moment is not None:
-            self._latencies.append(message.late_s)
-            self._stamped_by = message.moment.of
 
-    def _is_now_away(self, error: OSError) -> None:
-        if not self._is_away:
-            self._is_away = True
-            reason = error.strerror or str(error) or type(error).__name__
-            self._tell(
-                f"warning: --publish {self._address.text}: the receiver is away: {reason}; the run "
-                "goes on, and tries to reach it"
-            )
+class Publishing:
+    """Publishes estimates to receivers, which neither slow a run nor end it.
 
-    def _is_now_there(self) -> None:
-        if self._is_away:
-            self._is_away = False
-            self._tell(f"--publish {self._address.text}: the receiver is there")
+    It tells people lines. Of bodies by whose label there is something to `foresee` by, what that
+    makes of an estimate is published, `ahead_s` later. A `SessionError` if an address is wrong, its
+    package is not installed, or it cannot be listened at.
+    """
+
+    def __init__(
+        self,
+        urls: Sequence[str],
+        header: Header,
+        tell: Callable[[str], None],
+        foresee: Mapping[str, Foresee] | None = None,
+        ahead_s: float = 0.0,
+        rules: PublishingRules = PublishingRules(),
+    ) -> None:
+        self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
+        addresses = [parse(url, SENDERS) for url in urls]
+        self._channels = [
+            Channel(each, sender_for(each, header), tell, rules) for each in addresses
+        ]
+
+    def __enter__(self) -> Publishing:
+        for channel in self._channels:
+            channel.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for channel in self._channels:
+            channel.end()
+        closing = [threading.Thread(target=channel.close) for channel in self._channels]
+        for thread in closing:
+            thread.start()
+        for thread in closing:
+            thread.join()
+        for channel in self._channels:
+            self._tell(channel.text())
+
+    def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
+        """Publish an estimate; a `SessionError` where it is foretold, and has no time."""
+        require_finite(estimate)
+        # what tells its offsets holds all that the frame was made from
+        estimate = replace(estimate, measured=dict)
+        foresee = self._foresee.get(estimate.label)
+        if foresee is not None:
+            estimate = foresee(estimate)
+        message = Message(estimate, frame_set.moment, self._ahead_s if foresee else 0.0)
+        for channel in self._channels:
+            channel.put(message)

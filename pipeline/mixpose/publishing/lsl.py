@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.message import Message
+from mixpose.publishing.message import Message, Sender
 
 if TYPE_CHECKING:
     from pylsl import StreamOutlet
@@ -24,7 +24,7 @@ _STATUS = {"lost": 0.0, "ambiguous": 1.0, "ok": 2.0}
 _FLUSH_S = 0.5  # outlets send in a thread of their own, which ends with them
 
 
-class LslSender:
+class LslSender(Sender):
     """An outlet ``lsl://name``; of several bodies ``name-<body>`` for each.
 
     Channels (float64, irregular rate): x y z in the unit of the session, the quaternion x y z w,
@@ -52,10 +52,6 @@ class LslSender:
         self._outlets = {
             label: pylsl.StreamOutlet(_info(pylsl, name, header)) for label, name in names.items()
         }
-        self.dropped = 0
-
-    def connect(self) -> None:
-        """Nothing to do: receivers come by themselves."""
 
     def send(self, message: Message) -> bool:
         """Push the sample of one body."""

@@ -1,36 +1,30 @@
-"""What is published: an estimate, and when its frame was taken."""
+"""What is published, and the protocols by which it is, by the scheme of their addresses."""
 
 from __future__ import annotations
 
 import json
 import re
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import header_line, pose_line
+from mixpose.publishing.address import Address
 from mixpose.records import Estimate, Moment
 
 
 @dataclass(frozen=True)
 class Message:
-    """An estimate on its way.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    moment : Moment or None
-        When its frame was taken, by `time.monotonic`; None of a recording.
-    ahead_s : float
-        How much later the pose is foretold for.
-    unix_s : float or None
-        The moment that the pose is of, in seconds since 1970; None of a recording.
-    """
+    """An estimate on its way."""
 
     estimate: Estimate
+    # when its frame was taken, by `time.monotonic`; None of a recording
     moment: Moment | None = None
-    ahead_s: float = 0.0
+    ahead_s: float = 0.0  # how much later the pose is foretold for
+    # the moment of the pose, s since 1970, the same for all receivers; None of a recording
     unix_s: float | None = field(init=False, default=None)  # the same for all receivers
 
     def __post_init__(self) -> None:
@@ -67,3 +61,45 @@ def path_word(label: str) -> str:
     """What a body is called in topics and paths, which allow few characters."""
     word = re.sub(r"\W", "_", label, flags=re.ASCII)
     return f"_{word}" if word[:1].isdigit() else word
+
+
+class Sender:
+    """Sends poses by one protocol.
+
+    It is made with an `Address` and the `Header` of the run, and refuses with a `SessionError` what
+    is wrong about them. All else is called in a thread of its own, so that it may wait; an
+    `OSError` says that the receiver is not there, or has gone away.
+    """
+
+    dropped = 0  # poses that some receiver did not get because it is slower than others
+
+    def connect(self) -> None:
+        """Reach the receiver, where it does not come by itself; again after it was away."""
+
+    def send(self, message: Message) -> bool:
+        """Send a pose, and return whether anybody was there to hear it."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Let go of the receiver.  Called from another thread, it ends a `send` that waits."""
+
+
+# module and what makes a sender there: only what is asked for is loaded
+SENDERS: Mapping[str, str] = {
+    "udp": "sockets:UdpSender",
+    "tcp": "sockets:TcpSender",
+    "ws": "ws:WebSocketSender",
+    "osc": "sockets:OscSender",
+    "lsl": "lsl:LslSender",
+    "mqtt": "mqtt:MqttSender",
+    "ros2": "ros2:ros2_sender",
+}
+
+
+def sender_for(address: Address, header: Header) -> Sender:
+    """What sends the poses of a run, or a `SessionError` that says why it cannot."""
+    module, _, name = SENDERS[address.scheme].partition(":")
+    make: Callable[[Address, Header], Sender] = getattr(
+        import_module(f"mixpose.publishing.{module}"), name
+    )
+    return make(address, header)

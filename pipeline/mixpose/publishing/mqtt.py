@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import PublishingRules
-from mixpose.publishing.message import Message, header_text, path_word
+from mixpose.publishing.channel import PublishingRules
+from mixpose.publishing.message import Message, Sender, header_text, path_word
 from mixpose.publishing.sockets import force_down, keep_little
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ _PORT = 1883
 _LOOK_S = 0.2  # how often to see, while a message waits, that the broker is still there
 
 
-class MqttSender:
+class MqttSender(Sender):
     """Publishes pose lines to ``mqtt://user:password@host:port/topic``, topics ``topic/<body>``.
 
     Quality of service 0: at most once, as what is late is of no use.  ``topic/header`` is retained.
@@ -34,7 +34,6 @@ class MqttSender:
         self._header = header_text(header)
         self._client: Client | None = None
         self._is_sending = False
-        self.dropped = 0
 
     def connect(self) -> None:
         """Connect, and publish the header."""

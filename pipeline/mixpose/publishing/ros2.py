@@ -1,14 +1,34 @@
-"""ROS 2: by rclpy where ROS is installed, else by a rosbridge."""
+"""ROS 2: by rclpy where ROS is installed, else by a rosbridge.
+
+rclpy comes with ROS and with no package index.  A rosbridge is JSON over a WebSocket, where ROS is
+on another machine or in a container:
+https://github.com/RobotWebTools/rosbridge_suite/blob/ros2/ROSBRIDGE_PROTOCOL.md
+"""
 
 from __future__ import annotations
 
+import array
+import importlib
+import json
+from collections.abc import Mapping
+from contextlib import suppress
 from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mixpose.poses.header import Header
+from mixpose.poses.ros import pose_message
 from mixpose.publishing.address import Address
-from mixpose.publishing.ros_node import RosNodeSender
-from mixpose.publishing.rosbridge import RosbridgeSender
-from mixpose.publishing.sender import Sender
+from mixpose.publishing.channel import PublishingRules
+from mixpose.publishing.message import Message, Sender, path_word
+from mixpose.publishing.sockets import connected, force_down
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+DEFAULT_BRIDGE = "127.0.0.1:9090"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_DEPTH = 10  # of the queues of publishers, as in ROS's examples
 
 
 def ros2_sender(address: Address, header: Header) -> Sender:
@@ -17,3 +37,177 @@ def ros2_sender(address: Address, header: Header) -> Sender:
     if "bridge" in address.options or find_spec("rclpy") is None:
         return RosbridgeSender(address, header)
     return RosNodeSender(address, header)
+
+
+class Topics(NamedTuple):
+    """Topics of the poses of a run, and the frame that they are in."""
+
+    poses: Mapping[str, str]  # by label of a body
+    unit: str
+    frame_id: str
+    transforms: str = "/tf"
+
+
+class RosMessage(NamedTuple):
+    """A message with its fields by name, and where it goes."""
+
+    topic: str
+    kind: str
+    fields: dict[str, Any]
+
+
+def topics(address: Address, header: Header) -> Topics:
+    """Topics by ``ros2://topic``, of several bodies one each below it, or a `SessionError`."""
+    names = address.name.split("/")
+    if not all(part == path_word(part) and part for part in names):
+        raise address.error(
+            f"topic: found {address.name or 'none'}; allowed: words of letters, digits and _ with "
+            "slashes between them, as in ros2://tracker"
+        )
+    base = f"/{address.name}"
+    poses = {label: f"{base}/{path_word(label)}" for label in header.labels}
+    if len(poses) == 1:
+        poses = dict.fromkeys(poses, base)
+    return Topics(poses, header.unit, address.options.get("frame", "world"))
+
+
+def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
+    """The pose of a message and its transform, in metres; nothing of a lost frame.
+
+    The stamp is when the frame was taken: Unix time of a live source, the time of a recording's
+    frame or, without times, its number.
+    """
+    estimate = message.estimate
+    if estimate.T_world_object is None:
+        return []
+    recorded = estimate.frame if estimate.time_s is None else estimate.time_s
+    seconds = float(recorded if message.unix_s is None else message.unix_s)
+    fields = pose_message(estimate, to.unit, seconds, to.frame_id)
+    pose = fields["pose"]["pose"]
+    transform = {
+        "header": fields["header"],
+        "child_frame_id": path_word(estimate.label),
+        "transform": {"translation": pose["position"], "rotation": pose["orientation"]},
+    }
+    return [
+        RosMessage(to.poses[estimate.label], POSE, fields),
+        RosMessage(to.transforms, TRANSFORMS, {"transforms": [transform]}),
+    ]
+
+
+class RosNodeSender(Sender):
+    """A node ``mixpose`` that publishes to the topics of ``ros2://topic``."""
+
+    def __init__(self, address: Address, header: Header) -> None:
+        self._topics = topics(address, header)
+        rclpy = importlib.import_module("rclpy")
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self._node = rclpy.create_node("mixpose", context=self._context)
+        kinds = dict.fromkeys(self._topics.poses.values(), POSE)
+        kinds[self._topics.transforms] = TRANSFORMS
+        self._publishers = {
+            topic: self._node.create_publisher(_type(kind), topic, _DEPTH)
+            for topic, kind in kinds.items()
+        }
+
+    def send(self, message: Message) -> bool:
+        """Publish the pose of one body and its transform."""
+        for each in ros_messages(message, self._topics):
+            self._publishers[each.topic].publish(_filled(_type(each.kind)(), each.fields))
+        return any(one.get_subscription_count() for one in self._publishers.values())
+
+    def close(self) -> None:
+        """End the node."""
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+def _type(kind: str) -> Any:
+    """The class of a message, ``package/msg/Name``."""
+    package, _, name = kind.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
+
+
+def _filled(message: Any, fields: dict[str, Any]) -> Any:
+    """A message with its fields set, those of its parts too."""
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            _filled(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            made = _type("geometry_msgs/msg/TransformStamped")
+            setattr(message, name, [_filled(made(), each) for each in value])
+        elif isinstance(value, list):
+            setattr(message, name, array.array("d", value))
+        else:
+            setattr(message, name, value)
+    return message
+
+
+class RosbridgeSender(Sender):
+    """Publishes to the topics of ``ros2://topic?bridge=host:port``."""
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.needs("websockets", "ros2")
+        self._bridge = address.options.get("bridge", DEFAULT_BRIDGE)
+        host, _, port = self._bridge.rpartition(":")
+        if not (host and port.isdigit() and 0 < int(port) < 2**16):
+            raise address.error(f"bridge: found {self._bridge}; allowed: host:port")
+        self._place = host.strip("[]"), int(port)
+        self._topics = topics(address, header)
+        self._connection: ClientConnection | None = None
+        self._is_sending = False
+
+    def connect(self) -> None:
+        """Connect, and advertise the topics."""
+        from websockets.exceptions import WebSocketException  # noqa: PLC0415 - an extra
+        from websockets.sync.client import connect  # noqa: PLC0415
+
+        try:
+            self._connection = connect(
+                f"ws://{self._bridge}",
+                sock=connected(self._place),
+                open_timeout=PublishingRules.connect_s,
+                close_timeout=PublishingRules.connect_s,
+                compression=None,
+            )
+        except WebSocketException as error:
+            raise ConnectionError(f"ws://{self._bridge}: {error}") from error
+        for topic in self._topics.poses.values():
+            self._say({"op": "advertise", "topic": topic, "type": POSE})
+        self._say({"op": "advertise", "topic": self._topics.transforms, "type": TRANSFORMS})
+
+    def send(self, message: Message) -> bool:
+        """Publish the pose of one body and its transform."""
+        for each in ros_messages(message, self._topics):
+            self._say({"op": "publish", "topic": each.topic, "msg": each.fields})
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        assert self._connection is not None
+        with suppress(TimeoutError, ConnectionClosed):
+            # the bridge says something only where it refuses
+            answer = json.loads(self._connection.recv(timeout=0))
+            if answer.get("op") == "status" and answer.get("level") == "error":
+                raise ConnectionError(f"the rosbridge refuses: {answer.get('msg')}")
+        return True
+
+    def close(self) -> None:
+        """Close the connection; where a send waits, for which its lock is held, by force."""
+        if self._connection is None:
+            return
+        if self._is_sending:
+            force_down(self._connection.socket)
+        else:
+            self._connection.close()
+
+    def _say(self, what: dict[str, Any]) -> None:
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        assert self._connection is not None
+        self._is_sending = True
+        try:
+            self._connection.send(json.dumps(what, allow_nan=False))
+        except ConnectionClosed as error:
+            raise ConnectionError("the rosbridge has gone") from error
+        finally:
+            self._is_sending = False

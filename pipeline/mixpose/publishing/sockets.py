@@ -1,22 +1,24 @@
-"""Connections whose receivers may be slow, and datagrams that nobody may get."""
+"""Poses over plain sockets: a poses file by TCP, lines by UDP, and Open Sound Control 1.0."""
 
 from __future__ import annotations
 
 import socket
+import time
 from contextlib import suppress
 from typing import Any
 
-from mixpose.publishing.backlog import PublishingRules
+from mixpose import rigid
+from mixpose.poses.header import Header
+from mixpose.publishing.address import Address
+from mixpose.publishing.channel import PublishingRules
+from mixpose.publishing.message import Message, Sender, header_text, path_word
+
+HEADER_S = 1.0
+"""The header, which says the unit, is repeated so often: nobody knows who listens since when."""
 
 
 def connected(place: tuple[str, int]) -> socket.socket:
-    """A connection to a host and a port, on which little waits and nothing is held back.
-
-    Raises
-    ------
-    OSError
-        If nobody answers there in time.
-    """
+    """A connection to a host and a port, on which little waits and nothing is held back."""
     connection = socket.create_connection(place, PublishingRules.connect_s)
     connection.settimeout(None)  # whoever is slow is waited for: half a line helps nobody
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -35,7 +37,7 @@ def force_down(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
-class Datagrams:
+class Datagrams(Sender):
     """Datagrams to a host and a port, whether anybody listens there or not (RFC 768)."""
 
     def __init__(self, place: tuple[str, int]) -> None:
@@ -44,24 +46,12 @@ class Datagrams:
         self._to: tuple[Any, ...] = ()
 
     def connect(self) -> None:
-        """Look up the host.
-
-        Raises
-        ------
-        OSError
-            If it is not known.
-        """
+        """Look up the host."""
         kind, _, _, _, self._to = socket.getaddrinfo(*self._place, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(kind, socket.SOCK_DGRAM)
 
     def put(self, data: bytes) -> None:
-        """Send one datagram.
-
-        Raises
-        ------
-        OSError
-            If it is too long, or there is no way to the host.
-        """
+        """Send one datagram."""
         assert self._socket is not None
         self._socket.sendto(data, self._to)
 
@@ -69,3 +59,81 @@ class Datagrams:
         """Close the socket."""
         if self._socket is not None:
             self._socket.close()
+
+
+class TcpSender(Sender):
+    """Connects to ``tcp://host:port``, where a receiver listens; the header comes first."""
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        self._place = address.place("tcp://127.0.0.1:9870")
+        self._header = f"{header_text(header)}\n".encode()
+        self._socket: socket.socket | None = None
+
+    def connect(self) -> None:
+        """Connect, and send the header."""
+        self._socket = connected(self._place)
+        self._socket.sendall(self._header)
+
+    def send(self, message: Message) -> bool:
+        """Send a line."""
+        assert self._socket is not None
+        self._socket.sendall(f"{message.text}\n".encode())
+        return True
+
+    def close(self) -> None:
+        """Close the connection; what was sent still arrives."""
+        if self._socket is not None:
+            force_down(self._socket)
+            self._socket.close()
+
+
+class UdpSender(Datagrams):
+    """Sends to ``udp://host:port``, whether anybody listens there or not."""
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        super().__init__(address.place("udp://127.0.0.1:9870"))
+        self._header = header_text(header).encode()
+        self._told = float("-inf")
+
+    def send(self, message: Message) -> bool:
+        """Send a line, and from time to time the header before it."""
+        now = time.monotonic()
+        if now - self._told >= HEADER_S:
+            self._told = now
+            self.put(self._header)
+        self.put(message.text.encode())
+        return True
+
+
+class OscSender(Datagrams):
+    """Sends to ``osc://host:port/prefix``, whether anybody listens there or not.
+
+    A message ``/prefix/<body>`` has the frame number (i), the time of the frame in seconds (d;
+    of a live source those since 1970), the status (s), and but for a lost frame x y z in the unit
+    of the session and the quaternion x y z w (7 f).
+    """
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        address.needs("pythonosc", "osc")
+        super().__init__(address.place("osc://127.0.0.1:9000"))
+        self._prefix = f"/{address.path or 'mixpose'}"
+
+    def send(self, message: Message) -> bool:
+        """Send the message of one body."""
+        from pythonosc.osc_message_builder import OscMessageBuilder  # noqa: PLC0415 - an extra
+
+        estimate = message.estimate
+        built = OscMessageBuilder(f"{self._prefix}/{path_word(estimate.label)}")
+        built.add_arg(int(estimate.frame), "i")
+        time_s = estimate.time_s if message.unix_s is None else message.unix_s
+        built.add_arg(float(estimate.frame if time_s is None else time_s), "d")
+        built.add_arg(estimate.status, "s")
+        T = estimate.T_world_object
+        if T is not None:
+            for value in (*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()):
+                built.add_arg(value, "f")
+        self.put(built.build().dgram)
+        return True

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import PublishingRules
-from mixpose.publishing.message import Message, header_text
+from mixpose.publishing.channel import PublishingRules
+from mixpose.publishing.message import Message, Sender, header_text
 from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class _Client:
         return self.began is not None and now - self.began > PublishingRules.stuck_s
 
 
-class WebSocketSender:
+class WebSocketSender(Sender):
     """Listens at ``ws://host:port/path``; who connects there gets the header and further lines.
 
     Each gets what it is quick enough for.  Who asks for another path is refused, so that a path
@@ -64,10 +64,6 @@ class WebSocketSender:
         self._end = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="mixpose-ws", daemon=True)
         self._thread.start()
-        self.dropped = 0
-
-    def connect(self) -> None:
-        """Nothing to do: receivers come by themselves."""
 
     def send(self, message: Message) -> bool:
         """Hand a line to all who are there."""
@@ -106,17 +102,15 @@ class WebSocketSender:
         ):
             await self._end.wait()
             deadline = self._loop.time() + PublishingRules.farewell_s
-            while self._are_waiting() and self._loop.time() < deadline:
+            # for what is still to be sent to those who read
+            while self._loop.time() < deadline and any(
+                one.waiting or one.began is not None for one in self._clients if not one.is_stuck()
+            ):
                 await asyncio.sleep(0.01)
             for client in self._clients:
                 self.dropped += len(client.waiting) + (client.began is not None)
                 if client.is_stuck():
                     client.connection.transport.abort()
-
-    def _are_waiting(self) -> bool:
-        """Whether anything is still to be sent to those who read."""
-        there = [one for one in self._clients if not one.is_stuck()]
-        return any(one.waiting or one.began is not None for one in there)
 
     def _refuse_other_paths(
         self, connection: ServerConnection, request: Request

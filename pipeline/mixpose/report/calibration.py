@@ -9,8 +9,7 @@ import numpy as np
 from mixpose.calibration import Calibration
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
-from mixpose.report.drawing import BARS, POSE, TRUTH, blank, drawn
-from mixpose.report.figures import Chart
+from mixpose.report.figures import BARS, POSE, TRUTH, Chart, blank, drawn
 from mixpose.report.page import page_templates
 
 MARK = '<meta name="generator" content="mixpose calibration'
@@ -20,22 +19,9 @@ _LONG = 0.05  # of an image's width: the arrow of a residual of three standard d
 
 
 def render_calibration(found: Calibration, name: str, unit: str, version: str) -> str:
-    """The page of a calibration, without anything outside it.
+    """The page of a calibration of a session by its name, without anything outside it.
 
-    Parameters
-    ----------
-    found : Calibration
-    name : str
-        Of the session.
-    unit : str
-        Of lengths.
-    version : str
-        Of mixpose.
-
-    Raises
-    ------
-    SessionError
-        If a library is missing.
+    `unit` is of lengths, `version` of mixpose. A `SessionError` where a library is missing.
     """
     environment = page_templates()
     sensors = range(len(found.after.names))
@@ -48,21 +34,25 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
         refused=found.refused,
         unlinked=[found.after.names[k] for k in found.unlinked],
         images=[chart for chart in charts if chart is not None],
-        others=[_above(found, unit), _by_frame(found), _by_feature(found)],
+        others=[_above(found, unit), _residuals(found, "frame"), _residuals(found, "feature")],
     )
 
 
 def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
-    sights, eye = found.sights[index], found.after.sensors[index]
+    sights = found.sights[index]
+    eye: Any = found.after.sensors[index]
     if not len(sights.y):
         return None
     if eye.dimension == 1:
         figure, axes = blank()
         axes.plot(sights.y[:, 0], sights.offset[:, 0], ".", markersize=2.5, **POSE)
-        axes.set_xlabel(f"range, {unit}")
-        axes.set_ylabel(f"residual, {unit}")
+        axes.set(xlabel=f"range, {unit}", ylabel=f"residual, {unit}")
     else:
-        figure, axes = _image_axes(eye, sights.y)
+        figure, axes = blank(height=3.2)
+        low, high = sights.y.min(axis=0), sights.y.max(axis=0)
+        if getattr(eye, "resolution", None) is not None:
+            low, high = np.zeros(2), np.array(eye.resolution, dtype=float)
+        axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
         width = float(np.ptp(axes.get_xlim()))
         scale = 3 * found.noise[index] / (_LONG * width)
         axes.quiver(
@@ -81,23 +71,12 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
     return Chart(title, alt, drawn(figure))
 
 
-def _image_axes(eye: Any, y: Any) -> tuple[Any, Any]:
-    figure, axes = blank(height=3.2)
-    resolution = getattr(eye, "resolution", None)
-    low, high = y.min(axis=0), y.max(axis=0)
-    if resolution is not None:
-        low, high = np.zeros(2), np.array(resolution, dtype=float)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(high[1], low[1])
-    axes.set_aspect("equal")
-    return figure, axes
-
-
 def _above(found: Calibration, unit: str) -> Chart:
     """Sensors and body in the plane in which the rig is widest."""
     before = np.array([centre_of(s) for s in found.before.sensors])
     after = np.array([centre_of(s) for s in found.after.sensors])
-    body = np.array([T[:3, :3] @ found.after.points.mean(axis=0) + T[:3, 3] for T in _poses(found)])
+    middle = found.after.points.mean(axis=0)
+    body = np.array([T[:3, :3] @ middle + T[:3, 3] for T in found.poses.values()])
     everything = np.concatenate([after, body])
     a, b = np.sort(np.argsort(-np.ptp(everything, axis=0), kind="stable")[:2])
     figure, axes = blank(height=3.6)
@@ -105,51 +84,34 @@ def _above(found: Calibration, unit: str) -> Chart:
     axes.plot(before[:, a], before[:, b], **{**TRUTH, "linestyle": "none", "marker": "x"})
     axes.plot(after[:, a], after[:, b], "o", markersize=5, fillstyle="none", **POSE)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{'xyz'[a]}, {unit}")
-    axes.set_ylabel(f"{'xyz'[b]}, {unit}")
+    axes.set(xlabel=f"{'xyz'[a]}, {unit}", ylabel=f"{'xyz'[b]}, {unit}")
     title = "Sensors before (crosses) and after (circles), and the body (dots)"
     return Chart(title, f"{len(after)} sensors, {len(body)} frames", drawn(figure))
 
 
-def _poses(found: Calibration) -> Any:
-    return np.array(list(found.poses.values()))
-
-
-def _by_frame(found: Calibration) -> Chart:
-    numbers, values = _grouped(found, "frame")
-    figure, axes = blank()
-    axes.plot(numbers, values, ".", markersize=4, **POSE)
-    axes.set_xlabel("frame")
-    axes.set_ylabel("residual, standard deviations")
-    axes.set_ylim(bottom=0)
-    return Chart("Residual of each frame", _spoken("frame", numbers, values), drawn(figure))
-
-
-def _by_feature(found: Calibration) -> Chart:
-    indices, values = _grouped(found, "feature")
-    numbers = indices + 1
-    figure, axes = blank()
-    axes.bar(numbers, values, **BARS)
-    if len(numbers) <= _MOST_NAMED:
-        axes.set_xticks(numbers, [found.after.labels[k] for k in indices])
-    axes.set_xlabel("feature of the body")
-    axes.set_ylabel("residual, standard deviations")
-    return Chart("Residual of each feature", _spoken("feature", numbers, values), drawn(figure))
-
-
-def _grouped(found: Calibration, kind: str) -> tuple[Any, Any]:
-    """Root mean square residual in standard deviations by frame or feature."""
+def _residuals(found: Calibration, kind: str) -> Chart:
+    """Residuals of each frame, as dots, or of each feature, as bars."""
+    # root mean square by number, in standard deviations
     keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
     for index, sights in found.sights.items():
         keys.append(getattr(sights, kind))
         squares.append((sights.offset**2).sum(axis=1) / found.noise[index] ** 2)
-    key, squared = np.concatenate(keys), np.concatenate(squares)
-    numbers, inverse = np.unique(key, return_inverse=True)
-    mean = np.bincount(inverse, squared) / np.maximum(np.bincount(inverse), 1)
-    return numbers, np.sqrt(mean)
-
-
-def _spoken(word: str, numbers: Any, values: Any) -> str:
-    if not len(values):
-        return "nothing was met"
-    return f"worst: {word} {numbers[int(np.argmax(values))]}, {values.max():.3g}"
+    numbers, inverse = np.unique(np.concatenate(keys), return_inverse=True)
+    totals, counts = np.bincount(inverse, np.concatenate(squares)), np.bincount(inverse)
+    values = np.sqrt(totals / np.maximum(counts, 1))
+    figure, axes = blank()
+    if kind == "frame":
+        axes.plot(numbers, values, ".", markersize=4, **POSE)
+        axes.set(xlabel="frame", ylim=(0, None))
+    else:
+        labels = [found.after.labels[k] for k in numbers]
+        numbers = numbers + 1
+        axes.bar(numbers, values, **BARS)
+        if len(numbers) <= _MOST_NAMED:
+            axes.set_xticks(numbers, labels)
+        axes.set_xlabel("feature of the body")
+    axes.set_ylabel("residual, standard deviations")
+    alt = "nothing was met"
+    if len(values):
+        alt = f"worst: {kind} {numbers[int(np.argmax(values))]}, {values.max():.3g}"
+    return Chart(f"Residual of each {kind}", alt, drawn(figure))

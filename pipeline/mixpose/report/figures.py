@@ -1,56 +1,205 @@
 """What the figures of a report show: each is one small SVG that takes on the page's colours.
 
-Words by people stay out of the figures (the page escapes them); figures hold only our own.
+Texts stay texts, and the colours of ink and rules are the page's own, so that a figure follows the
+reader's fonts and light or dark background.  Words by people stay out of the figures (the page
+escapes them); figures hold only our own.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.report.drawing import (
-    BAND,
-    BARS,
-    POSE,
-    TRUTH,
-    TimeAxes,
-    blank,
-    count_axes,
-    drawn,
-    line,
-    mark_ambiguous,
-    stacked,
-)
 from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
+# Legible on white and on near black alike.
+_BLUE, _ORANGE, _RED, _GREY = "#2f80d0", "#d9780f", "#dc4450", "#8a8f98"
+
+POSE: dict[str, Any] = {"color": _BLUE}
+BARS: dict[str, Any] = {"color": _BLUE}
+TRUTH: dict[str, Any] = {"color": _GREY, "linestyle": (0, (3, 1.5)), "linewidth": 1.1, "marker": ""}
+BAND: dict[str, Any] = {"color": _BLUE, "linewidth": 0.9, "markersize": 1.5}
+_AMBIGUOUS: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "D",
+    "markeredgewidth": 0,
+    "color": _ORANGE,
+    "zorder": 4,
+}
+
+# Stand-ins that `drawn` exchanges for the page's colours.
+_INK, _RULE = "#1a1b1c", "#c1c2c3"
+
+_WIDTH = 4.4  # inches; on the page a figure is 1 to 1.5 times as large
+_HEIGHT = 2.5
+_DOTS = 100  # frames; more of them are lines without dots
+_MANY = 250  # frames; more of them are drawn as pixels, lest the page grow
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mixpose",
+    "font.size": 9.5,
+    "axes.edgecolor": _RULE,
+    "axes.labelcolor": _INK,
+    "axes.titlecolor": _INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-4, 5),
+    "grid.color": _RULE,
+    "grid.linewidth": 0.4,
+    "text.color": _INK,
+    "xtick.color": _RULE,
+    "ytick.color": _RULE,
+    "xtick.labelcolor": _INK,
+    "ytick.labelcolor": _INK,
+}
 AXES = ("x", "y", "z")
 _BINS = 40
 
 
+def blank(height: float = _HEIGHT) -> tuple[Figure, Axes]:
+    """An empty figure with one pair of axes; `height` in inches."""
+    figure, (axes,) = stacked((1.0,), height)
+    return figure, axes
+
+
+def stacked(shares: tuple[float, ...], height: float = 1.15 * _HEIGHT) -> tuple[Figure, list[Axes]]:
+    """A figure with pairs of axes one above the other, with a common time axis."""
+    from matplotlib import rc_context  # noqa: PLC0415 - heavy
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+        grid = figure.subplots(
+            len(shares), 1, squeeze=False, sharex=True, height_ratios=list(shares)
+        )
+    return figure, list(grid[:, 0])
+
+
+class TimeAxes:
+    """Axes over the frames of a run; lines break at `jumps` (n,), which are no motion."""
+
+    def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
+        self._axes, self._series = axes, series
+        self._breaks = series.breaks if jumps is None else series.breaks | jumps
+        self._as_pixels = len(series.x) > _MANY
+        gaps = np.diff(series.x)
+        self._half_step = 0.5 * float(np.median(gaps)) if gaps.size else 0.5
+
+    def frame(self) -> None:
+        """Show all frames, those without a value too."""
+        x = self._series.x
+        if x.size:
+            margin = max(0.01 * float(x[-1] - x[0]), self._half_step)
+            self._axes.set_xlim(float(x.min()) - margin, float(x.max()) + margin)
+
+    def draw(self, values: Floats, look: dict[str, Any] = POSE) -> None:
+        """Draw a line that breaks where frames are lost or left out."""
+        line(self._axes, self._series.x, values, self._breaks, look)
+
+    def band(self, values: Floats, half_width: Floats) -> None:
+        """Fill the band about values."""
+        x, y, width = (_broken(each, self._breaks) for each in (self._series.x, values, half_width))
+        self._axes.fill_between(
+            x,
+            y - width,
+            y + width,
+            color=_BLUE,
+            alpha=0.25,
+            linewidth=0,
+            rasterized=self._as_pixels,
+        )
+
+    def mark_ambiguous(self, values: Floats) -> None:
+        """Mark the values of ambiguous frames."""
+        mark_ambiguous(self._axes, self._series.x, values, self._series)
+
+    def mark_lost(self) -> None:
+        """Shade the stretches of lost frames from top to bottom."""
+        lost = self._series.status == "lost"
+        edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
+        x = self._series.x
+        stretches = [
+            (x[first] - self._half_step, x[last - 1] - x[first] + 2 * self._half_step)
+            for first, last in edges.reshape(-1, 2)
+        ]
+        if stretches:
+            self._axes.broken_barh(
+                stretches,
+                (0.0, 1.0),
+                transform=self._axes.get_xaxis_transform(),
+                color=_RED,
+                alpha=0.3,
+                linewidth=0,
+                rasterized=self._as_pixels,
+            )
+
+
+def line(axes: Axes, x: Floats, y: Floats, breaks: Flags, look: dict[str, Any] = POSE) -> None:
+    """Draw a line that leaves out breaks and missing values, and dots where it would not show."""
+    many, dotted = len(x) > _MANY, len(x) <= _DOTS
+    x, y = _broken(x, breaks), _broken(y, breaks)
+    look = {"linewidth": 1.3, "marker": "o", "markersize": 2.5, "rasterized": many, **look}
+    if not dotted:
+        known = np.isfinite(x + y)
+        beside = np.r_[False, known[:-1]] | np.r_[known[1:], False]
+        look["markevery"] = np.flatnonzero(known & ~beside).tolist()
+    axes.plot(x, y, **look)
+
+
+def mark_ambiguous(axes: Axes, x: Floats, y: Floats, series: Series) -> None:
+    """Mark ambiguous frames at places (x, y) of all n frames; smaller where they are many."""
+    doubtful = series.status == "ambiguous"
+    size = 3.5 * np.clip(np.sqrt(_DOTS / max(len(x), 1)), 0.4, 1.0)
+    look = {**_AMBIGUOUS, "markersize": size, "rasterized": len(x) > _MANY}
+    axes.plot(x[doubtful], y[doubtful], **look)
+
+
+def _broken(values: Floats, breaks: Flags) -> Floats:
+    """Values with a NaN before each break."""
+    return np.insert(values, np.flatnonzero(breaks), np.nan)
+
+
+def drawn(figure: Figure) -> str:
+    """An ``<svg>`` element that names nothing outside itself."""
+    from matplotlib import rc_context  # noqa: PLC0415
+
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", transparent=True, dpi=200, metadata=nothing)
+    text = buffer.getvalue()
+    width, height = 72 * figure.get_size_inches()
+    inside = text[text.index(">", text.index("<svg")) + 1 :]
+    inside = re.sub(r"<style.*?</style>|<!--.*?-->", "", inside, flags=re.DOTALL)
+    inside = re.sub(r'<g id="[^"]*"', "<g", inside)
+    # figures share a page, so the names of their parts must differ
+    prefix = hashlib.sha256(inside.encode()).hexdigest()[:12]
+    inside = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", inside)
+    inside = inside.replace(_INK, "var(--ink)").replace(_RULE, "var(--rule)")
+    return f'<svg viewBox="0 0 {width:g} {height:g}" aria-hidden="true">{inside.strip()}'
+
+
 @dataclass(frozen=True)
 class Chart:
-    """One figure of the page.
+    """One figure of the page."""
 
-    Attributes
-    ----------
-    title : str
-        May hold names that people gave; the page escapes it.
-    alt : str
-        What is seen, for those who do not see it.
-    svg : str
-        An ``<svg>`` element.
-    """
-
-    title: str
-    alt: str
-    svg: str
+    title: str  # may hold names that people gave; the page escapes it
+    alt: str  # what is seen, for those who do not see it
+    svg: str  # an ``<svg>`` element
 
 
 def trajectory(series: Series, errors: Errors | None) -> list[Chart]:
@@ -83,27 +232,15 @@ _MOST_ROWS = 60  # features of a sensor that are drawn
 
 
 def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
-    """Residual and explained share of each sensor over time.
-
-    Parameters
-    ----------
-    series : Series
-    unit_of : callable
-        Unit of a sensor's residuals, by its name.
-    """
+    """Residual and explained share of each sensor over time; `unit_of` residuals by its name."""
     charts = []
     for name, rms in series.rms.items():
         explained = series.explained[name]
         unit = unit_of(name)
         figure, (upper, lower) = stacked((1.0, 1.0))
         for axes, values, label in ((upper, rms, f"rms, {unit}"), (lower, explained, "explained")):
-            panel = TimeAxes(axes, series)
-            panel.mark_lost()
-            panel.draw(values)
-            panel.mark_ambiguous(values)
-            panel.frame()
+            _draw(axes, series, values)
             axes.set_ylabel(label)
-            axes.set_ylim(bottom=0.0)
         lower.set_ylim(0.0, 1.02)
         upper.tick_params(labelbottom=False)
         lower.set_xlabel(series.x_label)
@@ -113,14 +250,7 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
 
 
 def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
-    """How far off each sensor met each feature over time, a row per feature.
-
-    Parameters
-    ----------
-    series : Series
-    unit_of : callable
-        Unit of a sensor's residuals, by its name.
-    """
+    """How far off each sensor met each feature over time, a row per feature."""
     charts = []
     for name, residuals in series.residuals.items():
         if not residuals:
@@ -139,21 +269,23 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         axes.pcolormesh(x, y, unmet, vmin=0.0, vmax=1.0, cmap="Reds", rasterized=True)
         figure.colorbar(mesh, ax=axes, label=f"off by, {unit_of(name)}")
         axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)])
-        axes.set_xlabel(series.x_label)
-        axes.set_ylabel("feature; red: not met")
-        worst = max(residuals, key=lambda each: _typical(residuals[each]))
+        axes.set(xlabel=series.x_label, ylabel="feature; red: not met")
+        met_by = {name: each[np.isfinite(each)] for name, each in residuals.items()}
+        worst = max(met_by, key=lambda each: np.median(met_by[each]) if met_by[each].size else 0.0)
         alt = f"{name}: how far off each feature is met over time; the farthest off is {worst}"
         charts.append(Chart(f"{name}: features", alt, drawn(figure)))
     return charts
 
 
-def _typical(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else 0.0
-
-
 def latency(series: Series) -> list[Chart]:
     """How long frames took, as a histogram over a logarithmic axis."""
+    from matplotlib.ticker import (  # noqa: PLC0415 - heavy
+        LogLocator,
+        MaxNLocator,
+        NullFormatter,
+        StrMethodFormatter,
+    )
+
     known = series.latency_ms[series.latency_ms > 0]  # NaN is not greater either
     if not known.size:
         return []
@@ -162,11 +294,13 @@ def latency(series: Series) -> list[Chart]:
     edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
     figure, axes = blank()
     axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
-    count_axes(axes)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     axes.set_xscale("log")
-    plain_ticks(axes)
-    axes.set_xlabel("latency, ms")
-    axes.set_ylabel("frames")
+    # ticks as people write numbers
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set(xlabel="latency, ms", ylabel="frames")
     title = "Time per frame"
     return [Chart(title, _spoken("Time per frame, ms", known), drawn(figure))]
 
@@ -179,24 +313,20 @@ def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
         (f"Position error, {series.unit}", errors.distance),
     ):
         figure, axes = blank()
-        panel = TimeAxes(axes, series)
-        panel.mark_lost()
-        panel.draw(values)
-        panel.mark_ambiguous(values)
-        panel.frame()
-        axes.set_ylim(bottom=0.0)
+        _draw(axes, series, values)
         axes.set_xlabel(series.x_label)
         charts.append(Chart(title, _spoken(title, values), drawn(figure)))
     return charts
 
 
-def plain_ticks(axes: Axes) -> None:
-    """Ticks of a logarithmic axis as people write numbers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415
-
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+def _draw(axes: Axes, series: Series, values: Floats) -> None:
+    """Values of all frames, none of them negative; those of ambiguous and lost frames marked."""
+    panel = TimeAxes(axes, series)
+    panel.mark_lost()
+    panel.draw(values)
+    panel.mark_ambiguous(values)
+    panel.frame()
+    axes.set_ylim(bottom=0.0)
 
 
 def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
@@ -213,8 +343,7 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
         axes.plot(*known[-1, [a, b]], marker="s", markersize=7, fillstyle="none", **ink)
     axes.set_aspect("equal", adjustable="datalim")
     axes.ticklabel_format(useOffset=False)
-    axes.set_xlabel(f"{AXES[a]}, {series.unit}")
-    axes.set_ylabel(f"{AXES[b]}, {series.unit}")
+    axes.set(xlabel=f"{AXES[a]}, {series.unit}", ylabel=f"{AXES[b]}, {series.unit}")
     title = f"Plane {AXES[a]}{AXES[b]}"
     spoken = [_spoken(AXES[k], position[:, k]) for k in (a, b)]
     return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawn(figure))
@@ -245,8 +374,7 @@ def _values(
         lower.set_yscale("log")
     else:
         lower.set_ylim(0.0, 1.15 * float(positive.max()) if positive.size else 1.0)
-    lower.set_ylabel("± 95 %")
-    lower.set_xlabel(series.x_label)
+    lower.set(xlabel=series.x_label, ylabel="± 95 %")
     return drawn(figure)
 
 

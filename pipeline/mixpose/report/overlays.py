@@ -33,27 +33,15 @@ _LARGEST_ZOOM = 4.0
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera's frame with the pose on it.
-
-    Attributes
-    ----------
-    sensor : str
-    uri : str
-        Holds the whole JPEG.
-    width, height : int
-        Of the JPEG in px.
-    zoom : float
-        Pixels of the JPEG per pixel of the camera.
-    is_part : bool
-        Whether it shows only the surroundings of the object.
-    """
+    """A camera's frame with the pose on it."""
 
     sensor: str
-    uri: str
+    uri: str  # holds the whole JPEG
+    # of the JPEG in px
     width: int
     height: int
-    zoom: float
-    is_part: bool
+    zoom: float  # pixels of the JPEG per pixel of the camera
+    is_part: bool  # whether it shows only the surroundings of the object
 
 
 @dataclass(frozen=True)
@@ -69,15 +57,7 @@ class OverlayFrame:
 def overlay_frames(
     session: Session, poses: PoseFile, series: Series, errors: Errors | None
 ) -> tuple[list[OverlayFrame], list[str]]:
-    """Read a few frames again and draw their poses.
-
-    Returns
-    -------
-    frames : list of OverlayFrame
-        Ascending; empty where no camera's recording can be read.
-    notices : list of str
-        What could not be read, a sentence each.
-    """
+    """A few frames, ascending, with their poses on them, and sentences on what is not read."""
     setups, opened, notices = _open(session)
     chosen = chosen_frames(series, errors)
     lines = {line.frame: line for line in poses.poses}
@@ -88,7 +68,11 @@ def overlay_frames(
         with closing(_read(opened, chosen)) as frame_sets:
             for frame_set in frame_sets:
                 line = lines[frame_set.number]
-                shots = _shots(session, setups, frame_set, line)
+                shots = tuple(
+                    _shot(session, setups[name], frame, frame.data, line)
+                    for name, frame in frame_set.frames.items()
+                    if isinstance(frame.data, np.ndarray)
+                )
                 why = chosen[frame_set.number]
                 frames.append(OverlayFrame(frame_set.number, line.status, why, shots))
     except RecordingError as error:
@@ -153,16 +137,6 @@ def _read(
         return
     for number in sorted(wanted):
         yield from pair(opened, number, number + 1)
-
-
-def _shots(
-    session: Session, setups: Mapping[str, SensorSetup], frame_set: FrameSet, line: PoseLine
-) -> tuple[Shot, ...]:
-    return tuple(
-        _shot(session, setups[name], frame, frame.data, line)
-        for name, frame in frame_set.frames.items()
-        if isinstance(frame.data, np.ndarray)
-    )
 
 
 def _found(session: Session, setup: SensorSetup, frame: RawFrame) -> Floats | None:

@@ -1,7 +1,8 @@
-"""The page: what it says, put into its template."""
+"""The page: what it says, put into its template, and the session that its poses came from."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +14,8 @@ from mixpose.errors import SessionError
 from mixpose.poses.evaluate import Evaluation, as_numbered, evaluate
 from mixpose.poses.jsonl import PoseFile
 from mixpose.records import Floats, Status
-from mixpose.report.origin import Origin, find_session
 from mixpose.report.series import Series, errors_of, frame_ranges, series_of
+from mixpose.session import Session, load_session
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -25,6 +26,7 @@ MARK = '<meta name="generator" content="mixpose report'
 _TEMPLATE, _BODY_TEMPLATE = "page.html.j2", "body.html.j2"
 _STATUSES: tuple[Status, ...] = ("ok", "ambiguous", "lost")
 _MOST_RANGES = 40
+_LARGEST = 2_000_000  # bytes; no session file is near it
 
 
 @dataclass(frozen=True)
@@ -49,13 +51,7 @@ class SensorRow:
 
 
 def page_templates() -> Environment:
-    """The templates of pages, once what a page is made with is found to be installed.
-
-    Raises
-    ------
-    SessionError
-        Naming the extra that brings it.
-    """
+    """The templates of pages, or a `SessionError` that names the extra with what makes them."""
     try:
         import matplotlib  # noqa: F401, PLC0415
         from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
@@ -76,21 +72,9 @@ def page_templates() -> Environment:
 def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
     """The report of a run as one HTML page without anything outside it.
 
-    Parameters
-    ----------
-    poses : PoseFile
-    truth : PoseFile or None
-    cut : bool
-        Whether the last line of the poses was cut off.
-    version : str
-        Of mixpose, which makes the page.
-
-    Raises
-    ------
-    SessionError
-        If a library is missing.
-    RecordingError
-        If the poses cannot be compared with the truth.
+    `cut` says whether the last line of the poses was cut off; `version` is of mixpose. A
+    `SessionError` if a library is missing, a `RecordingError` if poses and truth cannot be
+    compared.
     """
     environment = page_templates()
     return environment.get_template(_TEMPLATE).render(
@@ -103,7 +87,8 @@ def _content(
 ) -> dict[str, Any]:
     """What is said once, and the parts of the page about each body."""
     labels = list(dict.fromkeys(line.label for line in poses.poses))
-    origin, swaps = find_session(poses), None
+    origin, swaps, named = find_session(poses), None, poses.header.get("session")
+    path = Path(named) if isinstance(named, str) and named else poses.path
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
     files = [poses]
@@ -119,7 +104,7 @@ def _content(
         parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
     return {
-        "name": _name(poses),
+        "name": "/".join(path.parts[-2:]),  # the folder says more than the file alone
         "truth": truth,
         "facts": _facts(poses, labels),
         "notices": contents[0]["notices"] if len(files) == 1 else [],
@@ -139,11 +124,14 @@ def _body_content(
 
     series = series_of(poses)
     errors = None if truth is None else errors_of(series, poses, truth)
-    evaluation = None if truth is None else _own_evaluation(poses, truth, series.label)
+    evaluation = None
+    if truth is not None:  # which may hold other bodies
+        own = tuple(line for line in truth.poses if line.label == series.label)
+        evaluation = evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
         names = [one.body.name for one in origin.session.objects]
-        own = origin.session.alone(series.object) if series.object in names else None
-        origin = replace(origin, session=own)
+        alone = origin.session.alone(series.object) if series.object in names else None
+        origin = replace(origin, session=alone)
     overlays, overlay_notices = (
         ([], [])
         if origin.session is None
@@ -169,19 +157,6 @@ def _body_content(
         "overlays": overlays,
         "overlay_notices": overlay_notices,
     }
-
-
-def _own_evaluation(poses: PoseFile, truth: PoseFile, label: str) -> Evaluation:
-    """The evaluation of one body, of which alone the poses are; the truth may hold others."""
-    own = tuple(line for line in truth.poses if line.label == label)
-    return evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
-
-
-def _name(poses: PoseFile) -> str:
-    """The session's file with its folder, which says more than the file alone."""
-    named = poses.header.get("session")
-    path = Path(named) if isinstance(named, str) and named else poses.path
-    return "/".join(path.parts[-2:])
 
 
 def _facts(poses: PoseFile, labels: Sequence[str]) -> list[tuple[str, str]]:
@@ -225,23 +200,15 @@ def _ranges_text(series: Series, status: Status) -> str:
 def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
     found = [Figure("frames", str(len(series.frames)), _span(series))]
     if evaluation is not None and evaluation.rotation_deg and evaluation.translation:
-        rotation, translation = evaluation.rotation_deg, evaluation.translation
-        found += [
-            Figure(
-                "rotation error, RMS",
-                f"{_short(rotation.rms)}°",
-                f"at most {_short(rotation.max)}°",
-            ),
-            Figure(
-                "position error, RMS",
-                f"{_short(translation.rms)} {series.unit}",
-                f"at most {_short(translation.max)} {series.unit}",
-            ),
-        ]
-    position, turn = series.half_width[:, :3], series.half_width[:, 3:]
+        for name, errors, unit in (
+            ("rotation error, RMS", evaluation.rotation_deg, "°"),
+            ("position error, RMS", evaluation.translation, f" {series.unit}"),
+        ):
+            most = f"at most {_short(errors.max)}{unit}"
+            found.append(Figure(name, f"{_short(errors.rms)}{unit}", most))
     for name, widths, unit in (
-        ("position, 95 %", position, f" {series.unit}"),
-        ("turn, 95 %", turn, "°"),
+        ("position, 95 %", series.half_width[:, :3], f" {series.unit}"),
+        ("turn, 95 %", series.half_width[:, 3:], "°"),
     ):
         widest = widths.max(axis=1) if len(widths) else np.empty(0)
         if np.isfinite(widest).any():
@@ -298,3 +265,59 @@ def _median(values: Floats) -> str:
 def _short(value: float) -> str:
     """Three digits that count, and no power of ten where people would write none."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What is known of the session file."""
+
+    named: str | None = None  # path in the header of the poses
+    path: Path | None = None  # where it was found
+    text: str | None = None  # its text
+    notice: str | None = None  # what is wrong: missing, changed, no session any more
+    # only if the file is the very one that the poses were estimated with
+    session: Session | None = None
+
+
+def find_session(poses: PoseFile) -> Origin:
+    """Read the session file that the header names, or its like beside the poses.
+
+    A file that is not the one of the run is shown only if it is a session file: a header may name
+    any file, and whoever passes the page on should not pass on that.
+    """
+    named = poses.header.get("session")
+    if not isinstance(named, str) or not named:
+        return Origin(notice="The poses file names no session file.")
+    wanted = poses.header.get("session_sha256")
+    found = [
+        (path, content)
+        for path in (Path(named), poses.path.parent / Path(named).name)
+        if (content := _bytes_of(path)) is not None
+    ]
+    if not found:
+        return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
+    for path, content in found:
+        if hashlib.sha256(content).hexdigest() == wanted:
+            text = content.decode("utf-8-sig", errors="replace")
+            try:
+                return Origin(named, path, text, session=load_session(path))
+            except SessionError as error:
+                return Origin(named, path, text, f"The session cannot be read again: {error}")
+    path, content = found[0]
+    notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
+    if isinstance(wanted, str):
+        notice = f"{path} has changed since the run: its SHA-256 is not the one in the poses file."
+    try:
+        load_session(path)
+    except SessionError:
+        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
+    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)
+
+
+def _bytes_of(path: Path) -> bytes | None:
+    try:
+        if path.is_file() and path.stat().st_size <= _LARGEST:
+            return path.read_bytes()
+    except OSError:
+        return None
+    return None

@@ -30,91 +30,52 @@ _DECIMALS_DEG = 7  # an axis that is held turns by rounding errors, and should b
 
 @dataclass(frozen=True)
 class Series:
-    """A run over its n frames, ascending; NaN where a frame does not have a value.
-
-    Attributes
-    ----------
-    object : str
-    label : str
-        The body in one word.
-    unit : str
-        Unit of lengths; "units" where the file does not say it.
-    frames : tuple of int
-        They come from file names, and may be longer than an int64.
-    x : (n,) float64
-        Where a frame stands in figures: its time in s, or its number where times are missing.
-    x_label : str
-    breaks : (n,) bool
-        Whether frame numbers are missing before a frame.
-    status : (n,) str
-    position : (n, 3) float64
-    turn_deg : (n, 3) float64
-        Rotation vector in world axes, degrees, of the turn from `T_reference`.
-    half_width : (n, 6) float64
-        Half-widths of the 95 % bands of position and turn, length units and degrees.
-    T_reference : (4, 4) float64
-        The first pose that is "ok", or else the first pose.
-    score, latency_ms : (n,) float64
-    rms, explained : mapping of str to (n,) float64
-        By sensor; NaN in lost frames too.
-    residuals : mapping of str to (mapping of str to (n,) float64)
-        By sensor and feature: infinite where it was in view and not met, NaN where it was not in
-        view and in lost frames.
-    """
+    """A run over its n frames, ascending; NaN where a frame does not have a value."""
 
     object: str
-    label: str
-    unit: str
-    frames: tuple[int, ...]
+    label: str  # the body in one word
+    unit: str  # of lengths; "units" where the file does not say it
+    frames: tuple[int, ...]  # they come from file names, and may be longer than an int64
+    # (n,), where a frame stands in figures: its time in s, or its number where times are missing
     x: Floats
     x_label: str
-    breaks: Flags
-    status: Texts
-    position: Floats
+    breaks: Flags  # (n,), whether frame numbers are missing before a frame
+    status: Texts  # (n,)
+    position: Floats  # (n, 3)
+    # (n, 3), rotation vector in world axes, degrees, of the turn from `T_reference`
     turn_deg: Floats
-    half_width: Floats
-    T_reference: Floats
-    score: Floats
-    latency_ms: Floats
-    rms: Mapping[str, Floats]
-    explained: Mapping[str, Floats]
+    half_width: Floats  # (n, 6), of the 95 % bands of position and turn, length units and degrees
+    T_reference: Floats  # (4, 4), the first pose that is "ok", or else the first pose
+    score: Floats  # (n,)
+    latency_ms: Floats  # (n,)
+    rms: Mapping[str, Floats]  # (n,) by sensor; NaN in lost frames too
+    explained: Mapping[str, Floats]  # likewise
+    # (n,) by sensor and feature: infinite where it was in view and not met, NaN where it was not in
+    # view and in lost frames
     residuals: Mapping[str, Mapping[str, Floats]]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors against the truth at the frames of a `Series`; NaN where there is none.
+    """Errors against the truth at the frames of a `Series`; NaN where there is none."""
 
-    Attributes
-    ----------
-    rotation_deg, distance : (n,) float64
-    position : (n, 3) float64
-        Of the right answer that the pose was held against.
-    turn_deg : (n, 3) float64
-        Its turn, as in `Series`.
-    """
-
-    rotation_deg: Floats
-    distance: Floats
-    position: Floats
-    turn_deg: Floats
+    rotation_deg: Floats  # (n,)
+    distance: Floats  # (n,)
+    position: Floats  # (n, 3), of the right answer that the pose was held against
+    turn_deg: Floats  # (n, 3), its turn, as in `Series`
 
 
 def series_of(file: PoseFile) -> Series:
-    """Arrange the lines of a poses file by frame.
-
-    Raises
-    ------
-    RecordingError
-        If the file holds poses of several objects.
-    """
+    """Arrange the lines of a poses file by frame, or a `RecordingError` of several objects."""
     lines = sorted(file.poses, key=lambda line: line.frame)
     names = sorted({line.label for line in lines})
     if len(names) > 1:
         raise RecordingError(
             f"{file.path}: holds poses of {', '.join(map(repr, names))}; a series is of one body"
         )
-    T = np.array([_matrix(line) for line in lines], dtype=np.float64).reshape(-1, 4, 4)
+    no_pose = np.full((4, 4), np.nan)
+    poses = [no_pose if line.T_world_object is None else line.T_world_object for line in lines]
+    T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
     status = np.array([line.status for line in lines], dtype=np.str_)
     T_reference = _reference(T, status)
     frames = tuple(line.frame for line in lines)
@@ -143,13 +104,7 @@ def series_of(file: PoseFile) -> Series:
 
 
 def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
-    """Errors of every frame, modulo symmetries, as `mixpose.poses.evaluate` has them.
-
-    Raises
-    ------
-    RecordingError
-        If the files cannot be compared.
-    """
+    """Errors of every frame, modulo symmetries; a `RecordingError` if that cannot be compared."""
     found = errors_to_truth(poses, truth)
     by_frame = {error.frame: error.twist for error in found if error.object == series.label}
     nothing = np.full(6, np.nan)
@@ -179,10 +134,7 @@ def turns_deg(T: Floats, T_reference: Floats) -> Floats:
 
 
 def jumps_of_turns(turn_deg: Floats) -> Flags:
-    """Before which frames (n,) rotation vectors (n, 3) pass half a turn.
-
-    They come in again on the other side, by a whole turn, in all of their components at once.
-    """
+    """Before which frames (n,) rotation vectors (n, 3) pass half a turn, all components at once."""
     with np.errstate(invalid="ignore"):
         far = np.linalg.norm(np.diff(turn_deg, axis=0), axis=1) > _HALF_TURN_DEG
     return np.concatenate([np.zeros(min(len(turn_deg), 1), dtype=bool), far])
@@ -198,10 +150,6 @@ def frame_ranges(series: Series, status: Status) -> list[tuple[int, int]]:
             ranges.append((first, frame))
         goes_on = found == status
     return ranges
-
-
-def _matrix(line: PoseLine) -> Floats:
-    return np.full((4, 4), np.nan) if line.T_world_object is None else line.T_world_object
 
 
 def _reference(T: Floats, status: Texts) -> Floats:
@@ -259,19 +207,10 @@ def _half_widths(lines: list[PoseLine], T: Floats, T_reference: Floats) -> Float
 
 
 def rotation_vector_jacobian(vector: Floats) -> Floats:
-    """Change of a rotation vector by a small further turn in world axes.
+    """Change (3, 3) of a rotation vector by a small further turn in world axes; radians, at most π.
 
     Inverse of the left Jacobian of SO(3): J. Solà et al., A micro Lie theory for state estimation
     in robotics, 2018, equation 146.
-
-    Parameters
-    ----------
-    vector : (3,) array
-        Radians, at most π long.
-
-    Returns
-    -------
-    (3, 3) array
     """
     x, y, z = vector
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,11 +1,13 @@
-"""Where a body is simulated if the session names no start: in view of its sensors.
+"""Where bodies are simulated if the session names no start: in view of its sensors.
 
 With several cameras that is where they look together; with one camera, in front of it where the
-body fills about a quarter of the image; among range sensors, beside their middle.
+body fills about a quarter of the image; among range sensors, beside their middle.  Bodies beside
+the first stand about that place, so far from each other that they touch by their motion at most.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,27 +16,30 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse
+from mixpose.rigid import from_parts, inverse, rotation_matrix
 from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.visible_spots import facing
+from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
+from mixpose.simulation.scenery import Actor
+from mixpose.simulation.visible_spots import brightness_levels, facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
 _SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob
 _ORIENTATIONS = 64
+_AMPLITUDE = 0.4  # of the body's radius
+_APART = 1.1  # sums of radii between bodies at rest
+_TRIES = 48  # places at each distance
+_DISTANCES = (1.2, 1.6, 2.2, 3.0, 4.0)  # radii of the largest
+_SEEDS_APART = 101  # between the motions of bodies
 
 
 def central_pose(session: Session, seed: int) -> Floats:
     """T_world_object (4, 4) that a simulated motion swings about.
 
-    That is ``[start]`` where the session has one.  Else the place follows from the sensors, and
-    the orientation is drawn by chance: the one of several that shows most features.
-
-    Raises
-    ------
-    SessionError
-        If no sensor sees any feature of the body there.
+    That is ``[start]`` where the session has one. Else the place follows from the sensors, and the
+    orientation is drawn by chance: the one of several that shows most features. A `SessionError` if
+    no sensor sees any feature of the body there.
     """
     if session.start is not None:
         T = session.start.T_world_object
@@ -58,6 +63,22 @@ def central_pose(session: Session, seed: int) -> Floats:
     return poses[best]
 
 
+def swinging(
+    session: Session, T_world_object: Floats, options: SimulationOptions, seed: int
+) -> Motion:
+    """The motion of a session's body about a central pose."""
+    body, amplitude = session.body, options.amplitude_translation
+    return plan_motion(
+        T_world_object,
+        pivot_of(body),
+        translation=_AMPLITUDE * body.radius if amplitude is None else amplitude,
+        rotation_deg=options.amplitude_rotation_deg,
+        period_s=options.period_s,
+        free=session.estimator.free,
+        seed=seed,
+    )
+
+
 def pivot_of(body: Body) -> Floats:
     """The point that a simulated body turns about: the middle of its features (3,)."""
     return np.asarray(body.means.mean(axis=0))
@@ -75,10 +96,7 @@ def count_seen(session: Session, T_world_object: Floats) -> int:
 
 
 def places(session: Session) -> list[Floats]:
-    """Candidates for the pivot's place (3,) in the world, the most natural one first.
-
-    Every camera of the session needs a resolution.
-    """
+    """Candidates for the pivot's place (3,) in the world, best first; resolutions are known."""
     radius = session.body.radius
     all_rays = [_ray(setup, radius) for setup in session.sensors]
     rays = [ray for ray in all_rays if ray is not None]
@@ -96,14 +114,11 @@ def places(session: Session) -> list[Floats]:
 
 @dataclass(frozen=True)
 class _Ray:
-    """The line of sight through the middle of a camera's image.
-
-    `distance` is where the body fills its share of the image; None for a parallel beam, where it
-    does so everywhere or nowhere.
-    """
+    """The line of sight through the middle of a camera's image."""
 
     origin: Floats
     direction: Floats
+    # where the body fills its share of the image; None: nowhere or everywhere
     distance: float | None
 
     def suits(self, place: Floats) -> bool:
@@ -152,3 +167,72 @@ def _beside_ranges(session: Session) -> Floats:
     aside = max(spread / 2, nearest + 5 * session.body.radius)
     _, _, axes = np.linalg.svd(centred, full_matrices=True)
     return np.asarray(positions.mean(axis=0) + aside * axes[2])
+
+
+def plan_companions(
+    session: Session, first: Motion, options: SimulationOptions
+) -> tuple[Actor, ...]:
+    """Place and move the bodies beside the first; a `SessionError` where that cannot be done."""
+    members = [(one, i) for one in session.objects for i in one.instances][1:]
+    if not members:
+        return ()
+    if any(setup.sensor.dimension != 2 for setup in session.sensors):
+        raise SessionError(
+            f"{session.path}: object: found {len(members) + 1} bodies before sensors of ranges; "
+            "simulate draws several bodies before cameras only"
+        )
+    placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
+    companions = []
+    for k, (one, instance) in enumerate(members, start=1):
+        own = session.alone(one.body.name)
+        seed = options.seed + _SEEDS_APART * k
+        is_at_start = one.start is not None and not instance
+        T = central_pose(own, seed)
+        if not is_at_start:
+            T = _aside(own, T, placed, seed, turned=one.start is not None)
+        placed.append((_middle(T, one.body), one.body.radius))
+        motion = swinging(own, T, options, seed)
+        rng = generator(seed, Purpose.BRIGHTNESS)
+        levels = brightness_levels(len(one.body), options.brightness_spread, rng)
+        companions.append(Actor(one.body, motion.pose, levels, is_body=True))
+    return tuple(companions)
+
+
+def _middle(T_world_object: Floats, body: Body) -> Floats:
+    return np.asarray(T_world_object[:3, :3] @ pivot_of(body) + T_world_object[:3, 3])
+
+
+def _aside(
+    session: Session,
+    T: Floats,
+    placed: Sequence[tuple[Floats, float]],
+    seed: int,
+    *,
+    turned: bool,
+) -> Floats:
+    """A pose apart from all that are placed, as near as can be where most features are seen."""
+    body = session.body
+    rng = generator(seed, Purpose.ORIENTATION)
+    largest = max([body.radius, *(radius for _, radius in placed)])
+    for distance in _DISTANCES:
+        best: tuple[int, Floats] | None = None
+        for _ in range(_TRIES):
+            direction = rng.standard_normal(3)
+            shift = distance * largest * direction / np.linalg.norm(direction)
+            middle = placed[0][0] + shift
+            R = rotation_matrix(rng.standard_normal(3)) @ T[:3, :3] if turned else T[:3, :3]
+            if any(
+                np.linalg.norm(middle - other) < _APART * (body.radius + radius)
+                for other, radius in placed
+            ):
+                continue
+            there = from_parts(R, middle - R @ pivot_of(body))
+            seen = count_seen(session, there)
+            if best is None or seen > best[0]:
+                best = seen, there
+        if best is not None and best[0] == len(body) * len(session.sensors):
+            return best[1]
+    raise SessionError(
+        f"{session.path}: object {body.name!r}: found no place apart from the other bodies in view "
+        "of all cameras; give it an [object.start]"
+    )

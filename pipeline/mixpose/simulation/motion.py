@@ -1,14 +1,22 @@
-"""How a simulated body moves: smoothly, never the same way twice, and known exactly."""
+"""How a simulated body moves, and when a sensor sees it.
+
+It moves smoothly, never the same way twice, and is known exactly.  Sensors may be late, and cameras
+read their rows one after the other: a frame's time is that at which its middle row is read, in the
+middle of the row's exposure.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, from_parts, rotation_matrix
-from mixpose.simulation.draws import Purpose, generator
+from mixpose.sensors import Sensor
+from mixpose.simulation.options import Purpose, generator
 
 # A slow swing and a faster, smaller one on top of it, per axis.
 _SHARES = np.array([0.7, 0.3])
@@ -16,20 +24,20 @@ _FREQUENCIES = np.array([[0.6, 1.1], [1.5, 2.3]])  # from, to; in swings per per
 # Every axis begins a little off the centre: near a session's [start], not on it.
 _FIRST = 0.07
 
+PoseAt: TypeAlias = Callable[[float], Floats]
+"""The pose (4, 4) at a time, or so many seconds after that of a frame."""
+
+_ROUNDS = 6  # each leaves the share of a readout in which a feature crosses a row: a thousandth
+_BLUR_STEPS = 9  # positions of a moving marker whose light a frame adds up
+
 
 @dataclass(frozen=True)
 class Swing:
-    """Sums of sinusoids, one sum per world axis.
+    """Sums of K sinusoids, one sum per world axis."""
 
-    Attributes
-    ----------
-    amplitudes, frequencies_hz, phases : (K, 3) float64
-        Of K sinusoids per axis; phases in radians.
-    """
-
-    amplitudes: Floats
+    amplitudes: Floats  # (K, 3), as all of them
     frequencies_hz: Floats
-    phases: Floats
+    phases: Floats  # in radians
 
     def at(self, times_s: Floats) -> Floats:
         """Values (..., 3) at times (...)."""
@@ -39,24 +47,12 @@ class Swing:
 
 @dataclass(frozen=True)
 class Motion:
-    """A body that swings and turns about a central pose.
+    """A body that swings and turns about a central pose."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        The central pose.
-    pivot : (3,) float64
-        The point of the object, in its own frame, about which it turns.
-    shift : Swing
-        Displacement of the pivot, length units.
-    turn : Swing
-        Rotation vector in world axes, radians.
-    """
-
-    T_world_object: Floats
-    pivot: Floats
-    shift: Swing
-    turn: Swing
+    T_world_object: Floats  # (4, 4), the central pose
+    pivot: Floats  # (3,), the point of the object, in its own frame, about which it turns
+    shift: Swing  # displacement of the pivot, length units
+    turn: Swing  # rotation vector in world axes, radians
 
     def poses(self, times_s: Floats) -> Floats:
         """The poses T_world_object (..., 4, 4) at times (...) in seconds."""
@@ -64,6 +60,10 @@ class Motion:
         R = rotation_matrix(self.turn.at(times_s)) @ R_centre
         pivot_world = R_centre @ self.pivot + t_centre + self.shift.at(times_s)
         return from_parts(R, pivot_world - R @ self.pivot)
+
+    def pose(self, time_s: float) -> Floats:
+        """The pose (4, 4) at a time."""
+        return self.poses(np.array(time_s))
 
     @property
     def reach(self) -> float:
@@ -81,22 +81,11 @@ def plan_motion(
     free: tuple[str, ...] = TWIST_NAMES,
     seed: int = 0,
 ) -> Motion:
-    """Choose a motion about a central pose.
+    """Choose a motion about a central pose (4, 4) and the pivot (3,) in the object's frame.
 
-    Parameters
-    ----------
-    T_world_object : (4, 4) array
-        The central pose.
-    pivot : (3,) array
-        Where the object turns about, in its frame.  With fewer than six directions free it turns
-        about its origin instead, as a turn about any other point would move the origin.
-    translation, rotation_deg : float
-        Largest displacement and turn per world axis.
-    period_s : float
-        About the time of one slow swing.
-    free : tuple of str
-        World-frame directions that change, names of `mixpose.rigid.TWIST_NAMES`.
-    seed : int
+    With fewer than six of the world-frame directions `free` it turns about its origin instead, as a
+    turn about any other point would move the origin. `translation` and `rotation_deg` are largest
+    per world axis; a slow swing takes about `period_s`.
     """
     rng = generator(seed, Purpose.MOTION)
     is_free = np.array([name in free for name in TWIST_NAMES], dtype=np.float64)
@@ -120,3 +109,41 @@ def _swing(amplitudes: Floats, period_s: float, rng: np.random.Generator) -> Swi
         frequencies_hz=(low + (high - low) * rng.random((len(_SHARES), 3))) / period_s,
         phases=np.where(falling, np.pi - first, first),
     )
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """The timing of a sensor."""
+
+    late_s: float = 0.0  # seconds after the common time
+    readout_s: float = 0.0  # from the first row to the last
+    exposure_s: float = 0.0  # for which a row collects light
+    rows: int = 0  # of an image; 0 where there are none
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether all is seen at the common time."""
+        return not (self.late_s or self.readout_s or self.exposure_s)
+
+    def poses(self, sensor: Sensor, point: Floats, pose_after: PoseAt) -> list[Floats]:
+        """The poses at which a point (3,) of a body is seen, one for each part of the exposure."""
+        if self.is_ideal:
+            return [pose_after(0.0)]
+        steps = _BLUR_STEPS if self.exposure_s else 1
+        shares = (np.arange(steps) + 0.5) / steps - 0.5
+        return [
+            pose_after(self._moment(sensor, point, pose_after, share * self.exposure_s))
+            for share in shares.tolist()
+        ]
+
+    def _moment(self, sensor: Sensor, point: Floats, pose_after: PoseAt, within: float) -> float:
+        first = moment = self.late_s + within
+        if not self.readout_s:
+            return moment
+        for _ in range(_ROUNDS):
+            T = pose_after(moment)
+            y, visible = sensor.project(T[:3, :3] @ point + T[:3, 3])
+            if not visible:
+                break
+            moment = first + self.readout_s * (float(y[1]) / (self.rows - 1) - 0.5)
+        return moment

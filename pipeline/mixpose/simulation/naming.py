@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import permutations
 from pathlib import Path, PurePosixPath
 from typing import Literal, TypeAlias
 
@@ -28,32 +29,16 @@ _FEWEST_DIGITS = 4
 
 @dataclass(frozen=True)
 class SourceFiles:
-    """The files of one sensor, relative to the recording's folder.
+    """The files of one sensor, relative to the recording's folder."""
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor.
-    kind : {"images", "video", "profiles", "detections"}
-    path : str
-        The one file of a video or table; for images what comes before the frame number.
-    ending : str
-        For images: what comes after the frame number.
-    digits : int
-        For images: how many digits the frame number has at least.
-    listed : dict of int to str
-        For images of a list: the name of each frame.
-    pattern : str
-        The glob that the session reads the images by; empty for all other sources.
-    """
-
-    sensor: str
+    sensor: str  # its name
     kind: Kind
-    path: str
-    ending: str = ""
-    digits: int = 0
+    path: str  # the one file of a video or table; for images what comes before the frame number
+    ending: str = ""  # for images: what comes after the frame number
+    digits: int = 0  # for images: how many digits the frame number has at least
+    # for images of a list: the name of each frame
     listed: dict[int, str] = field(default_factory=dict)
-    pattern: str = ""
+    pattern: str = ""  # the glob that the session reads the images by; empty for all other sources
 
     def name(self, number: int) -> str:
         """The file that holds a frame."""
@@ -97,27 +82,15 @@ Sources: TypeAlias = Sequence[tuple[SensorSetup, str | tuple[str, ...]]]
 
 
 def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[SourceFiles, ...]]:
-    """Choose the files of a recording.
+    """Choose the files of a recording, for sources inside its folder.
 
-    Parameters
-    ----------
-    sources : sequence of (SensorSetup, str or tuple of str)
-        The sensors with their sources, these inside the recording's folder.
-    frames : int
-        How many frames there are to be.
-
-    Returns
-    -------
-    numbers : sequence of int
-        Frame numbers, ascending: those that lists of images say, else from 0.
-    files : tuple of SourceFiles
-
-    Raises
-    ------
-    SessionError
-        If no files that can be written would be read by these sources.
+    The frame numbers, ascending, are those that lists of images say, else from 0. A `SessionError`
+    if no files that can be written would be read by these sources.
     """
-    single = [(setup, _unlisted(source)) for setup, source in sources]
+    single = [
+        (setup, source[0] if isinstance(source, tuple) and len(source) == 1 else source)
+        for setup, source in sources
+    ]
     numbers = _frame_numbers(single, frames)
     files = tuple(_source_files(setup, source, numbers) for setup, source in single)
     for one in files:
@@ -126,16 +99,18 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
                 f"{_where(one.sensor)}: counts frames from 0, while a list of images of another "
                 f"sensor has the numbers {numbers[0]} to {numbers[-1]}; use numbered images"
             )
-    _check_apart(files, numbers[0])
+    for one, other in permutations(files, 2):
+        name = one.name(numbers[0])
+        if other.reads(name):
+            raise SessionError(
+                f"{_where(other.sensor)}: would also read {name} of sensor {one.sensor!r}; give "
+                "each sensor files of its own"
+            )
     return numbers, files
 
 
 def _where(sensor: str) -> str:
     return f"sensor {sensor!r}: source"
-
-
-def _unlisted(source: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    return source[0] if isinstance(source, tuple) and len(source) == 1 else source
 
 
 def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
@@ -175,15 +150,8 @@ def _source_files(
         raise SessionError(
             f'{_where(setup.name)}: missing; name what is to be written, like "{setup.name}*.png"'
         )
-    if setup.sensor.dimension == 1:
-        return _range_files(setup, source)
-    if setup.sensor.dimension == 3:
-        path = _filled(source) if isinstance(source, str) else ""
-        if PurePosixPath(path).suffix.casefold() != ".csv":
-            raise SessionError(
-                f"{_where(setup.name)}: found {source!r}; allowed for clouds: a .csv table"
-            )
-        return SourceFiles(setup.name, "detections", path)
+    if setup.sensor.dimension != 2:
+        return _table_files(setup, source)
     files = _camera_files(setup.name, source, numbers)
     if files.path.casefold().endswith(".mp4") and any(n % 2 for n in setup.resolution or ()):
         raise SessionError(
@@ -193,33 +161,22 @@ def _source_files(
     return files
 
 
-def _check_apart(sources: Sequence[SourceFiles], number: int) -> None:
-    for one in sources:
-        for other in sources:
-            if one is not other and other.reads(one.name(number)):
-                raise SessionError(
-                    f"{_where(other.sensor)}: would also read "
-                    f"{one.name(number)} of sensor {one.sensor!r}; give each sensor files of its "
-                    "own"
-                )
-
-
-def _range_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
+def _table_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
     path = _filled(source) if isinstance(source, str) else ""
     suffix = PurePosixPath(path).suffix.casefold()
-    if suffix == ".npy" and setup.bin_size is None:
+    are_ranges, binned = setup.sensor.dimension == 1, setup.bin_size is not None
+    if are_ranges and suffix == ".npy" and not binned:
         raise SessionError(
             f"sensor {setup.name!r}: bin_size: missing; profiles ({path}) need "
             "range_min and bin_size"
         )
-    if suffix == ".npy" or (suffix == ".csv" and setup.bin_size is not None):
+    if are_ranges and (suffix == ".npy" or (suffix == ".csv" and binned)):
         return SourceFiles(setup.name, "profiles", path)
     if suffix == ".csv":
         return SourceFiles(setup.name, "detections", path)
-    raise SessionError(
-        f"{_where(setup.name)}: found {source!r}; allowed for ranges: a .csv table, or profiles "
-        "as .npy or .csv"
-    )
+    allowed = "ranges: a .csv table, or profiles as .npy or .csv"
+    allowed = allowed if are_ranges else "clouds: a .csv table"
+    raise SessionError(f"{_where(setup.name)}: found {source!r}; allowed for {allowed}")
 
 
 def _camera_files(
@@ -239,7 +196,8 @@ def _camera_files(
         return SourceFiles(sensor, "detections", _filled(source))
     if suffix in VIDEO_SUFFIXES:
         return SourceFiles(sensor, "video", _filled(source))
-    if suffix in _OTHER_VIDEOS or suffix == ".npy" or _is_live(source):
+    is_live = "://" in source or source.startswith("camera:")
+    if suffix in _OTHER_VIDEOS or suffix == ".npy" or is_live:
         raise SessionError(
             f"{_where(sensor)}: found {source!r}; simulate writes images, .avi, .mp4 and .csv"
         )
@@ -247,10 +205,6 @@ def _camera_files(
         return _globbed_images(sensor, source, numbers)
     digits = max(_FEWEST_DIGITS, len(str(numbers[-1])))
     return SourceFiles(sensor, "images", source.rstrip("/") + "/", ".png", digits)
-
-
-def _is_live(source: str) -> bool:
-    return "://" in source or source.startswith("camera:")
 
 
 def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> SourceFiles:

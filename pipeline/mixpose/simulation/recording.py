@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,22 +16,22 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import central_pose, pivot_of
-from mixpose.simulation.channels import Channel, check_setup, plan_channel
-from mixpose.simulation.companions import Companion, moved, plan_companions
-from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.central_pose import (
+    central_pose,
+    plan_companions,
+    swinging,
+)
+from mixpose.simulation.channels import Channel, Planner, check_setup
+from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
-from mixpose.simulation.options import DEFAULT_FPS, SimulationOptions
-from mixpose.simulation.scenery import motion_pose, plan_scenery
+from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, generator
+from mixpose.simulation.render import SensorWriter
+from mixpose.simulation.scenery import Actor, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
-from mixpose.simulation.shutter import PoseAfter
-from mixpose.simulation.visible_spots import VisibleSpots, displacements, look
-from mixpose.simulation.writers import SensorWriter
+from mixpose.simulation.visible_spots import VisibleSpots, displacements, later, look
 
 TRUTH_NAME = "truth.jsonl"
 
-_AMPLITUDE = 0.4  # of the body's radius
 _DECIMALS = 12  # of true poses: what machines round differently is beyond
 
 Progress: TypeAlias = Callable[[int], None]
@@ -48,7 +48,7 @@ class _Plan:
     fps: float
     motion: Motion
     channels: tuple[Channel, ...]
-    companions: tuple[Companion, ...] = ()
+    companions: tuple[Actor, ...] = ()
 
 
 def simulate(
@@ -61,25 +61,11 @@ def simulate(
 ) -> None:
     """Write a recording that the session plays, with the true poses beside it.
 
-    The folder then holds ``session.toml``, the marker and calibration files that it names,
-    frames for the source of each sensor, and ``truth.jsonl``.  The same session, options and
-    seed give the same bytes.
-
-    Parameters
-    ----------
-    session : Session
-    folder : path
-        Made if it is not there.
-    options : SimulationOptions
-    overwrite : bool
-        Whether a recording in the folder is replaced.
-    progress : callable, optional
-        Called with the number of frames done, after each.
-
-    Raises
-    ------
-    SessionError
-        If the session cannot be simulated, or the folder holds a recording or cannot be written.
+    The folder, made if it is not there, then holds ``session.toml``, the marker and calibration
+    files that it names, frames for the source of each sensor, and ``truth.jsonl``. The same
+    session, options and seed give the same bytes. `progress` is told the number of frames done. A
+    `SessionError` if the session cannot be simulated, or the folder holds a recording that is not
+    to be overwritten, or cannot be written.
     """
     folder = Path(folder)
     plan = _plan(session, options)
@@ -98,7 +84,7 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
     check_setup(session)
     copied = copy_session(session)
     sources = list(zip(session.sensors, copied.sources))
-    motion = _motion(session, options)
+    motion = swinging(session, central_pose(session, options.seed), options, options.seed)
     try:
         numbers, files = plan_files(sources, options.frames)
         fps = _frames_per_second(session, options)
@@ -107,22 +93,10 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
         scenery = plan_scenery(session.body, motion, cameras, options)
         companions = plan_companions(session, motion, options)
-        actors = (*(one.actor for one in companions), *scenery.actors)
-        scenery = replace(scenery, actors=actors)
-        channels = tuple(
-            plan_channel(
-                setup,
-                own,
-                session.body,
-                motion,
-                options,
-                fps=fps,
-                index=i,
-                scenery=scenery,
-                step_s=step,
-            )
-            for i, (setup, own, step) in enumerate(zip(setups, files, steps))
-        )
+        scenery = replace(scenery, actors=(*companions, *scenery.actors))
+        planner = Planner(session.body, motion, options, fps, scenery)
+        numbered = enumerate(zip(setups, files, steps))
+        channels = tuple(planner.channel(a, own, i, step) for i, (a, own, step) in numbered)
     except SessionError as error:  # which key is known there, which file here
         raise SessionError(f"{session.path}: {error}") from error
     return _Plan(session, options, copied, numbers, fps, motion, channels, companions)
@@ -183,20 +157,6 @@ def _frames_per_second(session: Session, options: SimulationOptions) -> float:
     return rates.pop() if rates else DEFAULT_FPS
 
 
-def _motion(session: Session, options: SimulationOptions) -> Motion:
-    body = session.body
-    amplitude = options.amplitude_translation
-    return plan_motion(
-        central_pose(session, options.seed),
-        pivot_of(body),
-        translation=_AMPLITUDE * body.radius if amplitude is None else amplitude,
-        rotation_deg=options.amplitude_rotation_deg,
-        period_s=options.period_s,
-        free=session.estimator.free,
-        seed=options.seed,
-    )
-
-
 def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
     """See that the frames in the folder will be those of this recording only."""
     if folder.resolve() == plan.session.folder.resolve():
@@ -225,29 +185,37 @@ def _write_times(plan: _Plan, folder: Path) -> None:
         for setup, channel in zip(plan.session.sensors, plan.channels, strict=True)
     }
     for name, sensor in plan.copied.times.items():
-        times = [_time(plan, number) + steps[sensor] for number in plan.numbers]
+        times = [number / plan.fps + steps[sensor] for number in plan.numbers]
         rows = [f"{n},{t:.6f}\n" for n, t in zip(plan.numbers, times, strict=True)]
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("frame,time_s\n" + "".join(rows), encoding="ascii", newline="\n")
 
 
-def _time(plan: _Plan, number: int) -> float:
-    return number / plan.fps
-
-
 def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
+    # in the order of the session's bodies
+    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
+    paths = [plan.motion.pose, *(one.pose for one in plan.companions)]
     with ExitStack() as stack:
-        writers = [stack.enter_context(channel.open(folder)) for channel in plan.channels]
+        writers = [stack.enter_context(closing(c.open(folder))) for c in plan.channels]
         truth = stack.enter_context((folder / TRUTH_NAME).open("w", encoding="ascii", newline="\n"))
         truth.write(_line(_header(plan)))
         for done, number in enumerate(plan.numbers, start=1):
             # the motion begins with the first frame, whatever its number
             moment = (number - plan.numbers[0]) / plan.fps
-            T = np.round(plan.motion.poses(np.array(moment)), _DECIMALS) + 0.0
-            if _record_frame(plan, writers, number, T, moment):
-                for pose in _poses(plan, number, T, moved(plan.companions, moment, _DECIMALS)):
-                    truth.write(_line(pose))
+            poses = [np.round(pose(moment), _DECIMALS) + 0.0 for pose in paths]
+            is_recorded = _record_frame(plan, writers, number, poses[0], moment)
+            for (name, instance), T in zip(names, poses, strict=True) if is_recorded else ():
+                pose_line = {
+                    "type": "pose",
+                    "frame": number,
+                    "time_s": round(number / plan.fps, 6),
+                    "object": name,
+                    **({} if instance is None else {"instance": instance}),
+                    "status": "ok",
+                    "T_world_object": T.tolist(),
+                }
+                truth.write(_line(pose_line))
             if progress is not None:
                 progress(done)
 
@@ -281,24 +249,15 @@ def _record_frame(
             channel.options,
             rng,
             offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else _after(plan.motion, moment),
+            pose_after=None if channel.view.shutter.is_ideal else later(plan.motion.pose, moment),
             time_s=moment,
             is_away=is_away,
         )
         if is_missing:
-            visible = _nothing(visible)
-        writer.write(number, _time(plan, number) + channel.step_s, visible, rng)
+            visible = VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
+        writer.write(number, number / plan.fps + channel.step_s, visible, rng)
         recorded = True
     return recorded and not is_away
-
-
-def _after(motion: Motion, moment: float) -> PoseAfter:
-    pose = motion_pose(motion)
-    return lambda seconds: pose(moment + seconds)
-
-
-def _nothing(visible: VisibleSpots) -> VisibleSpots:
-    return VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
 
 
 def _header(plan: _Plan) -> dict[str, Any]:
@@ -312,23 +271,6 @@ def _header(plan: _Plan) -> dict[str, Any]:
         "seed": plan.options.seed,
         "simulation": asdict(plan.options),
     }
-
-
-def _poses(
-    plan: _Plan, number: int, T_first: Floats, others: Sequence[Floats]
-) -> Iterator[dict[str, Any]]:
-    """The lines of a frame, in the order of the session's bodies."""
-    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
-    for (name, instance), T in zip(names, [T_first, *others], strict=True):
-        yield {
-            "type": "pose",
-            "frame": number,
-            "time_s": round(_time(plan, number), 6),
-            "object": name,
-            **({} if instance is None else {"instance": instance}),
-            "status": "ok",
-            "T_world_object": T.tolist(),
-        }
 
 
 def _line(values: dict[str, Any]) -> str:

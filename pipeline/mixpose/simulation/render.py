@@ -1,4 +1,4 @@
-"""From spots to grey images and range profiles.
+"""From spots to grey images and range profiles, and to the disk: a writer per kind of source.
 
 A spot is a Gaussian integrated over each pixel or bin, so that its centroid is where the feature
 projects to, without a bias toward pixel centres.
@@ -8,35 +8,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil
-from typing import Literal
+from pathlib import Path
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from mixpose.errors import SessionError
 from mixpose.records import Floats
+from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.outlines import coverage
-from mixpose.simulation.visible_spots import VisibleSpots
+from mixpose.simulation.visible_spots import VisibleSpots, coverage
 
 _REACH = 5.0  # standard deviations up to which a spot is drawn: the rest is below 1e-6 of it
 _WHITE = 255.0
 _RED, _GREEN, _BLUE = 1.0, 0.8, 0.6
+# Runs and no filter: the best for noise, and fast.
+_PNG = (
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER,
+    cv2.IMWRITE_PNG_FILTER_NONE,
+)
+_VIDEO_QUALITY = 95
 
 
 def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma: float) -> None:
-    """Add Gaussian spots to an image, in place.
+    """Add Gaussian spots at centres (M, 2) to an image (H, W), in place.
 
-    Parameters
-    ----------
-    image : (H, W) array
-    points : (M, 2) array
-        Centres in px, u right and v down, pixel centres at integers.
-    peaks : (M,) array
-        Density at the centre; a spot adds ``peak · 2π σ²`` in all.
-    sigma : float
-        Standard deviation in px.
+    Centres are in px, u right and v down, pixel centres at integers; a spot of a `peak` adds ``peak
+    · 2π σ²`` in all.
     """
     height, width = image.shape
     for (u, v), peak in zip(points, peaks):
@@ -48,17 +51,9 @@ def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma
 
 
 def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -> None:
-    """Add Gaussian peaks to a profile (B,), in place.
+    """Add Gaussian peaks at `places` (M,), in bins, to a profile (B,), in place.
 
-    Parameters
-    ----------
-    profile : (B,) array
-    places : (M,) array
-        Centres in bins, bin centres at integers.
-    peaks : (M,) array
-        Density at the centre; a peak adds ``peak · √(2π) σ`` in all.
-    sigma : float
-        Standard deviation in bins.
+    Bin centres are at integers; a peak adds ``peak · √(2π) σ`` in all.
     """
     for place, peak in zip(places, peaks):
         bins = _cells(place, sigma, len(profile))
@@ -68,40 +63,21 @@ def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """How a camera's images are drawn.
+    """How a camera's images are drawn."""
 
-    Attributes
-    ----------
-    resolution : (int, int)
-        Width and height, px.
-    spot_sigma : float
-        Standard deviation of a spot, px.
-    polarity : {"bright", "dark"}
-        "dark" is the negative of "bright".
-    """
-
-    resolution: tuple[int, int]
-    spot_sigma: float
-    polarity: Literal["bright", "dark"] = "bright"
+    resolution: tuple[int, int]  # width and height, px
+    spot_sigma: float  # standard deviation of a spot, px
+    polarity: Literal["bright", "dark"] = "bright"  # "dark" is the negative of "bright"
 
 
 @dataclass(frozen=True)
 class ProfileFormat:
-    """How a range sensor's profiles are drawn.
-
-    Attributes
-    ----------
-    bins : int
-    range_min, bin_size : float
-        Range of the first bin, and from bin to bin.
-    width : float
-        Standard deviation of a feature's peak, length units.
-    """
+    """How a range sensor's profiles are drawn."""
 
     bins: int
-    range_min: float
-    bin_size: float
-    width: float
+    range_min: float  # of the first bin
+    bin_size: float  # from bin to bin
+    width: float  # standard deviation of a feature's peak, length units
 
 
 def render_image(
@@ -110,28 +86,14 @@ def render_image(
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
-    """The image that a camera takes.
-
-    Parameters
-    ----------
-    visible : VisibleSpots
-        In px.
-    form : ImageFormat
-    options : SimulationOptions
-        Of which `brightness`, `background`, `noise` and `shot_noise` count here.
-    rng : Generator
-        For the noise.
-
-    Returns
-    -------
-    (H, W) uint8 array
-        Grey levels; what is brighter than 255 is 255.
-    """
+    """The image (H, W) that a camera takes of spots in px; what is brighter than 255 is 255."""
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
     draw_light(image, visible, options.brightness, form.spot_sigma)
-    gains = _mosaic(image.shape) if options.bayer else None
-    if gains is not None:
+    if options.bayer:
+        # what each pixel of a colour sensor takes of warm white light, by its filter
+        gains = np.full(image.shape, _GREEN, np.float32)
+        gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
         image *= gains
     if options.shot_noise:
         lit = image > 0
@@ -144,7 +106,7 @@ def render_image(
         image += noise
     np.clip(np.rint(image, out=image), 0, _WHITE, out=image)
     grey = image.astype(np.uint8)
-    if gains is not None:
+    if options.bayer:
         colours = cv2.cvtColor(grey, cv2.COLOR_BayerRGGB2BGR)
         grey = np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     if form.polarity == "dark":
@@ -178,36 +140,13 @@ def draw_light(
         image[rows, columns] *= (1 - shares).astype(np.float32)
 
 
-def _mosaic(shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """What each pixel of a colour sensor takes of warm white light, by its filter."""
-    gains = np.full(shape, _GREEN, np.float32)
-    gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
-    return gains
-
-
 def render_profile(
     visible: VisibleSpots,
     form: ProfileFormat,
     options: SimulationOptions,
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
-    """The profile that a range sensor records.
-
-    Parameters
-    ----------
-    visible : VisibleSpots
-        In length units.
-    form : ProfileFormat
-    options : SimulationOptions
-        Of which `range_snr` counts here.
-    rng : Generator
-        For the noise.
-
-    Returns
-    -------
-    (bins,) float32 array
-        1 at the peak of a mean feature; never below 0, as amplitudes are not.
-    """
+    """The profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
     profile = np.zeros(form.bins)
     places = (visible.points[:, 0] - form.range_min) / form.bin_size
     draw_profile(profile, places, visible.levels, form.width / form.bin_size)
@@ -226,3 +165,139 @@ def _shares(cells: range, centre: float, sigma: float) -> Floats:
     """Share of a unit Gaussian that falls into each cell."""
     edges = np.arange(cells.start, cells.stop + 1) - 0.5
     return np.asarray(np.diff(0.5 * erf((edges - centre) / (np.sqrt(2) * sigma))))
+
+
+def _made(files: SourceFiles, folder: Path) -> Path:
+    """The one file of a source, in a folder that is there."""
+    path = folder / files.path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+class ImageWriter:
+    """A file per image."""
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ImageFormat
+    ) -> None:
+        self._files, self._folder, self._options, self._form = files, folder, options, form
+
+    def write(
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
+    ) -> None:
+        """Draw and write one image."""
+        image = render_image(visible, self._form, self._options, rng)
+        path = self._folder / self._files.name(number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        suffix = path.suffix.casefold()
+        path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
+
+    def close(self) -> None:
+        """Nothing is left to do: every image is whole."""
+
+
+class VideoWriter:
+    """All images in one video: MJPEG in .avi, MPEG-4 in .mp4."""
+
+    def __init__(
+        self,
+        files: SourceFiles,
+        folder: Path,
+        options: SimulationOptions,
+        form: ImageFormat,
+        fps: float,
+    ) -> None:
+        self._options, self._form = options, form
+        path = _made(files, folder)
+        # OpenCV's own writer of MJPEG lets the quality be set
+        own = path.suffix.casefold() == ".avi"
+        self._video = cv2.VideoWriter(
+            str(path),
+            cv2.CAP_OPENCV_MJPEG if own else cv2.CAP_FFMPEG,
+            cv2.VideoWriter.fourcc(*("MJPG" if own else "mp4v")),
+            fps,
+            form.resolution,
+            (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if own else (),
+        )
+        if not self._video.isOpened():
+            raise SessionError(
+                f"simulate: sensor {files.sensor!r}: source: {files.path} cannot be written as a "
+                'video; write images, with a glob like "left*.png"'
+            )
+
+    def write(
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
+    ) -> None:
+        """Draw one image and append it."""
+        image = render_image(visible, self._form, self._options, rng)
+        self._video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+
+    def close(self) -> None:
+        """Finish the container."""
+        self._video.release()
+
+
+class ProfileWriter:
+    """A row per frame: .npy of float32, or .csv without a header."""
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
+    ) -> None:
+        self._options, self._form = options, form
+        path = _made(files, folder)
+        self._is_text = path.suffix.casefold() == ".csv"
+        self._file = path.open("wb")
+        if not self._is_text:
+            shape = (options.frames, form.bins)
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(self._file, header)
+
+    def write(
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
+    ) -> None:
+        """Draw one profile and append it."""
+        profile = render_profile(visible, self._form, self._options, rng)
+        row = profile.astype("<f4").tobytes()
+        if self._is_text:
+            row = (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")
+        self._file.write(row)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class DetectionWriter:
+    """A row per detection, in no order, or one of weight 0: the sensor looked, and saw none."""
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
+    ) -> None:
+        self._noise, self._coordinates = noise, coordinates
+        self._file = _made(files, folder).open("w", encoding="ascii", newline="\n")
+        self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
+
+    def write(
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
+    ) -> None:
+        """Append the detections of one frame."""
+        noise = self._noise * rng.standard_normal(visible.points.shape)
+        shown = np.ones(len(noise), dtype=bool)
+        for cover in visible.covers:  # of something dark before cameras
+            corners = cover.astype(np.float32)
+            inside = [cv2.pointPolygonTest(corners, y.tolist(), False) for y in visible.points]
+            shown &= np.array(inside, dtype=float) < 0
+        points, weights = (visible.points + noise)[shown], visible.levels[shown]
+        if not len(points):
+            points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
+        for i in rng.permutation(len(points)):
+            cells = [f"{value:.9g}" for value in (*points[i], weights[i])]
+            self._file.write(",".join([str(number), f"{time_s:.6f}", *cells]) + "\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+SensorWriter: TypeAlias = ImageWriter | VideoWriter | ProfileWriter | DetectionWriter
+"""Writes what one sensor records, frame by frame by ascending numbers, until it is closed."""

@@ -6,9 +6,8 @@ from a seed.  Sensors of ranges know nothing of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 
@@ -16,11 +15,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import Sensor
-from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.motion import Motion, plan_motion
-from mixpose.simulation.options import SimulationOptions
-
-PoseAt: TypeAlias = Callable[[float], Floats]
+from mixpose.simulation.motion import Motion, PoseAt, plan_motion
+from mixpose.simulation.options import Purpose, SimulationOptions, generator
 
 _LAMP = 0.12  # of the body's radius
 _LAMP_LEVEL = 3.0  # of a marker: the image is white there
@@ -38,51 +34,25 @@ _ARM_PERIOD = 0.8  # of that of the body
 
 @dataclass(frozen=True)
 class Actor:
-    """Markers that are no part of the body.
-
-    Attributes
-    ----------
-    body : Body
-    pose : callable
-        From seconds to T_world_object (4, 4).
-    levels : (N,) float64
-        Brightness.
-    mirror : (4, 4) float64 or None
-        Reflection of the world in which they are seen.
-    is_image : bool
-        Whether they are a mirror image of the body, and gone when it is.
-    is_body : bool
-        Whether they are another body of the session: solid, and hidden by others now and then.
-    """
+    """Markers that are no part of the body."""
 
     body: Body
-    pose: PoseAt
-    levels: Floats
-    mirror: Floats | None = None
-    is_image: bool = False
-    is_body: bool = False
+    pose: PoseAt  # from seconds to T_world_object (4, 4)
+    levels: Floats  # (N,) of brightness
+    mirror: Floats | None = None  # reflection (4, 4) of the world in which they are seen
+    is_image: bool = False  # whether they are a mirror image of the body, and gone when it is
+    is_body: bool = False  # another body of the session: solid, and hidden by others now and then
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A straight dark bar that swings before the body.
+    """A straight dark bar that swings before the body."""
 
-    Attributes
-    ----------
-    ends : (2, 3) float64
-        At rest, in the world.
-    swing : (3,) float64
-        Farthest displacement.
-    period_s, phase : float
-    radius : float
-        Half its width.
-    """
-
-    ends: Floats
-    swing: Floats
+    ends: Floats  # (2, 3), at rest, in the world
+    swing: Floats  # (3,), farthest displacement
     period_s: float
     phase: float
-    radius: float
+    radius: float  # half its width
 
     def outline(self, sensor: Sensor, time_s: float) -> Floats:
         """Corners (4, 2) of the bar in a sensor without bounds, px; none where it is not seen."""
@@ -114,111 +84,86 @@ def plan_scenery(
     R, t = motion.T_world_object[:3, :3], motion.T_world_object[:3, 3]
     middle = R @ motion.pivot + t
     front = _unit(np.mean([_unit(camera.towards(middle)) for camera in cameras], axis=0))
-    down = _unit(np.mean([_down(camera, middle) for camera in cameras], axis=0))
+    downs = []  # where rows of images go in the world: a small step that is seen below
+    for camera in cameras:
+        _, J, _ = camera.linearise(middle)
+        downs.append(_unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300)))
+    down = _unit(np.mean(downs, axis=0))
     side = _unit(np.cross(front, down))
-    frame = np.stack([side, down, front])
-    actors = [
-        *_lamps(body, middle, frame, options, rng),
-        *(_other(body, middle, frame, options, k, rng) for k in range(options.others)),
-    ]
+    stage = _Stage(body, middle, np.stack([side, down, front]), options, rng)
+    lamps = [stage.lamp() for _ in range(options.lamps)]
+    others = [stage.other(k) for k in range(options.others)]
+    images = []
     if options.mirror:
-        plane = middle + _TABLE_BELOW * body.radius * down
-        mirror = _reflection(plane, down)
+        # the map of the world onto its mirror image in the table
+        mirror, plane = np.eye(4), middle + _TABLE_BELOW * body.radius * down
+        mirror[:3, :3] -= 2 * np.outer(down, down)
+        mirror[:3, 3] = 2 * (plane @ down) * down
         levels = np.full(len(body), options.mirror)
-        images = [Actor(body, motion_pose(motion), levels, mirror, is_image=True)]
-        images += [
-            Actor(one.body, one.pose, options.mirror * one.levels, mirror)
-            for one in actors[options.lamps :]
-        ]
-        actors += images
-    arms = tuple(_arm(body, middle, frame, options, rng) for _ in range(options.occluder))
-    return Scenery(tuple(actors), arms)
-
-
-def motion_pose(motion: Motion) -> PoseAt:
-    """The pose of a motion at a time."""
-    return lambda time_s: motion.poses(np.array(time_s))
+        images = [Actor(body, motion.pose, levels, mirror, is_image=True)]
+        images += [Actor(o.body, o.pose, options.mirror * o.levels, mirror) for o in others]
+    arms = tuple(stage.arm() for _ in range(options.occluder))
+    return Scenery((*lamps, *others, *images), arms)
 
 
 def _unit(vector: Floats) -> Floats:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _down(camera: Sensor, middle: Floats) -> Floats:
-    """Where the image's rows go, in the world about a point: a small step that is seen below."""
-    _, J, _ = camera.linearise(middle)
-    return _unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300))
+@dataclass(frozen=True)
+class _Stage:
+    """The surroundings of a body, of which scenery is drawn."""
 
+    body: Body
+    middle: Floats  # (3,)
+    frame: Floats  # (3, 3), rows to the side, down and to the front, as cameras see it
+    options: SimulationOptions
+    rng: np.random.Generator
 
-def _lamps(
-    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
-) -> list[Actor]:
-    """Lamps behind the body that stay where they are."""
-    lamps = []
-    for _ in range(options.lamps):
+    def lamp(self) -> Actor:
+        """A lamp behind the body that stays where it is."""
+        radius, rng = self.body.radius, self.rng
         aside = rng.uniform(-_LAMPS_ASIDE, _LAMPS_ASIDE, 2)
-        place = middle + body.radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ frame)
+        place = self.middle + radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ self.frame)
         lamp = Body(
-            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * body.radius])
+            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * radius])
         )
-        lamps.append(Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL])))
-    return lamps
+        return Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL]))
 
+    def other(self, index: int) -> Actor:
+        """As many markers as the body has, elsewhere on another body that moves by itself."""
+        body, options, rng, count = self.body, self.options, self.rng, len(self.body)
+        directions = rng.standard_normal((count, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        places = body.radius * directions * rng.uniform(0.3, 1.0, (count, 1))
+        normals = None if body.normals is None else np.tile(self.frame[2], (count, 1))
+        features = tuple(PointFeature(place) for place in places)
+        radii = None if body.radii is None else np.full(count, float(np.median(body.radii)))
+        other = Body("other", features, normals, None, body.shape, radii)
+        angle = rng.uniform(0, 2 * np.pi)
+        aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
+        R = rotation_matrix(0.3 * rng.standard_normal(3))
+        motion = plan_motion(
+            from_parts(R, self.middle + body.radius * (aside @ self.frame)),
+            np.zeros(3),
+            translation=_OTHERS_MOVE * body.radius,
+            rotation_deg=options.amplitude_rotation_deg,
+            period_s=options.period_s,
+            seed=options.seed + 7919 * (index + 1),
+        )
+        return Actor(other, motion.pose, np.ones(count))
 
-def _other(
-    body: Body,
-    middle: Floats,
-    frame: Floats,
-    options: SimulationOptions,
-    index: int,
-    rng: np.random.Generator,
-) -> Actor:
-    """As many markers as the body has, elsewhere on another body that moves by itself."""
-    count = len(body)
-    directions = rng.standard_normal((count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    places = body.radius * directions * rng.uniform(0.3, 1.0, (count, 1))
-    normals = None if body.normals is None else np.tile(frame[2], (count, 1))
-    features = tuple(PointFeature(place) for place in places)
-    radii = None if body.radii is None else np.full(count, float(np.median(body.radii)))
-    other = Body("other", features, normals, None, body.shape, radii)
-    angle = rng.uniform(0, 2 * np.pi)
-    aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
-    T = from_parts(
-        rotation_matrix(0.3 * rng.standard_normal(3)), middle + body.radius * (aside @ frame)
-    )
-    motion = plan_motion(
-        T,
-        np.zeros(3),
-        translation=_OTHERS_MOVE * body.radius,
-        rotation_deg=options.amplitude_rotation_deg,
-        period_s=options.period_s,
-        seed=options.seed + 7919 * (index + 1),
-    )
-    return Actor(other, motion_pose(motion), np.ones(count))
-
-
-def _arm(
-    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
-) -> Arm:
-    """A bar across the view that swings over the body and beside it."""
-    angle = rng.uniform(0, np.pi)
-    along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ frame
-    swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ frame
-    centre = middle + _ARM_BEFORE * body.radius * frame[2]
-    reach = 0.5 * _ARM_LENGTH * body.radius * along
-    return Arm(
-        np.array([centre - reach, centre + reach]),
-        _ARM_SWING * body.radius * swing,
-        _ARM_PERIOD * options.period_s,
-        rng.uniform(0, 2 * np.pi),
-        _ARM_WIDTH * body.radius,
-    )
-
-
-def _reflection(point: Floats, normal: Floats) -> Floats:
-    """The map (4, 4) of the world onto its mirror image in a plane."""
-    M = np.eye(4)
-    M[:3, :3] -= 2 * np.outer(normal, normal)
-    M[:3, 3] = 2 * (point @ normal) * normal
-    return M
+    def arm(self) -> Arm:
+        """A bar across the view that swings over the body and beside it."""
+        radius, angle = self.body.radius, self.rng.uniform(0, np.pi)
+        along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ self.frame
+        swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ self.frame
+        centre = self.middle + _ARM_BEFORE * radius * self.frame[2]
+        reach = 0.5 * _ARM_LENGTH * radius * along
+        return Arm(
+            np.array([centre - reach, centre + reach]),
+            _ARM_SWING * radius * swing,
+            _ARM_PERIOD * self.options.period_s,
+            self.rng.uniform(0, 2 * np.pi),
+            _ARM_WIDTH * radius,
+        )

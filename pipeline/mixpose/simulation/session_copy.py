@@ -27,24 +27,13 @@ _Place: TypeAlias = tuple[Any, str | int, Role, str]
 
 @dataclass(frozen=True)
 class SessionCopy:
-    """What a recording takes over from a session.
+    """What a recording takes over from a session."""
 
-    Attributes
-    ----------
-    content : bytes
-        The session file.
-    sources : tuple of (str or tuple of str)
-        Sources of the sensors in `content`, in order.
-    times : mapping of str to str
-        Tables of frame times that it names, with the first sensor of each.
-    files : tuple of (Path, str)
-        Marker and calibration files and the user's own extraction: where they are, and their
-        paths in the recording.
-    """
-
-    content: bytes
-    sources: tuple[str | tuple[str, ...], ...]
-    times: Mapping[str, str]
+    content: bytes  # the session file
+    sources: tuple[str | tuple[str, ...], ...]  # sources of the sensors in `content`, in order
+    times: Mapping[str, str]  # tables of frame times that it names, with the first sensor of each
+    # marker and calibration files and the user's own extraction: where they are, and their paths in
+    # the recording
     files: tuple[tuple[Path, str], ...]
 
     def write(self, folder: Path) -> None:
@@ -57,13 +46,7 @@ class SessionCopy:
 
 
 def copy_session(session: Session) -> SessionCopy:
-    """Read a session file for a recording.
-
-    Raises
-    ------
-    SessionError
-        If it cannot be read, or leads out of its folder in a way that cannot be changed.
-    """
+    """Read a session file for a recording; a `SessionError` if what it names cannot go along."""
     try:
         content = session.path.read_bytes()
         data = tomllib.loads(content.decode("utf-8-sig"))
@@ -82,7 +65,10 @@ def copy_session(session: Session) -> SessionCopy:
             files[new] = session.folder / old
         elif role == "times":
             times.setdefault(new, owner)
-    files.update(_modules(session))
+    # Python modules beside the session file that ``method = "module:function"`` names
+    methods = {setup.extract.method for setup in session.sensors}
+    names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
+    files |= {n: session.folder / n for n in names if (session.folder / n).is_file()}
     if moved:
         content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
     sources = [sensor.get("source", "") for sensor in new_data["sensor"]]
@@ -93,13 +79,6 @@ def copy_session(session: Session) -> SessionCopy:
         times=times,
         files=tuple((origin, name) for name, origin in files.items()),
     )
-
-
-def _modules(session: Session) -> dict[str, Path]:
-    """Python modules beside the session file that ``method = "module:function"`` names."""
-    methods = {setup.extract.method for setup in session.sensors}
-    names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
-    return {name: session.folder / name for name in names if (session.folder / name).is_file()}
 
 
 def _places(data: dict[str, Any]) -> Iterator[_Place]:

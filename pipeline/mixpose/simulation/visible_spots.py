@@ -20,39 +20,30 @@ from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import CloudSensor, Sensor
+from mixpose.simulation.motion import PoseAt, Shutter
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.outlines import centroid, outline
-from mixpose.simulation.scenery import PoseAt, Scenery
-from mixpose.simulation.shutter import PoseAfter, Shutter
+from mixpose.simulation.scenery import Scenery
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
 _CORE = 0.45  # of a body's radius: what others are hidden behind
 _PIECES = 32  # in which a line's image is measured
+CORNERS = 180  # of an outline: of a circle, half a thousandth of the radius is left out
+_ROWS_PER_PIXEL = 16
+
+_AROUND = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
+_CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=-1)
 
 
 @dataclass(frozen=True)
 class VisibleSpots:
-    """Spots in sensor coordinates.
+    """Spots in sensor coordinates."""
 
-    Attributes
-    ----------
-    points : (M, m) float64
-        Places of the spots.
-    levels : (M,) float64
-        Their brightness; 1 for the mean feature.
-    features : (M,) int
-        The feature that a spot belongs to; numbers from N on are false features.
-    outlines : mapping of int to (K, 2) float64
-        Edges of those spots that have a size.
-    covers : tuple of (4, 2) float64
-        Corners of what is dark before all spots.
-    """
-
-    points: Floats
-    levels: Floats
-    features: NDArray[np.intp]
+    points: Floats  # (M, m), places of the spots
+    levels: Floats  # (M,), their brightness; 1 for the mean feature
+    features: NDArray[np.intp]  # (M,), that spots belong to; numbers from N on are false features
+    # edges (K, 2) of those spots that have a size
     outlines: Mapping[int, Floats] = field(default_factory=dict)
-    covers: tuple[Floats, ...] = ()
+    covers: tuple[Floats, ...] = ()  # corners (4, 2) of what is dark before all spots
 
     def __len__(self) -> int:
         return len(self.points)
@@ -60,29 +51,15 @@ class VisibleSpots:
 
 @dataclass(frozen=True)
 class View:
-    """How one sensor looks at the body throughout a recording.
-
-    Attributes
-    ----------
-    sensor : Sensor
-    lowest, highest : (m,) float64
-        Bounds of false features.
-    levels : (N,) float64
-        Brightness of the features.
-    spacing : float
-        Distance of the spots of which a line consists, sensor units.
-    ridge : float
-        Brightness of each of these spots; 0 shares that of one feature among them.
-    shutter : Shutter
-    scenery : Scenery
-    """
+    """How one sensor looks at the body throughout a recording."""
 
     sensor: Sensor
+    # bounds (m,) of false features
     lowest: Floats
     highest: Floats
-    levels: Floats
-    spacing: float
-    ridge: float = 0.0
+    levels: Floats  # (N,), brightness of the features
+    spacing: float  # distance of the spots of which a line consists, sensor units
+    ridge: float = 0.0  # brightness of each of these spots; 0 shares that of one feature among them
     shutter: Shutter = Shutter()
     scenery: Scenery = Scenery()
 
@@ -101,33 +78,21 @@ def look(
     rng: np.random.Generator,
     *,
     offsets: Floats | None = None,
-    pose_after: PoseAfter | None = None,
+    pose_after: PoseAt | None = None,
     time_s: float = 0.0,
     is_away: bool = False,
 ) -> VisibleSpots:
-    """Decide what a sensor sees of a body.
+    """Decide what a sensor sees of a body at T_world_object (4, 4) at the frame's time.
 
-    Parameters
-    ----------
-    view : View
-    body : Body
-    T_world_object : (4, 4) array
-        At the frame's time.
-    options : SimulationOptions
-        Of which `hidden`, `hidden_count`, `clutter` and `brightness_spread` count here.
-    rng : Generator
-        For what is hidden and what is false.
-    offsets : (N, 3) array, optional
-        Displacements of the features in the object's frame.
-    pose_after : callable, optional
-        Poses later than the frame's time by some seconds; without it the body stands still.
-    time_s : float
-        Since the motion began, for what else moves.
-    is_away : bool
-        Whether the body is gone.
+    Features are displaced by `offsets` (N, 3) in the object's frame; without `pose_after`, poses
+    later by some seconds, the body stands still; `time_s` since the motion began is for what else
+    moves.
     """
     count = len(body)
-    false = _false_features(options.clutter, view, rng)
+    # evenly over the bounds, their number of the given mean
+    least = int(options.clutter)
+    false_count = least + int(rng.random() < options.clutter - least)
+    false = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
     spots = _Spots([false], [brightness_levels(len(false), options.brightness_spread, rng)])
     spots.owners += range(count, count + len(false))
     seen = facing(view.sensor, body, T_world_object) & ~_hidden(count, options, rng)
@@ -140,16 +105,16 @@ def look(
     for actor in view.scenery.actors:
         if is_away and actor.is_image:
             continue
-        later = _later(actor.pose, time_s)
-        faced = facing(view.sensor, actor.body, later(0.0), actor.mirror)
+        pose_later = later(actor.pose, time_s)
+        T = pose_later(0.0)
+        faced = facing(view.sensor, actor.body, T, actor.mirror)
         if actor.is_body:
-            T = later(0.0)
             others = [one for one in solid if one[2] is not actor]
             faced &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
             faced &= ~_hidden(len(actor.body), options, rng)
         for i in np.flatnonzero(faced).tolist():
             owner = count + len(false) + i
-            spots.add(view, actor.body, i, owner, later, actor.levels[i], None, actor.mirror)
+            spots.add(view, actor.body, i, owner, pose_later, actor.levels[i], None, actor.mirror)
     late = time_s + view.shutter.late_s
     covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
     return spots.visible(tuple(one for one in covers if len(one)))
@@ -158,10 +123,7 @@ def look(
 def _solid(
     view: View, body: Body, T_world_object: Floats, time_s: float, *, is_away: bool
 ) -> list[tuple[Floats, float, object]]:
-    """Cores of the session's bodies, the first one first: middle, radius, and whose it is.
-
-    A session of one body hides nothing behind it.
-    """
+    """Middle, radius and owner of the cores of several bodies, behind which others are hidden."""
     actors = [actor for actor in view.scenery.actors if actor.is_body]
     if not actors:
         return []
@@ -194,7 +156,8 @@ def hidden_behind(
     return hidden
 
 
-def _later(pose: PoseAt, time_s: float) -> PoseAfter:
+def later(pose: PoseAt, time_s: float) -> PoseAt:
+    """Poses so many seconds after a time."""
     return lambda seconds: pose(time_s + seconds)
 
 
@@ -213,7 +176,7 @@ class _Spots:
         body: Body,
         feature: int,
         owner: int,
-        pose_after: PoseAfter,
+        pose_after: PoseAt,
         level: float,
         offset: Floats | None = None,
         mirror: Floats | None = None,
@@ -262,10 +225,7 @@ def brightness_levels(count: int, spread: float, rng: np.random.Generator) -> Fl
 
 
 def displacements(body: Body, T_world_object: Floats, rng: np.random.Generator) -> Floats:
-    """Displacements (N, 3) of the features, drawn from the spread that the body states.
-
-    They are in the body's axes; gravity's turn against it with the pose (4, 4).
-    """
+    """Displacements (N, 3) in the body's axes, drawn from its spread; gravity's by its pose."""
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
     pairs = zip(draws, body.features, strict=True)
     drawn = np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
@@ -282,19 +242,18 @@ def _hidden(count: int, options: SimulationOptions, rng: np.random.Generator) ->
     return hidden
 
 
-def _false_features(mean: float, view: View, rng: np.random.Generator) -> Floats:
-    """False features (n, m), evenly over the bounds; n has the given mean."""
-    count = int(mean) + int(rng.random() < mean - int(mean))
-    return np.asarray(rng.uniform(view.lowest, view.highest, (count, len(view.lowest))))
-
-
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
     """Places (K, m) and shares of brightness (K,) of one feature's visible spots."""
     R, t = T_world_object[:3, :3], T_world_object[:3, 3]
     points, shares = feature.nodes()
     if isinstance(feature, SegmentFeature):
         ends = np.array([feature.start, feature.end]) @ R.T + t
-        count = _spot_count(view, ends)
+        # so many that they lie no farther apart than `spacing`
+        pieces = np.linspace(0, 1, _PIECES + 1)[:, None]
+        y, visible = view.sensor.project(ends[0] + pieces * (ends[1] - ends[0]))
+        steps = np.linalg.norm(np.diff(y, axis=0), axis=1)[visible[1:] & visible[:-1]]
+        longest = float(steps.max()) * _PIECES if len(steps) else 0.0
+        count = max(2, ceil(longest / view.spacing))
         along = (np.arange(count) + 0.5)[:, None] / count
         y, visible = view.sensor.project(ends[0] + along * (ends[1] - ends[0]))
         shares = np.full(count, max(1.0 / count, view.ridge))
@@ -303,10 +262,66 @@ def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats
     return y[visible], shares[visible]
 
 
-def _spot_count(view: View, ends_world: Floats) -> int:
-    """How many spots a line needs so that they lie no farther apart than `spacing`."""
-    along = np.linspace(0, 1, _PIECES + 1)[:, None]
-    y, visible = view.sensor.project(ends_world[0] + along * (ends_world[1] - ends_world[0]))
-    steps = np.linalg.norm(np.diff(y, axis=0), axis=1)[visible[1:] & visible[:-1]]
-    longest = float(steps.max()) * _PIECES if len(steps) else 0.0
-    return max(2, ceil(longest / view.spacing))
+def outline(
+    sensor: Sensor, body: Body, feature: int, T_world_object: Floats, mirror: Floats | None = None
+) -> Floats | None:
+    """Where the edge (CORNERS, 2) of a sphere or disk is seen, px; None where not all of it is.
+
+    `sensor` should have no bounds: what lies beyond an image has no place in it. Through a `mirror`
+    (4, 4) that is a reflection of the world.
+    """
+    assert body.radii is not None, "a body of points has no outlines"
+    radius = float(body.radii[feature])
+    M = T_world_object if mirror is None else mirror @ T_world_object
+    centre = M[:3, :3] @ body.means[feature] + M[:3, 3]
+    if body.shape == "disk" and body.normals is not None:
+        axis = M[:3, :3] @ body.normals[feature]
+    else:
+        # the circle at which lines of sight touch the sphere
+        towards = sensor.towards(centre)
+        distance = float(np.linalg.norm(towards))
+        if distance <= radius:
+            return None
+        axis = towards / distance
+        centre = centre + axis * radius**2 / distance
+        radius *= float(np.sqrt(1 - (radius / distance) ** 2))
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first /= np.linalg.norm(first)
+    plane = np.stack([first, np.cross(axis, first)])
+    y, visible = sensor.project(centre + radius * _CIRCLE @ plane)
+    return y if visible.all() else None
+
+
+def centroid(polygon: Floats) -> Floats:
+    """Centroid (2,) of the area that a polygon (n, 2) encloses."""
+    middle = polygon.mean(axis=0)
+    x, y = (polygon - middle).T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    return np.asarray(
+        middle + [(cross * (one + np.roll(one, -1))).sum() / (3 * cross.sum()) for one in (x, y)]
+    )
+
+
+def coverage(polygon: Floats, shape: tuple[int, int]) -> tuple[slice, slice, Floats]:
+    """Share of every pixel that a convex polygon covers, in a box of an image of a shape (H, W).
+
+    The corners (n, 2) are (u, v) in order, pixel centres at integers. Rows and columns of the box
+    are empty where the polygon is outside of the image.
+    """
+    low = np.clip(np.floor(polygon.min(axis=0) + 0.5).astype(int), 0, shape[::-1])
+    high = np.clip(np.ceil(polygon.max(axis=0) + 0.5).astype(int), 0, shape[::-1])
+    rows, columns = slice(low[1], high[1]), slice(low[0], high[0])
+    height, width = max(high[1] - low[1], 0), max(high[0] - low[0], 0)
+    if not height or not width:
+        return rows, columns, np.zeros((height, width))
+    lines = (np.arange(height * _ROWS_PER_PIXEL) + 0.5) / _ROWS_PER_PIXEL - 0.5 + low[1]
+    # where horizontal lines enter and leave it; alike where they miss it
+    top, bottom = int(polygon[:, 1].argmin()), int(polygon[:, 1].argmax())
+    turned, turn = np.roll(polygon, -top, axis=0), (bottom - top) % len(polygon)
+    sides = [turned[: turn + 1], np.concatenate([turned[turn:], turned[:1]])[::-1]]
+    one, other = (np.interp(lines, side[:, 1], side[:, 0]) for side in sides)
+    left, right = np.minimum(one, other), np.maximum(one, other)
+    right = np.where((lines < polygon[top, 1]) | (lines > polygon[bottom, 1]), left, right)
+    edges = np.arange(width) + low[0] - 0.5
+    within = np.clip(right[:, None] - edges, 0, 1) - np.clip(left[:, None] - edges, 0, 1)
+    return rows, columns, within.reshape(height, _ROWS_PER_PIXEL, width).mean(axis=1)

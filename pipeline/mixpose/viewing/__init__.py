@@ -6,8 +6,4 @@ The page has a process of its own, so that drawing takes no time from the run; i
 when it asks for one, and the moments in between are left out.
 """
 
-from __future__ import annotations
-
-from mixpose.viewing.viewer import Viewer
-
-__all__ = ["Viewer"]
+from mixpose.viewing.viewer import Viewer as Viewer

@@ -39,66 +39,34 @@ PACE = Pace()
 
 @dataclass(frozen=True)
 class Row:
-    """One frame in plots and trails: all that is kept of frames that are not shown.
-
-    Attributes
-    ----------
-    frame : int
-    statuses : tuple of Status
-        Of the bodies, in the session's order; likewise `places`.
-    places : tuple of ((3,) float64 or None)
-        Origins of the bodies in the world.
-    residuals : mapping of str to float
-        The largest `rms` of a sensor over the bodies, by its name; none where nothing was met.
-    """
+    """One frame in plots and trails: all that is kept of frames that are not shown."""
 
     frame: int
-    statuses: tuple[Status, ...]
-    places: tuple[Floats | None, ...]
+    statuses: tuple[Status, ...]  # of the bodies, in the session's order
+    places: tuple[Floats | None, ...]  # likewise their origins (3,) in the world
+    # the largest `rms` of a sensor over the bodies, by its name; none where nothing was met
     residuals: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A sensor's frame as the page has it.
+    """A sensor's frame as the page has it."""
 
-    Attributes
-    ----------
-    frame : RawFrame or None
-        None where the sensor has none.
-    zoom : float
-        By which its image was shrunk.
-    found : (M, 2) float64 or None
-        Features found, in pixels of the sensor.
-    """
-
-    frame: RawFrame | None
-    zoom: float = 1.0
-    found: Floats | None = None
+    frame: RawFrame | None  # None where the sensor has none
+    zoom: float = 1.0  # by which its image was shrunk
+    found: Floats | None = None  # features (M, 2), in pixels of the sensor
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame that is shown, with what has been since the one before.
+    """A frame that is shown, with what has been since the one before."""
 
-    Attributes
-    ----------
-    estimates : tuple of Estimate
-        Of all bodies.
-    sensors : mapping of str to Shown
-    rows : tuple of Row
-        Of frames since the last moment and of this one, the newest `Pace.history` of them.
-    counts : mapping of Status to int
-        Poses so far.
-    per_second : float
-        Frames estimated in a second, lately.
-    """
-
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[Estimate, ...]  # of all bodies
     sensors: Mapping[str, Shown]
+    # of frames since the last moment and of this one, the newest `Pace.history`
     rows: tuple[Row, ...]
-    counts: Mapping[Status, int] = field(default_factory=dict)
-    per_second: float = float("nan")
+    counts: Mapping[Status, int] = field(default_factory=dict)  # poses so far
+    per_second: float = float("nan")  # frames estimated in a second, lately
 
 
 @dataclass(frozen=True)

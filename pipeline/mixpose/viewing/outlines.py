@@ -20,19 +20,12 @@ _UPRIGHT = np.cos(np.deg2rad(30.0))  # an axis of the world that is nearer than 
 
 @dataclass(frozen=True)
 class Outline:
-    """A sensor in space.
-
-    Attributes
-    ----------
-    name : str
-    places : (n, 3) float64
-        Where it stands; of parallel beams the corners of the image on the sensor's plane.
-    border : Rays or None
-        Lines of sight around the edge of the image, in order; None of a range sensor.
-    """
+    """A sensor in space."""
 
     name: str
+    # (n, 3), where it stands; of parallel beams the corners of the image on the sensor's plane
     places: Floats
+    # lines of sight around the edge of the image, in order; None of a range sensor
     border: Rays | None
 
     @property
@@ -68,10 +61,7 @@ def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
 
 
 def up_of(session: Session) -> Floats:
-    """The world's direction (3,) that is up in the images: an axis where one is nearly that.
-
-    Without cameras, or where they contradict each other, z.
-    """
+    """The world's direction (3,) that is up in the images: an axis where one nearly is; else z."""
     ups = [
         -setup.sensor.T_sensor_world[1, :3]
         for setup in session.sensors
@@ -103,17 +93,13 @@ def _bounds(setup: SensorSetup, shown: Shown | None) -> tuple[Floats, Floats]:
 def _border(sensor: Sensor, lower: Floats, upper: Floats) -> Rays | None:
     """Rays of the edge of an image, or of as much amid it as its lens model explains."""
     middle, half = (lower + upper) / 2, (upper - lower) / 2
+    steps = np.linspace(0.0, 1.0, _ALONG_EDGE + 1)[:-1, None]
     for share in _SHARES:
-        edge = _edge(middle - share * half, middle + share * half)
+        (left, top), (right, bottom) = middle - share * half, middle + share * half
+        corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        edge = np.concatenate([a + steps * (b - a) for a, b in sides])
         rays = sensor.rays(edge)
         if rays is not None and len(rays) == len(edge):
             return rays
     return None
-
-
-def _edge(lower: Floats, upper: Floats) -> Floats:
-    """Pixels (4 n, 2) around an image, from corner to corner."""
-    corners = np.array([lower, (upper[0], lower[1]), upper, (lower[0], upper[1])])
-    steps = np.linspace(0.0, 1.0, _ALONG_EDGE + 1)[:-1, None]
-    ends = np.roll(corners, -1, axis=0)
-    return np.concatenate([a + steps * (b - a) for a, b in zip(corners, ends, strict=True)])

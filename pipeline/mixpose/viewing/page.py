@@ -4,40 +4,31 @@ from __future__ import annotations
 
 import html
 import threading
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
+from viser import uplot
 
 from mixpose.body import Body
-from mixpose.pictures.canvas import GREY, Picture, words
-from mixpose.pictures.layout import stacked
-from mixpose.pictures.overlay import STATUS_COLOURS
+from mixpose.pictures.canvas import GREY, Picture, stacked, words
+from mixpose.pictures.overlay import BODY_COLOURS, STATUS_COLOURS
 from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for, with_bodies
 from mixpose.records import Estimate, Status
 from mixpose.session import SensorSetup, Session
-from mixpose.viewing.moment import Moment, Shown, Wish
+from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
-from mixpose.viewing.series import Series
 
 _SENSORS_PX, _CONTROL_PX = 460, 380
 _JPEG_QUALITY = 80
+_HEIGHT_PX = 170
+_INK = "#bbbbbb"
 
 
 class Page:
-    """The page of a run.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    session : Session
-    wish : callable or None
-        Asks the run to pause, go on or step; None where it cannot.
-    paused : bool
-        Whether the run is paused to begin with.
-    """
+    """The page of a run; `wish` asks that to pause, go on or step, and is None where it cannot."""
 
     def __init__(
         self,
@@ -79,7 +70,7 @@ class Page:
                 for setup in self._session.sensors:
                     shown = moment.sensors.get(setup.name, Shown(None))
                     drawn = self._draw(posed, setup, shown)
-                    self._pictures[setup.name].image = _rgb(drawn)
+                    self._pictures[setup.name].image = drawn[:, :, ::-1]
                 self._status.content = status_text(moment)
                 self._series.add(moment.rows)
                 before = self._scene.magnification
@@ -148,20 +139,21 @@ class Page:
                 self._scene.draw_ellipsoids(self._last.estimates)
 
 
-def _rgb(picture: Picture) -> NDArray[np.uint8]:
-    return picture[:, :, ::-1]
-
-
 def status_text(moment: Moment, *, ended: bool = False) -> str:
     """What the page says about a frame, as HTML; names of the session are only ever words in it."""
     first = moment.estimates[0]
     when = "" if first.time_s is None else f", {first.time_s:.3f} s"
-    counts = ", ".join(
-        f"{moment.counts.get(status, 0)} {_coloured(status, status)}" for status in STATUS_COLOURS
-    )
+    counts = ", ".join(f"{moment.counts.get(s, 0)} {_coloured(s)}" for s in STATUS_COLOURS)
     speed = f"{moment.per_second:.3g} frames a second" if moment.per_second else "one at a time"
     speed = "done" if ended else speed
-    rows = "".join(_line(one) for one in moment.estimates)
+    rows = ""
+    for one in moment.estimates:
+        confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
+        doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
+        rows += (
+            f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status)}</td>"
+            f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
+        )
     return (
         f"<div style='padding: 0 0.8em; font-size: 0.9em'><b>frame {first.frame}</b>{when}"
         f"<br>{counts}<br>{speed}, {first.latency_ms:.3g} ms for this one"
@@ -170,15 +162,56 @@ def status_text(moment: Moment, *, ended: bool = False) -> str:
     )
 
 
-def _line(one: Estimate) -> str:
-    confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
-    doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
-    return (
-        f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status, one.status)}</td>"
-        f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
-    )
-
-
-def _coloured(status: Status, text: str) -> str:
+def _coloured(status: Status) -> str:
     blue, green, red = STATUS_COLOURS[status]
-    return f"<span style='color: rgb({red}, {green}, {blue})'>{text}</span>"
+    return f"<span style='color: rgb({red}, {green}, {blue})'>{status}</span>"
+
+
+class Series:
+    """Plots that go along with a run; residuals that are lengths have one of their own."""
+
+    def __init__(self, gui: viser.GuiApi, session: Session) -> None:
+        self._rows: deque[Row] = deque(maxlen=PACE.history)
+        colours = [STATUS_COLOURS[status] for status in STATUS_COLOURS]
+        self._status = _plot(gui, "bodies by status", list(STATUS_COLOURS), colours)
+        self._residuals = []
+        for unit in ("px", "length"):
+            names = [one.name for one in session.sensors if one.sensor.unit == unit]
+            if names:
+                title = f"residual RMS, {unit if unit == 'px' else session.unit}"
+                several = [BODY_COLOURS[k % len(BODY_COLOURS)] for k in range(len(names))]
+                self._residuals.append((names, _plot(gui, title, names, several)))
+
+    def add(self, rows: Iterable[Row]) -> None:
+        """Go on with some frames."""
+        self._rows.extend(rows)
+        frames = np.array([row.frame for row in self._rows], dtype=np.float64)
+        self._status.data = (
+            frames,
+            *(
+                np.array([row.statuses.count(status) for row in self._rows], dtype=np.float64)
+                for status in STATUS_COLOURS
+            ),
+        )
+        for names, plot in self._residuals:
+            residuals = [[row.residuals.get(name, np.nan) for row in self._rows] for name in names]
+            plot.data = (frames, *map(np.array, residuals))
+
+
+def _plot(
+    gui: viser.GuiApi, title: str, names: list[str], colours: list[tuple[int, int, int]]
+) -> viser.GuiUplotHandle:
+    lines = [
+        uplot.Series(label=name, stroke=f"rgb({red},{green},{blue})", width=1.5)
+        for name, (blue, green, red) in zip(names, colours, strict=True)
+    ]
+    axis = uplot.Axis(stroke=_INK, grid={"stroke": "#444444"}, ticks={"stroke": "#444444"})
+    return gui.add_uplot(
+        # the page keeps what share of the frames is shown, which of no frames is nothing
+        data=(np.arange(2.0), *(np.full(2, np.nan) for _ in names)),
+        series=(uplot.Series(label="frame"), *lines),
+        title=title,
+        scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
+        axes=(axis, axis),
+        height=_HEIGHT_PX,
+    )

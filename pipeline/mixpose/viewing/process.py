@@ -27,17 +27,8 @@ def show(
 ) -> None:
     """Show the moments that come through a pipe until it ends.
 
-    Parameters
-    ----------
-    place : Place
-        Where the page listens.
-    connection : Connection
-        Takes `Moment` and `Done`; gives `Viewers` and what the page wishes.
-    session : Session
-    on_files : bool
-        Whether the run can be paused.
-    paused : bool
-        Whether it is, to begin with.
+    The pipe takes `Moment` and `Done`, and gives `Viewers` and what the page wishes. Runs
+    `on_files` can be paused, and are `paused` to begin with or not.
     """
     _be_quiet()
     from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
@@ -77,18 +68,15 @@ class Wishes:
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, what: Wish) -> None:
-        """Ask the run for something."""
-        self._tell(what)
+    def wish(self, what: Wish | Viewers) -> None:
+        """Ask the run for something, or tell it."""
+        with self._lock:
+            self._connection.send(what)
 
     def viewers_are(self, count: int) -> None:
         """Tell how many browsers look."""
         self.viewers = count
-        self._tell(Viewers(count))
-
-    def _tell(self, message: object) -> None:
-        with self._lock:
-            self._connection.send(message)
+        self.wish(Viewers(count))
 
 
 def _be_quiet() -> None:

@@ -54,13 +54,7 @@ class _BodyNodes:
 
 
 class Scene:
-    """The scene of a run.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    session : Session
-    """
+    """The scene of a run."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server = server
@@ -86,7 +80,9 @@ class Scene:
                 nodes.pose.wxyz = _wxyz(one.T_world_object)
                 if len(posed) == 1:
                     nodes.markers.colors = np.array(_rgb(STATUS_COLOURS[one.status]), np.uint8)
-            nodes.trail.points = self._scale * _trail([row.places[k] for row in self._rows])
+            places = pairwise(row.places[k] for row in self._rows)  # none where one is missing
+            trail = [(a, b) for a, b in places if a is not None and b is not None]
+            nodes.trail.points = self._scale * np.array(trail, dtype=np.float64).reshape(-1, 2, 3)
         self.draw_ellipsoids(moment.estimates)
 
     def draw_ellipsoids(self, estimates: Sequence[Estimate]) -> None:
@@ -213,7 +209,14 @@ class Scene:
         everything = np.concatenate([sensors, bodies, bodies - radius, bodies + radius])
         middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
         at = self._scale * middle
-        eye = at + self._scale * _distance(everything - middle, away, up) * away
+        # from where all places are seen
+        right = np.cross(up, away)
+        right /= np.linalg.norm(right)
+        half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
+        places = everything - middle
+        across = np.abs(places @ right) / (_ASPECT * half)
+        upwards = np.abs(places @ np.cross(away, right)) / half
+        eye = at + self._scale * float((places @ away + np.maximum(across, upwards)).max()) * away
         cameras = [client.camera for client in self._server.get_clients().values()]
         for camera in (self._server.initial_camera, *cameras):
             camera.fov = np.deg2rad(_FOV_DEG)
@@ -223,22 +226,6 @@ class Scene:
                 camera.up = up
             camera.position = eye
             camera.look_at = at
-
-
-def _distance(places: Floats, away: Floats, up: Floats) -> float:
-    """From how far away all places (n, 3) about the origin are seen, along a unit vector."""
-    right = np.cross(up, away)
-    right /= np.linalg.norm(right)
-    half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
-    across = np.abs(places @ right) / (_ASPECT * half)
-    upwards = np.abs(places @ np.cross(away, right)) / half
-    return float((places @ away + np.maximum(across, upwards)).max())
-
-
-def _trail(places: Sequence[Floats | None]) -> Floats:
-    """Segments (n, 2, 3) between places that follow each other; none where one is missing."""
-    pairs = [(a, b) for a, b in pairwise(places) if a is not None and b is not None]
-    return np.array(pairs, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def _skeleton(points: Floats) -> Floats:

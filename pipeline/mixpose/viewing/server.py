@@ -14,8 +14,7 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers, MultipleValuesError
 from websockets.http11 import Request, Response
 
-from mixpose.viewing.address import LOOPBACK, Place
-from mixpose.viewing.guard import ASKED_FOR, Answer, Guard
+from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Guard, Place
 
 _MADE_S = 0.01  # between two looks at whether the server is made
 
@@ -29,14 +28,7 @@ class _Server(viser.ViserServer):  # type: ignore[misc]
 
 @contextmanager
 def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.ViserServer]:
-    """A server that answers on a socket.
-
-    Parameters
-    ----------
-    place : Place
-    on_viewers : callable
-        Called with the number of browsers whenever it changes.
-    """
+    """A server that answers on a socket, and tells the number of browsers whenever it changes."""
     # a browser that breaks off, or one that is refused, is nothing to report
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     ready = threading.Event()
@@ -59,13 +51,9 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
     """Let a server that begins here use the socket of a place, and ask its guard first.
 
-    viser offers neither, so what it serves with is replaced while it begins.  The socket takes
-    browsers from the start, viser only once it is made: they are held until it is `ready`.
-
-    Raises
-    ------
-    RuntimeError
-        If it began otherwise, and the guard was not asked.
+    viser offers neither, so what it serves with is replaced while it begins. The socket takes
+    browsers from the start, viser only once it is made: they are held until it is `ready`. A
+    `RuntimeError` if it began otherwise, and the guard was not asked.
     """
     usual = websockets.asyncio.server.serve
     guard = Guard(place.port, place.token)
@@ -73,7 +61,12 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
 
     def serve(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
-            answer = _answer(guard, request)
+            try:
+                asked = {name: request.headers.get(name) for name in ASKED_FOR}
+            except MultipleValuesError:
+                asked = {}
+            given = {name: value for name, value in asked.items() if value is not None}
+            answer = guard.answer(request.path, given)
             if answer is not None:
                 text = answer.text.encode()
                 headers = Headers(**answer.headers)
@@ -98,13 +91,3 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
         websockets.asyncio.server.serve = usual
     if not guarded:
         raise RuntimeError(f"viser {viser.__version__} does not serve as expected")
-
-
-def _answer(guard: Guard, request: Request) -> Answer | None:
-    try:
-        asked = {name: request.headers.get(name) for name in ASKED_FOR}
-    except MultipleValuesError:
-        asked = {}
-    return guard.answer(
-        request.path, {name: value for name, value in asked.items() if value is not None}
-    )

@@ -9,10 +9,9 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
-from types import TracebackType
+from typing import TypeAlias
 
 from mixpose.errors import SessionError
 from mixpose.objective import View
@@ -20,7 +19,7 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Done, Moment, Row, Shown, Viewers, row_of
+from mixpose.viewing.moment import PACE, Done, Moment, Row, Shown, Viewers, Wish, row_of
 
 _LOOK_S = 0.2
 """How often a wait looks whether it was interrupted; on some systems a wait on a lock is not."""
@@ -29,36 +28,19 @@ _LATELY_S = 2.0
 """Over which frames per second are counted."""
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A frame as the run has it."""
-
-    frame_set: FrameSet
-    found: dict[str, Floats]
-    estimates: tuple[Estimate, ...]
+_Frame: TypeAlias = tuple[FrameSet, dict[str, Floats], tuple[Estimate, ...]]
+"""A frame as the run has it, and what was found in it."""
 
 
 class Viewer:
     """Shows a run on a page; a context for ``run(watch=...)``, announced once it is entered.
 
-    Parameters
-    ----------
-    session : Session
-    text : str
-        Where the page is, as of `mixpose.viewing.address.listen`.
-    say : callable
-        Tells people a line.
-    on_files : bool
-        Whether the run can wait: it then waits for a browser before its first frame goes by, no
-        longer than `Pace.patience_s`, and pauses and steps as the page says.  Where nobody looks
-        any more it goes on.
-    paused : bool
-        Begin paused, and wait for the page for as long as it takes.
+    The page is where a `text` says, as of `mixpose.viewing.address.listen`. A run `on_files` waits
+    for a browser before its first frame goes by, no longer than `Pace.patience_s`, and pauses and
+    steps as the page says; where nobody looks any more it goes on. One that begins `paused` waits
+    for the page for as long as it takes.
 
-    Raises
-    ------
-    SessionError
-        If the package of the page is missing, or nothing can listen there.
+    A `SessionError` if the package of the page is missing, or nothing can listen there.
     """
 
     def __init__(
@@ -145,12 +127,7 @@ class Viewer:
             self._ended = True
             self._state.notify_all()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._end()
         if kind is None:
             with suppress(KeyboardInterrupt):  # the recording is done
@@ -170,10 +147,7 @@ class Viewer:
                 self._state.wait(_LOOK_S)
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Take one pose; the frame is shown with the last of its bodies, if the page asks for it.
-
-        On files this is where a run that is paused waits.
-        """
+        """Take one pose; with the last of a frame, show that if asked to, and wait if paused."""
         self._estimates.append(estimate)
         if len(self._estimates) < len(self._session.labels):
             return
@@ -184,7 +158,7 @@ class Viewer:
             if isinstance(view.observation.pattern, PointPattern)
         }
         with self._state:
-            self._newest = _Frame(frame_set, found, estimates)
+            self._newest = frame_set, found, estimates
             self._rows.append(row_of(estimates))
             self._counts.update(one.status for one in estimates)
             self._instants.append(time.monotonic())
@@ -227,17 +201,14 @@ class Viewer:
             return frame, rows
 
     def _moment(self, frame: _Frame, rows: tuple[Row, ...]) -> Moment:
-        cameras = sum(setup.sensor.dimension == 2 for setup in self._session.sensors)
+        frame_set, found, estimates = frame
+        room = room_for(max(sum(s.sensor.dimension == 2 for s in self._session.sensors), 1))
         sensors = {
-            setup.name: _shown(
-                frame.frame_set.frames.get(setup.name),
-                frame.found.get(setup.name),
-                room_for(max(cameras, 1)),
-            )
+            setup.name: _shown(frame_set.frames.get(setup.name), found.get(setup.name), room)
             for setup in self._session.sensors
         }
         # what works out offsets holds the whole frame
-        estimates = tuple(replace(one, measured=dict) for one in frame.estimates)
+        estimates = tuple(replace(one, measured=dict) for one in estimates)
         with self._state:
             since = time.monotonic() - _LATELY_S
             lately = sum(instant > since for instant in self._instants)
@@ -246,17 +217,19 @@ class Viewer:
 
     def _receive(self) -> None:
         """Take what the page says until it is gone."""
-        for message in _messages(self._connection):
-            with self._state:
-                if isinstance(message, Viewers):
-                    self._viewers = message.count
-                elif message == "next":
-                    self._asked = True
-                elif message == "step":
-                    self._paused, self._steps = True, self._steps + 1
-                else:
-                    self._paused, self._steps = message == "pause", 0
-                self._state.notify_all()
+        with suppress(EOFError, OSError):
+            while True:
+                message: Wish | Viewers = self._connection.recv()
+                with self._state:
+                    if isinstance(message, Viewers):
+                        self._viewers = message.count
+                    elif message == "next":
+                        self._asked = True
+                    elif message == "step":
+                        self._paused, self._steps = True, self._steps + 1
+                    else:
+                        self._paused, self._steps = message == "pause", 0
+                    self._state.notify_all()
         with self._state:
             if not self._ended:  # said before the run goes on, which may be at its end by then
                 self._say("warning: the page of --view has ended; the run goes on without it")
@@ -273,13 +246,6 @@ def _shown(frame: RawFrame | None, found: Floats | None, room: tuple[int, int]) 
         return Shown(frame, found=found)
     image, zoom = resized(frame.data, room)
     return Shown(replace(frame, data=image), zoom, found)
-
-
-def _messages(connection: Connection) -> Iterator[object]:
-    """Messages until the other end is gone."""
-    with suppress(EOFError, OSError):
-        while True:
-            yield connection.recv()
 
 
 @contextmanager

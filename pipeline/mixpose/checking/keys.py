@@ -1,0 +1,262 @@
+"""Keys of a session that are odd by themselves, or find far too few or too many features."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mixpose.body import LookAlike, congruent_parts
+from mixpose.checking.lookalikes import noise_of
+from mixpose.checking.placement import typical_poses
+from mixpose.errors import MixposeError
+from mixpose.extraction import METHODS, ExtractOptions
+from mixpose.fit import free_mask
+from mixpose.frames import files_of
+from mixpose.objective import View
+from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame
+from mixpose.runner import begin, observe, source_spec
+from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
+from mixpose.session import SensorSetup, Session
+
+_FEW = 0.6  # of the expected features: fewer are too few
+_SHARED, _OWN = "in [extract]", "in its own [sensor.extract]"
+_ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
+_MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
+_OFF_CENTRE = 0.25  # of the image: lenses are centred better, crops and other sizes often are not
+_NOISES = 3.0  # standard deviations that markers may be off each other
+_LEAST = 0.01  # of the smaller body's radius: nearer than this they are the same
+
+
+def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
+    """Whether features are "too few" or "too many" for a body, `fewest` of which may be seen."""
+    least = expected if fewest is None else fewest
+    if count < min(_FEW * least, least - 1):
+        return "too few"
+    return "too many" if count > _MANY * expected and count > expected + _MANY_MORE else None
+
+
+def advice(
+    session: Session, setup: SensorSetup, number: int, image: Image | None, expected: int
+) -> str:
+    """What to change so that about as many features are found as the sensor should see of the body.
+
+    Each key is tried by itself on one image, and the body is looked for in what is found then: as
+    many features as it has may be clutter that is larger or brighter than it. Where the sensor has
+    detections and no image, nothing can be tried.
+    """
+    options = setup.extract
+    if image is None:
+        return "the table of detections does not fit the body: look at its rows"
+    if options.method not in METHODS:
+        return f"look at what {options.method} returns"
+    frame = RawFrame(number, None, image)
+    before = len(_points(_found(session, setup, frame, {})))
+    trials = []
+    for key, value in _trials(options, image):
+        views = _found(session, setup, frame, {key: value})
+        count = len(_points(views))
+        if 0.9 * expected <= count <= 2 * expected:
+            trials.append(_Trial(key, value, count, views))
+    trials.sort(key=lambda trial: abs(trial.found - expected))
+    chosen = _with_the_body(session, number, trials)
+    if chosen is None and before < expected and trials:
+        chosen = trials[0]  # what finds more loses nothing, even where the body cannot be told
+    if chosen is not None:
+        value = chosen.value
+        written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
+        return f"with {chosen.key} = {written} {_SHARED} it would be {chosen.found}"
+    if before > expected:
+        return (
+            "none of the values tried leaves what can be the body; clutter is allowed for, and "
+            "mixpose inspect shows what is found"
+        )
+    keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
+    usual = "polarity, threshold, min_area and max_area"
+    return f"change {keys.get(options.method, usual)} in [extract]"
+
+
+def told_apart(warnings: Sequence[str]) -> list[str]:
+    """Warnings about sensors, where two that want unlike values of a key each get their own."""
+    values: dict[str, set[str]] = {}
+    for warning in warnings:
+        if advised := _ADVISED.search(warning):
+            values.setdefault(advised[1], set()).add(advised[2])
+    return [
+        warning.replace(_SHARED, _OWN)
+        if (advised := _ADVISED.search(warning)) and len(values[advised[1]]) > 1
+        else warning
+        for warning in warnings
+    ]
+
+
+class _Trial(NamedTuple):
+    """A key with another value, and what is found with it."""
+
+    key: str
+    value: Any
+    found: int
+    views: list[View]
+
+
+def _with_the_body(session: Session, number: int, trials: Sequence[_Trial]) -> _Trial | None:
+    """The first trial in which the body is found for sure; clutter may be ambiguous, too."""
+    # where all directions are free, the body may be anywhere in the frame
+    start = None if free_mask(session.estimator).all() else session.start
+    for trial in trials:
+        tracker, track = begin(replace(session, start=start))
+        _, estimate = tracker.advance(track, number, None, trial.views)
+        if estimate.status == "ok":
+            return trial
+    return None
+
+
+def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
+    polarity = "dark" if options.polarity == "bright" else "bright"
+    trials: list[tuple[str, Any]] = [("polarity", polarity), ("threshold", "auto")]
+    if options.method == "blobs":
+        trials += [("threshold", rule) for rule in ("local", "otsu", "triangle", "li", "sauvola")]
+        trials += [("min_area", area) for area in (3.0, 1.0, 10.0, 30.0, 100.0, 300.0)]
+        trials += [("max_area", area) for area in (30.0, 100.0, 1000.0) if area > options.min_area]
+        trials.append(("method", "log"))
+    if options.method == "log":
+        trials += [("spot_sigma", width) for width in (3.0, 1.5, 6.0, 12.0)]
+    low, high = float(image.min()), float(image.max())
+    trials += [("threshold", round(low + share * (high - low), 2)) for share in (0.3, 0.5, 0.7)]
+    return [(key, value) for key, value in trials if getattr(options, key) != value]
+
+
+def _found(
+    session: Session, setup: SensorSetup, frame: RawFrame, changed: dict[str, Any]
+) -> list[View]:
+    """What the sensor alone finds in a frame with other options; nothing where they are wrong."""
+    options = replace(setup.extract, **changed)
+    if options.max_area is not None and options.max_area <= options.min_area:
+        return []
+    alone = replace(session, sensors=(replace(setup, extract=options),))
+    try:
+        return observe(alone, FrameSet(frame.number, None, {setup.name: frame}))
+    except MixposeError:
+        return []
+
+
+def _points(views: Sequence[View]) -> Floats:
+    """The features found, where they are points."""
+    patterns = [view.observation.pattern for view in views]
+    found = [each.points for each in patterns if isinstance(each, PointPattern)]
+    return np.concatenate(found) if found else np.zeros((0, 2))
+
+
+def key_warnings(session: Session) -> list[str]:
+    """What is most likely wrong about calibrations and widths; images have their recorded sizes."""
+    return _off_centre(session) + _too_wide(session)
+
+
+def _off_centre(session: Session) -> list[str]:
+    """Principal points far from the middle: a calibration of images of another size."""
+    warnings = []
+    for setup in session.sensors:
+        sensor = setup.sensor
+        if not isinstance(sensor, PinholeCamera | FisheyeCamera) or sensor.resolution is None:
+            continue
+        size = np.array(sensor.resolution)
+        cx, cy = sensor.camera_matrix[:2, 2]
+        if (np.abs((cx, cy) - (size - 1) / 2) > _OFF_CENTRE * size).any():
+            warnings.append(
+                f"sensor {setup.name!r}: the principal point cx = {cx:g}, cy = {cy:g} is far from "
+                f"the middle of its images of {size[0]}x{size[1]} px: is the calibration of images "
+                "of another size, and camera_matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]?"
+            )
+    return warnings
+
+
+def _too_wide(session: Session) -> list[str]:
+    """Ranges given a width in which the whole body disappears, as by the default for pixels."""
+    names = [
+        f"{setup.name!r}"
+        for setup in session.sensors
+        if isinstance(setup.sensor, RangeSensor) and setup.extract.sigma > session.body.radius
+    ]
+    if not names:
+        return []
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    sigma = max(s.extract.sigma for s in session.sensors if isinstance(s.sensor, RangeSensor))
+    return [
+        f"sensor {names[0]}{more}: sigma = {sigma:g} {session.unit} in [extract] is wider than "
+        f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
+        "about what ranges err by"
+    ]
+
+
+def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> list[str]:
+    """Pairs of sensors that read the same recording, some of which are `replaced` by name."""
+    read = {
+        setup.name: {
+            os.path.realpath(place) if os.path.exists(place) else place  # noqa: PTH110 - or an address
+            for place in files_of(source_spec(session, setup, replaced.get(setup.name)))
+        }
+        for setup in session.sensors
+    }
+    warnings = []
+    for (a, own), (b, others) in combinations(read.items(), 2):
+        both = own & others
+        if both:
+            first = os.path.basename(min(both))  # noqa: PTH119 - of an address too
+            files = first if len(both) == 1 else f"{len(both)} files ({first}, ...)"
+            warnings.append(
+                f"sensors {a!r} and {b!r} read the same recording, {files}: give each its own "
+                "source"
+            )
+    return warnings
+
+
+def shared_part_warnings(session: Session) -> list[str]:
+    """Pairs of bodies that are congruent within the noise, or whose largest such parts are."""
+    warnings = list[str]()
+    if len(session.objects) < 2:
+        return warnings
+    noise = _noise_length(session)
+    for one, other in combinations([each.body for each in session.objects], 2):
+        least = _LEAST * min(one.radius, other.radius)
+        parts = congruent_parts(one, other, max(least, _NOISES * noise, one.spread, other.spread))
+        if parts:
+            warnings.append(_text(parts[0], session.unit))
+    return warnings
+
+
+def _noise_length(session: Session) -> float:
+    """What markers err by in the world, where the bodies are about: the best of the sensors."""
+    lengths = []
+    for setup in session.sensors:
+        if setup.sensor.dimension == 1:
+            lengths.append(noise_of(setup))
+            continue
+        if any(s.sensor.dimension == 2 and s.resolution is None for s in session.sensors):
+            continue
+        for T in typical_poses(session, 1)[:1]:
+            _, J, seen = setup.sensor.linearise(session.body.means @ T[:3, :3].T + T[:3, 3])
+            if seen.all():
+                lengths.append(noise_of(setup) / max(float(np.linalg.norm(J[0], 2)), 1e-12))
+    return min(lengths, default=0.0)
+
+
+def _text(part: LookAlike, unit: str) -> str:
+    one, other = part.body, part.other
+    pairs = ", ".join(f"{i} like {j}" for i, j in zip(part.features, part.partners, strict=True))
+    if len(part.features) == len(one) == len(other):
+        return (
+            f"the bodies {one.name!r} and {other.name!r} are congruent to {part.off:.2g} {unit} "
+            f"(markers {pairs}): nothing tells them apart; give one [[object]] with count, or move "
+            "a marker"
+        )
+    return (
+        f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
+        f"{other.name!r} to "
+        f"{part.off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
+        "expect ambiguous frames, or move a marker"
+    )
