@@ -106,19 +106,10 @@ def in_processes(workers: int | None = None) -> Iterator[Executor]:
 
 @contextmanager
 def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]:
-    """The workers of a scheduler.
+    """The workers of a scheduler at an address, or of `LOCAL` one, which has as many as
+    processors.
 
-    Parameters
-    ----------
-    scheduler : str
-        Its address, or `LOCAL`.
-    workers : int or None
-        Of a local cluster: as many as there are processors if not said.
-
-    Raises
-    ------
-    SessionError
-        If ``dask.distributed`` is not installed, or no scheduler answers.
+    Raises SessionError if ``dask.distributed`` is not installed, or no scheduler answers.
     """
     if find_spec("distributed") is None:
         raise SessionError(

@@ -58,15 +58,9 @@ LEAST_DELAY_S = 1e-6
 
 @dataclass(frozen=True)
 class Memory:
-    """All that a run knows between two frames.
+    """All that a run knows between two frames."""
 
-    Attributes
-    ----------
-    tracks : tuple of Track
-        One per body.
-    """
-
-    tracks: tuple[Track, ...]
+    tracks: tuple[Track, ...]  # one per body
 
 
 _KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
@@ -183,12 +177,8 @@ def _tracker(
 def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
     """Open the recordings of all sensors.
 
-    Raises
-    ------
-    SessionError
-        If a replaced sensor is not in the session, or a sensor has no source.
-    RecordingError
-        If a recording cannot be opened.
+    Raises SessionError if a replaced sensor is not in the session, or a sensor has no source.
+    Raises RecordingError if a recording cannot be opened.
     """
     names = [setup.name for setup in session.sensors]
     for name in replaced:

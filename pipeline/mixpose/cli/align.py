@@ -31,33 +31,19 @@ _ALL = 17  # digits: the frame is as exact as float64
 
 @dataclass(frozen=True)
 class AlignRequest:
-    """The options of ``mixpose align``.
+    """The options of ``mixpose align``."""
 
-    Attributes
-    ----------
-    floor : tuple of str
-        Files of poses, or bodies in frames of the recording, ``OBJECT@FRAME``.
-    output : Path
-    up : {"x", "y", "z"}
-    sources : tuple of str
-        ``NAME=PATH``.
-    """
-
-    floor: tuple[str, ...]
+    floor: tuple[str, ...]  # files of poses, or bodies in frames of the recording, ``OBJECT@FRAME``
     output: Path
     up: Axis
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # ``NAME=PATH``
 
 
 def align_session(path: Path, request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong, or directions of the world are held in it.
-    RecordingError
-        If the poses tell no floor.
+    Raises SessionError if the session or the options are wrong, or directions of the world are
+    held in it. Raises RecordingError if the poses tell no floor.
     """
     session = load_session(path)
     if len(session.estimator.free) < len(rigid.TWIST_NAMES):

@@ -37,44 +37,24 @@ from mixpose.session import Session, load_session
 
 @dataclass(frozen=True)
 class CalibrateRequest:
-    """What was asked for.
-
-    Attributes
-    ----------
-    output : Path or None
-    poses : Path or None
-        Known poses of the body.
-    free : tuple of str
-    sources : tuple of str
-        ``NAME=PATH``.
-    report : Path or None
-    check : bool
-        Whether an old calibration is only judged.
-    length : str or None
-        ``SENSOR:SENSOR=LENGTH``.
-    world : str or None
-        Whose frame becomes the world's: a sensor's, or ``body@FRAME``.
-    """
+    """What was asked for."""
 
     output: Path | None
-    poses: Path | None
+    poses: Path | None  # known poses of the body
     free: tuple[str, ...]
-    sources: tuple[str, ...]
+    sources: tuple[str, ...]  # ``NAME=PATH``
     report: Path | None
-    check: bool = False
-    length: str | None = None
-    world: str | None = None
+    check: bool = False  # whether an old calibration is only judged
+    length: str | None = None  # ``SENSOR:SENSOR=LENGTH``
+    world: str | None = None  # whose frame becomes the world's: a sensor's, or ``body@FRAME``
 
 
 def calibrate_session(path: Path, request: CalibrateRequest) -> None:
     """Calibrate a session and write what was found.
 
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the output would overwrite something else.
-    RecordingError
-        If the recording or the poses cannot be read, or do not show the body.
+    Raises SessionError if the session or an option is wrong, or the output would overwrite
+    something else. Raises RecordingError if the recording or the poses cannot be read, or do not
+    show the body.
     """
     session = load_session(path)
     output = request.output
@@ -184,10 +164,7 @@ def task_of(
 def known_poses(path: Path, session: Session) -> dict[int, Floats]:
     """Poses of the session's body by frame number.
 
-    Raises
-    ------
-    RecordingError
-        If the file holds none, or its unit is another.
+    Raises RecordingError if the file holds none, or its unit is another.
     """
     poses = read_poses(path)
     if poses.unit is not None and poses.unit != session.unit:

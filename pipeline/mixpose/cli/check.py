@@ -81,23 +81,10 @@ def check_session(
 ) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
-    Parameters
-    ----------
-    path : Path
-    quick : bool
-        Look at a few frames only instead of all.
-    sources : sequence of str
-        Recordings in place of the session's, as ``left=frames/``.
-    allow_code : bool
-        Whether functions that the session names may be run.
-
-    Raises
-    ------
-    SessionError
-        As ``mixpose run`` would before its first frame.
-    RecordingError
-        If a recording cannot be opened or its table of times lacks rows, or, after all has been
-        printed, if a frame is damaged.
+    `quick` looks at a few frames only; `sources` (``left=frames/``) stand in place of the
+    session's. Raises SessionError as ``mixpose run`` would before its first frame, and
+    RecordingError if a recording cannot be opened or its table of times lacks rows, or, after all
+    has been printed, if a frame is damaged.
     """
     session = load_session(path, allow_code=allow_code)
     replaced = named_sources(sources)

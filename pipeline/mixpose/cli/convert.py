@@ -64,12 +64,8 @@ class ConvertRequest:
 def convert_poses(path: Path, request: ConvertRequest) -> None:
     """Write the poses of a file in another format.
 
-    Raises
-    ------
-    SessionError
-        If the options are wrong or do not say enough.
-    RecordingError
-        If the poses file cannot be read, or holds what the format cannot say.
+    Raises SessionError if the options are wrong or do not say enough. Raises RecordingError if the
+    poses file cannot be read, or holds what the format cannot say.
     """
     name = _format(request)
     _refuse_options_of_other_formats(name, request)

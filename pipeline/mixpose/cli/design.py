@@ -47,12 +47,7 @@ class DesignRequest:
 
 
 def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
-    """Print a study of the systems of several session files.
-
-    Raises
-    ------
-    SessionError
-    """
+    """Print a study of the systems of several session files. Raises SessionError."""
     sessions = [with_image_sizes(load_session(path), {}) for path in paths]
     for path, session in zip(paths, sessions, strict=True):
         if session.unit != sessions[0].unit:

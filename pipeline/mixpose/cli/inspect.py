@@ -36,29 +36,13 @@ def inspect_frame(
     sources: Sequence[str],
     allow_code: bool = False,
 ) -> None:
-    """Write pictures of one frame into a folder and print what was found in it.
+    """Write pictures of one frame, else of the first, into a folder and print what was found in
+    it.
 
-    Parameters
-    ----------
-    path : Path
-        The session file.
-    number : int or None
-        Of the frame; None is the first of the recording.
-    folder : Path
-        Made if there is none.
-    poses : Path or None
-        Poses of a run, in place of estimating this frame on its own.
-    sources : sequence of str
-        ``NAME=PATH``, recordings in place of the session's.
-    allow_code : bool
-        Whether functions that the session names may be run.
-
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the folder holds other people's files.
-    RecordingError
-        If the recording or the poses cannot be read.
+    `poses` of a run stand in place of estimating this frame on its own, `sources` (``NAME=PATH``)
+    in place of the session's. Raises SessionError if the session or an option is wrong, or the
+    folder holds other people's files, and RecordingError if the recording or the poses cannot be
+    read.
     """
     session = load_session(path, allow_code=allow_code)
     require_matplotlib()

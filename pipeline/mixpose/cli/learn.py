@@ -24,36 +24,21 @@ from mixpose.whole_files import appearing_whole
 
 @dataclass(frozen=True)
 class LearnRequest:
-    """What was asked for.
-
-    Attributes
-    ----------
-    output : Path
-    axes : str or None
-        ``ORIGIN,X,Y``: markers by name.
-    like : Path or None
-        An older table of the same markers.
-    sources : tuple of str
-        ``NAME=PATH``.
-    allow_code : bool
-    """
+    """What was asked for."""
 
     output: Path
-    axes: str | None = None
-    like: Path | None = None
-    sources: tuple[str, ...] = ()
+    axes: str | None = None  # ``ORIGIN,X,Y``: markers by name
+    like: Path | None = None  # an older table of the same markers
+    sources: tuple[str, ...] = ()  # ``NAME=PATH``
     allow_code: bool = False
 
 
 def learn_session(path: Path, request: LearnRequest) -> None:
     """Learn the bodies of a recording and write a table of each.
 
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the output would overwrite something else.
-    RecordingError
-        If the recording cannot be read, or no body is seen to move.
+    Raises SessionError if the session or an option is wrong, or the output would overwrite
+    something else. Raises RecordingError if the recording cannot be read, or no body is seen to
+    move.
     """
     session = load_scene(path, allow_code=request.allow_code)
     inputs = [path] if request.like is None else [path, request.like]

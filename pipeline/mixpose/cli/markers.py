@@ -40,27 +40,10 @@ def write_markers(
 ) -> None:
     """Write where the markers of all bodies were: measured where they were, else by the pose.
 
-    Parameters
-    ----------
-    poses : PoseFile
-    lines : sequence of PoseLine
-        Of these, those to write.
-    session : Session
-        That of the poses: it has the markers.
-    output : Path or None
-        None is standard output, for ``trc``.
-    format_name : {"c3d", "trc"}
-    measured : bool
-        Whether what no sensors measured stays a gap.
-    fps : float or None
-        Frames per second, in place of the times of the poses.
-
-    Raises
-    ------
-    SessionError
-        If a package is missing, or poses and options do not go together.
-    RecordingError
-        If the poses hold what such a file cannot.
+    `lines` are those of the poses to write, `session` has the markers, `measured` leaves a gap
+    where no sensors measured, and `fps` stands in place of the times of the poses. Raises
+    SessionError if a package is missing, or poses and options do not go together, and
+    RecordingError if the poses hold what such a file cannot.
     """
     if format_name == "c3d":
         _require_c3d(output)

@@ -26,19 +26,9 @@ _FIRST_WORDS = (
 class Output:
     """Writes poses; a file is opened with the first of them, so that no failure empties it.
 
-    Parameters
-    ----------
-    path : Path or None
-        None is standard output.
-    format_name : str
-        Of `mixpose.poses.formats.FORMATS`.
-    header : Header
-    goes_on : LineFile or None
-        A file of JSON lines that has its header already, in place of opening `path`.
-    options : mapping
-        What the writer of the format takes besides.
-    called : Path or None
-        What messages call the file, where that is not `path`.
+    Without a path poses go to standard output. `goes_on` is a file of JSON lines that has its
+    header already, in place of opening `path`; `options` are what the writer of the format takes
+    besides; `called` is what messages call the file, where that is not `path`.
     """
 
     def __init__(
@@ -98,20 +88,8 @@ class Output:
 class OutputPerBody:
     """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
 
-    Parameters
-    ----------
-    path : Path or None
-        ``poses.tum`` stands for ``poses.<body>.tum``.
-    format_name : str
-    labels : sequence of str
-        Names of the bodies, identical ones numbered.
-    start : callable
-        Makes the output of one body from the path of its file.
-
-    Raises
-    ------
-    SessionError
-        If there is no path.
+    ``poses.tum`` stands for ``poses.<body>.tum``, whose output `start` makes. Raises SessionError
+    if there is no path.
     """
 
     file: LineFile | None = None
@@ -172,10 +150,7 @@ def _as_stream(file: LineFile) -> TextIO:
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     """Make sure that a file about to be written is new, or holds poses that mixpose wrote.
 
-    Raises
-    ------
-    SessionError
-        If it is an input of the run, or holds something else.
+    Raises SessionError if it is an input of the run, or holds something else.
     """
     beginning = _beginning(path, inputs)
     first = beginning.partition("\n")[0]
@@ -190,22 +165,10 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
 ) -> None:
-    """Make sure that a file about to be written is new, empty, or begins with a mark in it.
+    """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
+    it.
 
-    Parameters
-    ----------
-    path : Path
-    inputs : iterable of Path
-        Files that must stay.
-    mark : str
-        Words by which mixpose knows its own files of this kind.
-    option : str
-        By which the file was named.
-
-    Raises
-    ------
-    SessionError
-        If it is one of the inputs, or holds something else.
+    Raises SessionError if it is one of the inputs, or holds something else; `option` named it.
     """
     beginning = _beginning(path, inputs, option)
     if beginning and mark not in beginning:

@@ -31,30 +31,19 @@ _SLIPPED = 2.0  # times the deviations: a tip that stays where it is gives 1 wit
 
 @dataclass(frozen=True)
 class PivotRequest:
-    """The options of ``mixpose pivot``.
+    """The options of ``mixpose pivot``."""
 
-    Attributes
-    ----------
-    object, reference : str or None
-        Bodies by their names: the tool, and what its tip stays at a point of.
-    into : Path or None
-        The session that gets the tip.
-    """
-
+    # bodies by their names: the tool, and what its tip stays at a point of
     object: str | None
     reference: str | None
-    into: Path | None
+    into: Path | None  # the session that gets the tip
 
 
 def pivot_poses(path: Path, request: PivotRequest) -> None:
     """Find the tip of a tool, tell it, and write it into a session.
 
-    Raises
-    ------
-    SessionError
-        If an option names what is not there.
-    RecordingError
-        If the poses cannot be read, or do not tell the tip.
+    Raises SessionError if an option names what is not there. Raises RecordingError if the poses
+    cannot be read, or do not tell the tip.
     """
     poses = read_poses(path)
     tool = _tool(poses, request)

@@ -19,12 +19,8 @@ _PAGES = (".html", ".htm")
 def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
     """Write the report of a run to a page of its own.
 
-    Raises
-    ------
-    SessionError
-        If the output would overwrite something else, or a library is missing.
-    RecordingError
-        If the poses or the truth cannot be read or compared.
+    Raises SessionError if the output would overwrite something else, or a library is missing.
+    Raises RecordingError if the poses or the truth cannot be read or compared.
     """
     poses, cut = read_unfinished_poses(poses_path)
     truth = None if truth_path is None else read_poses(truth_path)

@@ -26,12 +26,8 @@ def write_rerun(
 ) -> None:
     """Write poses and the recording of their session as an ``.rrd`` file.
 
-    Raises
-    ------
-    SessionError
-        If the viewer's package is missing, or the session is not found or not that of the poses.
-    RecordingError
-        If the recording cannot be read.
+    Raises SessionError if the viewer's package is missing, or the session is not found or not that
+    of the poses. Raises RecordingError if the recording cannot be read.
     """
     if output is None:
         raise SessionError("--format rerun: needs -o FILE.rrd, it is no text")

@@ -35,12 +35,8 @@ from mixpose.tracking.proposers import predicted
 def run_session(path: Path, request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong.
-    RecordingError
-        If the recording cannot be read; frames already estimated stay written.
+    Raises SessionError if the session or the options are wrong. Raises RecordingError if the
+    recording cannot be read; frames already estimated stay written.
     """
     with ExitStack() as pages:  # what outlives the poses
         _run_session(path, request, pages)
@@ -232,10 +228,7 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
 def named_sources(named: Iterable[str]) -> dict[str, str]:
     """Recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
 
-    Raises
-    ------
-    SessionError
-        If a text is not of this form.
+    Raises SessionError if a text is not of this form.
     """
     sources = {}
     for text in named:

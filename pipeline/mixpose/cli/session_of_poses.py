@@ -13,10 +13,7 @@ from mixpose.session import Session, load_session
 def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False) -> Session:
     """The session that poses were estimated with: the one `named`, or the one of their header.
 
-    Raises
-    ------
-    SessionError
-        If it is not there or has another unit.
+    Raises SessionError if it is not there or has another unit.
     """
     path = named
     if path is None:

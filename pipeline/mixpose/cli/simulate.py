@@ -13,13 +13,7 @@ from mixpose.simulation.session_copy import SESSION_NAME
 
 
 def delays_of(given: list[str]) -> dict[str, float]:
-    """Seconds by sensor, of texts NAME=SECONDS.
-
-    Raises
-    ------
-    SessionError
-        If a text is not like that.
-    """
+    """Seconds by sensor, of texts NAME=SECONDS. Raises SessionError if a text is not like that."""
     delays = {}
     for text in given:
         name, _, seconds = text.rpartition("=")
@@ -39,10 +33,8 @@ def simulate_session(
 ) -> None:
     """Render the recording of a session into a folder.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong, or the folder holds a recording already.
+    Raises SessionError if the session or the options are wrong, or the folder holds a recording
+    already.
     """
     session = load_session(path)
     if not sys.stderr.isatty():

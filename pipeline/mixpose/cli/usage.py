@@ -25,15 +25,7 @@ _WORDINGS = (
 
 
 def usage_message(error: typer.TyperException, arguments: Sequence[str]) -> str:
-    """One line: which option, what was found, what is allowed, and where to read on.
-
-    Parameters
-    ----------
-    error : TyperException
-        What typer found wrong.
-    arguments : sequence of str
-        What was typed, to say what was found.
-    """
+    """One line: which option, what was found of what was typed, what is allowed, what to read."""
     typed = " ".join(["mixpose", *arguments[:1]]) if arguments[0][:1] != "-" else "mixpose"
     command = getattr(getattr(error, "ctx", None), "command_path", typed)
     text = _text(error, arguments).rstrip(". ")

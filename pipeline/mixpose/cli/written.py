@@ -11,10 +11,7 @@ from mixpose.whole_files import appearing_whole
 def write_text(path: Path, text: str, option: str) -> None:
     """Write a text to the file that an option names.
 
-    Raises
-    ------
-    SessionError
-        If it cannot be written.
+    Raises SessionError if it cannot be written.
     """
     try:
         with appearing_whole(path) as part:

@@ -64,16 +64,9 @@ def _is(kind: Callable[[int], bool], address: str) -> bool:
 def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
     """A capture that is released at the end; grey videos keep their depth.
 
-    Parameters
-    ----------
-    address : str or int
-        Path of a file, a pipe or a device, address of a stream (with ``://``), or index of a
-        camera.
-
-    Raises
-    ------
-    RecordingError
-        If it does not open, a stream or a pipe within `PATIENCE_S`.
+    `address` is the path of a file, a pipe or a device, the address of a stream (with ``://``), or
+    the index of a camera. Raises RecordingError if it does not open, a stream or a pipe within
+    `PATIENCE_S`.
     """
     quieten_opencv()
     with contextlib.ExitStack() as stack:
@@ -129,10 +122,7 @@ def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
 def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
     """Go to the next frame; False where there is none.
 
-    Raises
-    ------
-    SilentError
-        If a stream falls silent without ending.
+    Raises SilentError if a stream falls silent without ending.
     """
     began = time.monotonic()
     found = capture.grab()
@@ -148,13 +138,9 @@ class ColourRoom:
     """Where the coloured frames of a capture are put, one after the other.
 
     To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
-
-    Attributes
-    ----------
-    image : (H, W, 3 or 4) array or None
-        The last coloured frame; None before the first.
     """
 
+    # (H, W, 3 or 4), the last coloured frame; None before the first
     image: cv2.typing.MatLike | None = None
 
 
@@ -165,17 +151,9 @@ def retrieve(
     expected: tuple[int, int] | None,
     room: ColourRoom | None = None,
 ) -> Image:
-    """Convert the grabbed frame to grey values, (H, W).
+    """Convert the grabbed frame to grey values, (H, W); `room` is kept from frame to frame.
 
-    Parameters
-    ----------
-    room : ColourRoom or None
-        Kept from frame to frame of a capture; None: nothing is kept.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be decoded or has not the expected width and height.
+    Raises RecordingError if it cannot be decoded or has not the expected width and height.
     """
     found, image = capture.retrieve() if room is None else capture.retrieve(room.image)
     if not found or image is None:

@@ -19,17 +19,10 @@ _LONGEST_LINE = 16_000_000
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Lines and cells of a CSV file, one row at a time; blank lines are left out.
+    """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
 
-    Yields
-    ------
-    line, cells : int, list of str
-        Line in the file from 1, and its cells.  All rows have as many cells as the first one.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read as text, or a row has more or fewer cells than the first.
+    Raises RecordingError if the file cannot be read as text, or a row has more or fewer cells than
+    the first.
     """
     width = None
     try:

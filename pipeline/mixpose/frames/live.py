@@ -70,26 +70,17 @@ def live_address(source: str) -> str | int | None:
 
 @dataclass(frozen=True)
 class LiveSource:
-    """A camera or a stream, opened when its frames are asked for.
-
-    Attributes
-    ----------
-    address : str or int
-        Of a stream or a device, or the index of a camera.
-    resolution : (width, height) or None
-        Size that every frame must have, in px.
-    clock : callable or None
-        Gives the time of a frame number; None means when the frame was captured, or arrived where
-        the source does not tell, in s since the start.
-    """
+    """A camera or a stream, opened when its frames are asked for."""
 
     kind: ClassVar[SourceKind] = "live"
     ahead: ClassVar[int] = 0
     first: ClassVar[int] = 0
     length: ClassVar[None] = None
 
-    address: str | int
-    resolution: tuple[int, int] | None
+    address: str | int  # of a stream or a device, or the index of a camera
+    resolution: tuple[int, int] | None  # size that every frame must have, in px
+    # gives the time of a frame number; None means when the frame was captured, or arrived where the
+    # source does not tell, in s since the start
     clock: Clock | None
 
     def describe(self) -> str:
@@ -108,10 +99,7 @@ class LiveSource:
     ) -> Generator[RawFrame, None, None]:
         """Each time the newest frame, once there is one that has not been given yet.
 
-        Raises
-        ------
-        RecordingError
-            If the source does not open or falls silent.
+        Raises RecordingError if the source does not open or falls silent.
         """
         wanted = selection(start, stop, step, self.first)
         for frame_set in join_live({"": self}, wanted):
@@ -122,18 +110,10 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
     """The newest frames of all sources, once each has one that was not given yet.
 
     The frames of a set are those that were captured nearest to the latest moment which all have
-    reached: at most half a period apart, however long each was on its way.  A source that has
-    ended is left out of further sets, and one that is silent until it gives frames again.
-
-    Yields
-    ------
-    FrameSet
-        Numbered by the source that has given most frames.
-
-    Raises
-    ------
-    RecordingError
-        If a source does not open or falls silent.
+    reached: at most half a period apart, however long each was on its way. Sets are numbered by the
+    source that has given most frames. One that has ended is left out of further sets, and one that
+    is silent until it gives frames again. Raises RecordingError if a source does not open or falls
+    silent.
     """
     began = time.monotonic()
     with ExitStack() as stack:

@@ -27,16 +27,11 @@ class ClockRules:
 class CaptureTimes:
     """Tells from the stamps of a live source when its frames were captured.
 
-    A camera at this machine (V4L2) stamps frames by the machine's own clock.  Stamps of a stream
-    are of a clock that is off by an unknown time; as no frame arrives before it was captured, the
-    least difference seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor
-    Synchronization Problem*, IROS 2010).  Moments are then late by the shortest transmission, and
+    A camera at this machine (V4L2) stamps frames by the machine's own clock. Stamps of a stream are
+    of a clock that is off by an unknown time; as no frame arrives before it was captured, the least
+    difference seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor
+    Synchronization Problem*, IROS 2010). Moments are then late by the shortest transmission, and
     free of what others took longer.
-
-    Parameters
-    ----------
-    address : str or int
-        Of a stream or a device, or the index of a camera.
     """
 
     def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:

@@ -51,12 +51,8 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
 def open_source(spec: SourceSpec) -> Source:
     """Find the recording of a sensor and open it, without reading more than its beginning.
 
-    Raises
-    ------
-    SessionError
-        If the options of the source contradict each other, or do not fit the recording.
-    RecordingError
-        If there is no such recording or its beginning cannot be read.
+    Raises SessionError if the options of the source contradict each other, or do not fit the
+    recording. Raises RecordingError if there is no such recording or its beginning cannot be read.
     """
     clock = clock_of(spec)
     source = spec.source
@@ -80,10 +76,7 @@ def open_source(spec: SourceSpec) -> Source:
 def files_of(spec: SourceSpec) -> list[str]:
     """The files that a recording is read from, or the address of a camera or stream.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such recording.
+    Raises RecordingError if there is no such recording.
     """
     return _recognise(spec, spec.source)[1]
 

@@ -28,29 +28,15 @@ def pair(
 ) -> Generator[FrameSet, None, None]:
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
-    A number that some sources lack yields a set without them.  Of each source only a few frames
-    are in memory, more of small ones, decoded ahead in a thread of its own where that pays; the
-    threads end with this generator.
+    Numbers are those of ``range(start, stop, step)``, without `start` from the first that there is.
+    One that some sources lack yields a set without them; the time of a set is that of the first
+    sensor, in the order of `sources`, that has one. Of each source only a few frames are in memory,
+    more of small ones, decoded ahead in a thread of its own where that pays; the threads end with
+    this generator.
 
-    Parameters
-    ----------
-    sources : mapping of str to Source
-        Sources by sensor name; the order counts, see Returns.
-    start, stop, step : int
-        Numbers to read, like those of `range`.  Without `start` the first number there is.
-
-    Returns
-    -------
-    generator of FrameSet
-        The time of a set is that of the first sensor, in the order of `sources`, that has one.
-
-    Raises
-    ------
-    SessionError
-        At once, if `step` is less than 1, or live sources and recordings are mixed.
-    RecordingError
-        At once, if a table of times lacks rows for frames of that range; else in place of the
-        first set that a source cannot be read for.
+    Raises at once: SessionError if `step` is less than 1, or live sources and recordings are mixed;
+    RecordingError if a table of times lacks rows for frames of that range. What cannot be read is a
+    RecordingError in place of the first set that lacks it.
     """
     live = {sensor: source for sensor, source in sources.items() if isinstance(source, LiveSource)}
     if live and len(live) < len(sources):

@@ -22,29 +22,19 @@ from mixpose.records import GridPattern, RawFrame
 
 @dataclass(frozen=True)
 class RangeProfiles:
-    """Range profiles of one sensor, numbered from 0.
-
-    Attributes
-    ----------
-    path : Path
-        ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without
-        a header, a row per frame.
-    range_min, bin_size : float
-        Range of the first bin and distance from bin to bin, in length units.
-    clock : callable or None
-        Gives the time of a frame number.
-    bins : int
-        Number of bins in each profile.
-    """
+    """Range profiles of one sensor, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "profiles"
     ahead: ClassVar[int] = 0
 
+    # ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without a
+    # header, a row per frame
     path: Path
+    # range of the first bin and distance from bin to bin, in length units
     range_min: float
     bin_size: float
-    clock: Clock | None
-    bins: int
+    clock: Clock | None  # gives the time of a frame number
+    bins: int  # number of bins in each profile
 
     @cached_property
     def length(self) -> int:
@@ -93,12 +83,8 @@ class RangeProfiles:
 def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
     """Open a file of range profiles and learn its shape.
 
-    Raises
-    ------
-    SessionError
-        If `range_min` or `bin_size` is not given or makes no grid.
-    RecordingError
-        If the file is no array of frames x bins.
+    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid. Raises
+    RecordingError if the file is no array of frames x bins.
     """
     range_min = _option(spec, "range_min", spec.range_min)
     bin_size = _option(spec, "bin_size", spec.bin_size)

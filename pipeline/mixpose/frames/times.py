@@ -20,18 +20,10 @@ _LISTED = 5  # frame numbers that a message names
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """A table of times; called with a frame number it gives that frame's time.
+    """A table of times; called with a frame number it gives that frame's time."""
 
-    Attributes
-    ----------
-    path : Path
-        Where the table comes from; only for messages.
-    seconds : mapping of int to float
-        Times in s by frame number.
-    """
-
-    path: Path
-    seconds: Mapping[int, float]
+    path: Path  # where the table comes from; only for messages
+    seconds: Mapping[int, float]  # times in s by frame number
 
     def __call__(self, number: int) -> float:
         """Time of frame `number` in s; RecordingError where the table has none."""
@@ -45,10 +37,7 @@ class FrameTimes:
 def read_times(path: Path) -> FrameTimes:
     """Read a table with the header ``frame,time_s``, rows in any order.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be read, a cell is no finite number or a frame comes twice.
+    Raises RecordingError if it cannot be read, a cell is no finite number or a frame comes twice.
     """
     times: dict[int, float] = {}
     rows = csv_rows(path)
@@ -76,10 +65,7 @@ def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
     """Refuse a table of times that lacks a row for one of some frames.
 
-    Raises
-    ------
-    RecordingError
-        In one line: the table, which frames it lacks and what is allowed.
+    Raises RecordingError in one line: the table, which frames it lacks and what is allowed.
     """
     missing = untimed(clock, numbers)
     if not missing:
@@ -96,12 +82,8 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 def clock_of(spec: SourceSpec) -> Clock | None:
     """What gives the frames of a source their times; None where the session does not say.
 
-    Raises
-    ------
-    SessionError
-        If both `times` and `fps` are given, or `fps` is no positive number.
-    RecordingError
-        If the table of times cannot be read.
+    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number. Raises
+    RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:
         raise SessionError(f"sensor {spec.sensor!r}: found times and fps, only one is allowed")

@@ -17,20 +17,10 @@ COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 class BopWriter:
     """Writes one row per frame that has a pose; lost frames are left out.
 
-    R (row by row) and t (mm) are those of `T_world_object`.  The toolkit takes them for object to
-    camera: give it estimates that are relative to one (`estimates.relative_to`).  `time` is how
-    long the estimate took in seconds, as BOP has it, or -1 where that was not measured.  BOP
-    numbers its objects: the first name that occurs is `obj_id`, the next one more.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-    scene_id : int
-        Written into every row.
-    obj_id : int
-        Number of the first object.
+    R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
+    camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
+    the estimate took in seconds, as BOP has it, or -1 where that was not measured. BOP numbers its
+    objects: the first name that occurs is `obj_id`, the next one more.
     """
 
     def __init__(

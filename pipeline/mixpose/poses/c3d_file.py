@@ -23,26 +23,12 @@ _SCALE_AT = 12  # byte of the header where the scale stands
 
 
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:
-    """Write trajectories in mm.
+    """Write trajectories in mm, and tell whether frame n of mixpose is frame n + 1 there.
 
-    A measured point has its residual, and the bits of the sensors that measured it, of the first
-    seven; one by the pose has the residual 0 and no bit, as C3D has it for points that are
-    computed; one that is not known the residual -1.  Frame n of mixpose is frame n + 1.
-
-    Parameters
-    ----------
-    path : Path
-    trajectories : Trajectories
-
-    Returns
-    -------
-    bool
-        Whether frames are numbered so; else they begin at 1, as their numbers are too large.
-
-    Raises
-    ------
-    RecordingError
-        If there are more frames than a file can number.
+    Where numbers are too large for that, frames begin at 1. A measured point has its residual, and
+    the bits of the sensors that measured it, of the first seven; one by the pose has the residual 0
+    and no bit, as C3D has it for points that are computed; one that is not known the residual -1.
+    Raises RecordingError if there are more frames than a file can number.
     """
     import ezc3d  # noqa: PLC0415 - not everybody has it
 

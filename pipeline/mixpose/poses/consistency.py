@@ -15,21 +15,13 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether the covariances tell the truth, over "ok" frames that have one.
-
-    Attributes
-    ----------
-    frames : int
-    nees_per_dimension : float
-        Mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they
-        promise too much.
-    inside_95 : float
-        Share of frames whose truth lies inside the 95 % ellipsoid.
-    """
+    """Whether the covariances tell the truth, over "ok" frames that have one."""
 
     frames: int
+    # mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they promise
+    # too much
     nees_per_dimension: float
-    inside_95: float
+    inside_95: float  # share of frames whose truth lies inside the 95 % ellipsoid
 
 
 def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
@@ -46,22 +38,11 @@ def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
 
 
 def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
-    """Mahalanobis distance squared of an error, and its number of dimensions.
+    """Mahalanobis distance squared of an error (6,), and its dimensions: the rank of the
+    covariance.
 
     Only directions that the covariance leaves free count: an axis that is held at the start pose
-    has no variance, and its error no measure.
-
-    Parameters
-    ----------
-    twist : (6,) array
-    covariance : (6, 6) array
-
-    Returns
-    -------
-    nees : float or None
-        None if the covariance leaves no direction free.
-    dimensions : int
-        Rank of the covariance.
+    has no variance, and its error no measure. None where it leaves none free.
     """
     variance = np.diag(covariance)
     kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)

@@ -19,19 +19,12 @@ _LEFT = 0.1  # of the errors, at most, for a constant transform to explain them
 
 @dataclass(frozen=True)
 class ConstantOffset:
-    """A transform that takes all poses near to the truth.
+    """A transform that takes all poses near to the truth."""
 
-    Attributes
-    ----------
-    of : {"object", "world"}
-        Whether it stands right of the poses, ``T_truth = T_pose T``, or left of them.
-    T : (4, 4) float64
-    rotation_deg, translation : float
-        RMS errors that are left with it.
-    """
-
+    # whether it stands right of the poses, ``T_truth = T_pose T``, or left of them
     of: Literal["object", "world"]
-    T: Floats
+    T: Floats  # (4, 4)
+    # RMS errors that are left with it
     rotation_deg: float
     translation: float
 
@@ -52,12 +45,9 @@ class ConstantOffset:
 
 
 def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | None:
-    """The transform, where one explains most of the errors.
+    """The transform that explains most of the errors of poses with their truths, where one does.
 
-    Parameters
-    ----------
-    pairs : sequence of ((4, 4) array, (4, 4) array)
-        A pose and its truth.  Bodies that hardly move tell nothing.
+    Bodies that hardly move tell nothing.
     """
     if len(pairs) < _FEWEST:
         return None

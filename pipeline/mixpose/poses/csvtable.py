@@ -32,14 +32,8 @@ class CsvWriter:
     Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
     behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
     covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; confidence; score;
-    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor; latency_ms.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-        Its `sensors` give the sensor columns; where there are none, the first frame does.
+    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor, which the header
+    names or else the first frame; latency_ms.
     """
 
     def __init__(self, stream: TextIO, header: Header) -> None:
@@ -54,10 +48,7 @@ class CsvWriter:
     def write(self, estimate: Estimate) -> None:
         """Write the row of one frame and flush it.
 
-        Raises
-        ------
-        ValueError
-            If the frame reports on a sensor that has no columns.
+        Raises ValueError if the frame reports on a sensor that has no columns.
         """
         require_finite(estimate)
         if self._sensors is None:

@@ -30,11 +30,8 @@ def pose_of(estimate: Estimate) -> Floats | None:
 def require_finite(estimate: Estimate) -> None:
     """Refuse an estimate that holds a NaN or an infinity.
 
-    Raises
-    ------
-    ValueError
-        Naming frame and field.  No format has a place for such values, and an estimate that
-        holds one is a fault of the program, not of its user.
+    Raises ValueError naming frame and field.  No format has a place for such values, and an
+    estimate that holds one is a fault of the program, not of its user.
     """
     values: dict[str, Floats | float | None] = {
         "time_s": estimate.time_s,

@@ -29,36 +29,24 @@ _LARGEST = 1e100  # squares of larger lengths would overflow
 
 @dataclass(frozen=True)
 class PoseLine:
-    """A pose line as read; the fields are those of `mixpose.records.Estimate`.
+    """A pose line as read; the fields are those of `mixpose.records.Estimate`."""
 
-    Attributes
-    ----------
-    line : int
-        Where it stands in the file, from 1.
-    score : float or None
-        None where the line has none.
-    tip : (3,) float64 or None
-        Where the body's tip is in the world.
-    filled : bool
-        Whether nothing was measured in this frame.
-    """
-
-    line: int
+    line: int  # where it stands in the file, from 1
     frame: int
     time_s: float | None
     object: str
     status: Status
     T_world_object: Floats | None
     covariance: Floats | None
-    score: float | None
+    score: float | None  # None where the line has none
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...]
     latency_ms: float | None
     instance: int | None = None
     confidence: float | None = None
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
-    tip: Floats | None = None
-    filled: bool = False
+    tip: Floats | None = None  # (3,), where the body's tip is in the world
+    filled: bool = False  # whether nothing was measured in this frame
 
     @property
     def label(self) -> str:
@@ -130,19 +118,9 @@ _Checked = TypeVar("_Checked", bound=_Line)
 
 
 def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
-    """Check the JSON object of a pose line.
+    """Check the JSON object of a pose line, `where` being ``file:line`` for messages.
 
-    Parameters
-    ----------
-    values : mapping
-    where : str
-        ``file:line``, for messages.
-    line : int
-        Number of the line, from 1.
-
-    Raises
-    ------
-    RecordingError
+    Raises RecordingError.
     """
     pose = _checked(_Pose, values, where)
     matrix = pose.T_world_object
@@ -193,9 +171,7 @@ def _report(sensor: _Sensor) -> SensorReport:
 def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:
     """Check the JSON object of a header line and return its unit and symmetries.
 
-    Raises
-    ------
-    RecordingError
+    Raises RecordingError.
     """
     header = _checked(_Header, values, where)
     if header.format != FORMAT:

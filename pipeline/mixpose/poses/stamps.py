@@ -10,14 +10,8 @@ from mixpose.records import Estimate
 
 
 class Stamps:
-    """The time of each pose; the frame number where the recording has no times.
-
-    Parameters
-    ----------
-    stream : text stream
-        Gets a comment line, which readers skip, where frame numbers stand for times.
-    format_name : str
-        For messages.
+    """The time of each pose; where the recording has none the frame number, as a comment line
+    says.
     """
 
     def __init__(self, stream: TextIO, format_name: str) -> None:
@@ -27,10 +21,7 @@ class Stamps:
     def time_of(self, estimate: Estimate) -> float:
         """Time in s, or the frame number.
 
-        Raises
-        ------
-        RecordingError
-            If some frames have a time and others have none.
+        Raises RecordingError if some frames have a time and others have none.
         """
         has_time = estimate.time_s is not None
         if self._has_times is None:

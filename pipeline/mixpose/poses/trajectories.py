@@ -14,33 +14,16 @@ from mixpose.records import Floats, Mask
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """N markers over F frames of successive numbers.
+    """N markers over F frames of successive numbers."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        N, all different.
-    places : (F, N, 3) float64
-        In the world; NaN where a marker is not known.
-    residuals : (F, N) float64
-        Of places that sensors measured, a length; NaN of those that are not, or by the pose.
-    by_sensor : (F, N, L) bool
-        Which sensors measured it.
-    first : int
-        Number of the first frame.
-    rate : float
-        Frames per second.
-    unit : str
-        Of lengths.
-    """
-
-    names: tuple[str, ...]
-    places: Floats
+    names: tuple[str, ...]  # N, all different
+    places: Floats  # (F, N, 3), in the world; NaN where a marker is not known
+    # (F, N), of places that sensors measured, a length; NaN of those that are not, or by the pose
     residuals: Floats
-    by_sensor: Mask
-    first: int
-    rate: float
-    unit: str
+    by_sensor: Mask  # (F, N, L), which sensors measured it
+    first: int  # number of the first frame
+    rate: float  # frames per second
+    unit: str  # of lengths
 
     @property
     def is_known(self) -> Mask:
@@ -56,12 +39,8 @@ class Trajectories:
 def rate_of(lines: Sequence[PoseLine]) -> tuple[float, float] | None:
     """Frames per second by the times of pose lines, and how far off the times are, in frames.
 
-    None where lines have no times, or all are of one frame.
-
-    Raises
-    ------
-    RecordingError
-        If times do not ascend with the frames.
+    None where lines have no times, or all are of one frame. Raises RecordingError if times do not
+    ascend with the frames.
     """
     times = {line.frame: line.time_s for line in lines if line.time_s is not None}
     if len(times) < 2:

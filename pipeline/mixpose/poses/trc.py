@@ -21,14 +21,7 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """Write trajectories in mm; the format cannot say which places sensors measured.
 
     What is not known is NaN: an empty cell would shift the row where readers split at any space.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open.
-    trajectories : Trajectories
-    called : str
-        Name of the file, which stands in its first line.
+    The name `called` of the file stands in its first line.
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space

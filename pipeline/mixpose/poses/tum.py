@@ -15,17 +15,7 @@ from mixpose.records import Estimate
 
 
 class TumWriter:
-    """Writes one line per frame that has a pose; lost frames are left out.
-
-    A trajectory needs a time in every line.  Where the recording has none, the frame number
-    stands in its place and a comment line, which readers skip, says so.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-    """
+    """Writes one line per frame that has a pose; lost frames are left out."""
 
     def __init__(self, stream: TextIO, header: Header) -> None:
         self._stream = stream
@@ -35,10 +25,7 @@ class TumWriter:
     def write(self, estimate: Estimate) -> None:
         """Write the line of one frame and flush it.
 
-        Raises
-        ------
-        RecordingError
-            If some frames have a time and others have none.
+        Raises RecordingError if some frames have a time and others have none.
         """
         require_finite(estimate)
         T = pose_of(estimate)

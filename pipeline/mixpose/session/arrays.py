@@ -36,25 +36,11 @@ def limits(value: object) -> str:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
-    """Read nested lists of numbers.
+    """Read nested lists of numbers as a float64 array; a problem points at the first that does not
+    fit.
 
-    Parameters
-    ----------
-    value : object
-        What the file holds.
-    shape : tuple of int or None
-        Length of the list at each depth; None for any length but zero.
-    allowed : str
-        What to tell the user is allowed.
-
-    Returns
-    -------
-    float64 array of that shape
-
-    Raises
-    ------
-    BadKeyError
-        Pointing at the first entry that does not fit.
+    `shape` has the length of the list at each depth, None for any length but zero; `allowed` is
+    what to tell the user.
     """
     if not shape:
         if not is_number(value):
@@ -75,12 +61,7 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
 
 
 def resolution(value: Any) -> tuple[int, int]:
-    """Read the width and height of an image in px.
-
-    Raises
-    ------
-    BadKeyError
-    """
+    """Read the width and height of an image in px."""
     match value:
         case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
             if 0 < width <= _WIDEST and 0 < height <= _WIDEST:

@@ -27,19 +27,8 @@ _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
-    Parameters
-    ----------
-    table : ObjectTable
-    folder : Path
-        What the marker file's path is relative to.
-    unit : {"m", "cm", "mm", "um"}
-        Of the session, into which lengths of other programs' files are converted.
-
-    Raises
-    ------
-    BadKeyError
-        If there are fewer than three features, some are repeated, or spread or normals do not fit
-        them.
+    The marker file's path is relative to `folder`; lengths of other programs' files are converted
+    into `unit`. There must be three features or more, none repeated, that spread and normals fit.
     """
     markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points
@@ -171,25 +160,11 @@ def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
 
 
 def covariances(sigma: Any, count: int) -> Floats:
-    """Read the key ``sigma`` as one covariance per feature.
+    """Read the key ``sigma`` as one covariance per feature, (N, 3, 3).
 
-    Where three features leave it open, a list of three numbers is [sx, sy, sz] for all of them,
-    and three lists of three numbers are a covariance for all of them.
-
-    Parameters
-    ----------
-    sigma : object
-        A number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature.
-    count : int
-        N.
-
-    Returns
-    -------
-    (N, 3, 3) float64 array
-
-    Raises
-    ------
-    BadKeyError
+    It is a number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature. Where
+    three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and three
+    lists of three numbers are a covariance for all of them.
     """
     if _is_single(sigma):
         _check_ambiguous(sigma, count)

@@ -24,40 +24,23 @@ LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
 
 @dataclass(frozen=True)
 class Markers:
-    """What a marker table holds.
+    """What a marker table holds."""
 
-    Attributes
-    ----------
-    points : (N, 3) float64
-    sigma : list or None
-        Per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them;
-        None where the table has no such columns.
-    names : tuple of str
-        Of the markers, where the file has names.
-    normals : (N, 3) float64 or None
-        Outward directions of flat markers, where the file has them.
-    """
-
-    points: Floats
+    points: Floats  # (N, 3)
+    # per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them; None
+    # where the table has no such columns
     sigma: list[Any] | None
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  # of the markers, where the file has names
+    # (N, 3), outward directions of flat markers, where the file has them
     normals: Floats | None = None
 
 
 def read_markers(path: Path) -> Markers:
-    """Read a marker table.
+    """Read a marker table; problems name line and column.
 
-    Parameters
-    ----------
-    path : Path
-        CSV with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along x, y
-        and z) or nine (the covariance, row by row).  The columns in which ``mixpose learn``
-        says how well markers are known may stand there, too.
-
-    Raises
-    ------
-    BadKeyError
-        Naming line and column.
+    It is a CSV file with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along
+    x, y and z) or nine (the covariance, row by row). The columns in which ``mixpose learn`` says
+    how well markers are known may stand there, too.
     """
     content = read_bytes(path)
     with in_file(path.name):

@@ -23,10 +23,8 @@ _NO_TEXT = tuple(
 def read_bytes(path: Path) -> bytes:
     """Read a file.
 
-    Raises
-    ------
-    BadKeyError
-        If there is no such file, it is larger than any session needs, or it cannot be read.
+    Raises BadKeyError if there is no such file, it is larger than any session needs, or it cannot
+    be read.
     """
     try:
         is_other = path.exists() and not path.is_file()
@@ -48,10 +46,7 @@ def read_bytes(path: Path) -> bytes:
 def as_text(content: bytes) -> str:
     """Decode UTF-8, with or without the mark that some editors put in front.
 
-    Raises
-    ------
-    BadKeyError
-        Naming what it is in place of text, or the line that is not UTF-8.
+    Raises BadKeyError naming what it is in place of text, or the line that is not UTF-8.
     """
     kind = next((name for start, name in _NO_TEXT if start.match(content)), None)
     if kind is not None:

@@ -17,13 +17,7 @@ _OTHER_QUOTES = re.compile("[“”„‘’«»]")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML.
-
-    Raises
-    ------
-    BadKeyError
-        In one line, with what is most likely meant.
-    """
+    """Parse TOML. Raises BadKeyError in one line, with what is most likely meant."""
     try:
         return tomllib.loads(text)
     except ValueError as error:  # of TOML, or a number of thousands of digits

@@ -29,11 +29,8 @@ class _Place:
 def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
     """Check parsed TOML against the table of the whole file.
 
-    Raises
-    ------
-    BadKeyError
-        The first finding, an unknown key before any other: a misspelt key often is the reason
-        why another is missing.
+    Raises BadKeyError the first finding, an unknown key before any other: a misspelt key often is
+    the reason why another is missing.
     """
     try:
         return root.model_validate(data)

@@ -23,37 +23,21 @@ Group: TypeAlias = Sequence[Content]
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """A camera of a calibration file.
-
-    Attributes
-    ----------
-    name : str
-    intrinsics : Intrinsics
-    T_camera_rig : (4, 4) float64 or None
-        Maps coordinates that all cameras of the file share to those of the camera; None where
-        the file does not say.
-    unit : {"m", "cm", "mm", "um"} or None
-        Of the translation; None where the format leaves that to whoever wrote the file.
-    note : str
-        What a person should know of it; mostly empty.
-    """
+    """A camera of a calibration file."""
 
     name: str
     intrinsics: Intrinsics
+    # (4, 4), maps coordinates that all cameras of the file share to those of the camera; None where
+    # the file does not say
     T_camera_rig: Floats | None = None
+    # of the translation; None where the format leaves that to whoever wrote the file
     unit: Unit | None = None
-    note: str = ""
+    note: str = ""  # what a person should know of it; mostly empty
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras of files that belong together, and so of one world.
-
-    Attributes
-    ----------
-    files : tuple of str
-    cameras : tuple of CalibratedCamera
-    """
+    """Cameras of files that belong together, and so of one world."""
 
     files: tuple[str, ...]
     cameras: tuple[CalibratedCamera, ...]
@@ -66,42 +50,21 @@ class Rig:
 
 @dataclass(frozen=True)
 class Format:
-    """A format of calibration files.
+    """A format of calibration files."""
 
-    Attributes
-    ----------
-    name : str
-        With its article, as in "this is a Kalibr file".
-    shown : str
-        For the list of what is allowed.
-    recognises : callable
-        Whether a file is in this format.
-    names : callable
-        Names of the cameras in files that belong together.
-    read : callable
-        One of them.  The session's model helps where the files do not state one.
-    groups : callable or None
-        Files that belong together; None for formats whose files stand alone.
-    holds_several : bool
-        Whether one file can hold several cameras.
-    """
-
-    name: str
-    shown: str
-    recognises: Callable[[Content], bool]
-    names: Callable[[Group], list[str]]
+    name: str  # with its article, as in "this is a Kalibr file"
+    shown: str  # for the list of what is allowed
+    recognises: Callable[[Content], bool]  # whether a file is in this format
+    names: Callable[[Group], list[str]]  # names of the cameras in files that belong together
+    # One of them.  The session's model helps where the files do not state one.
     read: Callable[[Group, str, CameraModel], CalibratedCamera]
+    # files that belong together; None for formats whose files stand alone
     groups: Callable[[Group], list[Group]] | None = None
-    holds_several: bool = True
+    holds_several: bool = True  # whether one file can hold several cameras
 
 
 def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floats:
-    """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists.
-
-    Raises
-    ------
-    BadKeyError
-    """
+    """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists."""
     with under("translation"):
         t = numbers(_flat(translation), (3,), "[x, y, z]")
     if isinstance(rotation, list) and rotation and isinstance(rotation[0], list | tuple):
@@ -121,10 +84,7 @@ def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floa
 def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) -> Floats:
     """A rigid motion (4, 4) of a quaternion, real part first, and a translation.
 
-    Raises
-    ------
-    BadKeyError
-        If the quaternion has no length.
+    Raises BadKeyError if the quaternion has no length.
     """
     w, x, y, z = wxyz
     if not 0.5 < np.linalg.norm(wxyz) < 2:

@@ -20,16 +20,9 @@ _NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
 
 @dataclass(frozen=True)
 class Content:
-    """A calibration file.
+    """A calibration file."""
 
-    Attributes
-    ----------
-    name : str
-        As the user wrote it.
-    text : str
-    """
-
-    name: str
+    name: str  # as the user wrote it
     text: str
 
     @property
@@ -45,10 +38,7 @@ class Content:
     def parsed(self) -> Any:
         """What the text says as JSON or YAML.
 
-        Raises
-        ------
-        BadKeyError
-            If it is neither; by its name's ending, why it is no TOML or JSON.
+        Raises BadKeyError if it is neither; by its name's ending, why it is no TOML or JSON.
         """
         no_json = ""
         if self.text.lstrip().startswith("{"):
@@ -87,13 +77,7 @@ class Content:
 
 
 def read_content(path: Path, name: str) -> Content:
-    """Read a calibration file.
-
-    Raises
-    ------
-    BadKeyError
-        If it is missing or no text.
-    """
+    """Read a calibration file. Raises BadKeyError if it is missing or no text."""
     content = read_bytes(path)
     with in_file(name):
         if content.startswith(_NO_TEXT):

@@ -160,10 +160,8 @@ def read_nodes(
 ) -> CalibratedCamera:
     """Read the camera whose nodes the user names.
 
-    Raises
-    ------
-    BadKeyError
-        If the text cannot be parsed, or a node is missing or is no camera matrix or distortion.
+    Raises BadKeyError if the text cannot be parsed, or a node is missing or is no camera matrix or
+    distortion.
     """
     intrinsics = _intrinsics(_open([content]), model, matrix, distortion_name)
     return CalibratedCamera(content.stem, intrinsics)

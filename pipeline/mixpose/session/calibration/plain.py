@@ -22,15 +22,7 @@ MODELS: dict[str, CameraModel] = {
 def model_of_distortion(name: object) -> CameraModel | None:
     """The camera model that a distortion model of Kalibr or ROS belongs to.
 
-    Returns
-    -------
-    {"pinhole", "fisheye"} or None
-        None for the empty name, which ROS writes for a camera without distortion.
-
-    Raises
-    ------
-    BadKeyError
-        If mixpose has no such model.
+    None for the empty name, which ROS writes for a camera without distortion.
     """
     if name is None or name == "":
         return None

@@ -24,12 +24,7 @@ def is_camera(table: Any) -> bool:
 def read_table(
     table: dict[str, Any], name: str, group: Group, unit: Unit | None
 ) -> CalibratedCamera:
-    """Read the table of a camera.
-
-    Raises
-    ------
-    BadKeyError
-    """
+    """Read the table of a camera."""
     fisheye = table.get("fisheye", False)
     if not isinstance(fisheye, bool):
         raise BadKeyError(found(fisheye, "true or false"), "fisheye")

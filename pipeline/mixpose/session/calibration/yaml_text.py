@@ -12,12 +12,7 @@ _OPENCV_HEAD = re.compile(r"\A\s*%YAML:?[ \d.]*[^\n]*\n(---[^\n]*\n)?")
 
 
 def parse_yaml(text: str) -> Any:
-    """Parse the first document of a YAML text.
-
-    Raises
-    ------
-    BadKeyError
-    """
+    """Parse the first document of a YAML text."""
     import yaml  # noqa: PLC0415  # only sessions with such a calibration need it
 
     if len(text) > MOST_YAML_CHARACTERS:

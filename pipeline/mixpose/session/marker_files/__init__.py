@@ -28,17 +28,8 @@ _ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterT
 
 
 def read_marker_file(path: Path, unit: Unit) -> Markers:
-    """Read the body of another program, or a table of markers.
-
-    Parameters
-    ----------
-    path : Path
-    unit : {"m", "cm", "mm", "um"}
-        That lengths are wanted in; those of a table are in it already.
-
-    Raises
-    ------
-    BadKeyError
+    """Read the body of another program, or a table of markers, whose lengths are in `unit`
+    already.
     """
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml", ".json", ".xml", ".stl"):

@@ -16,13 +16,7 @@ from mixpose.session.text_files import as_text
 
 
 def read_astertrack(content: bytes) -> Markers:
-    """Read the flat markers of an AsterTrack target.
-
-    Raises
-    ------
-    BadKeyError
-        Naming the line.
-    """
+    """Read the flat markers of an AsterTrack target. Raises BadKeyError naming the line."""
     vertices: list[list[float]] = []
     faces: list[tuple[str, int, list[int]]] = []
     group = ""

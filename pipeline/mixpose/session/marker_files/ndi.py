@@ -21,10 +21,7 @@ _MOST = 20
 def read_rom(content: bytes) -> Markers:
     """Read the markers of an NDI tool.
 
-    Raises
-    ------
-    BadKeyError
-        If the file is none, is cut short, or has changed since it was written.
+    Raises BadKeyError if the file is none, is cut short, or has changed since it was written.
     """
     if not content.startswith(NDI_MARK):
         raise BadKeyError('not an NDI .rom file, which begins with "NDI"')

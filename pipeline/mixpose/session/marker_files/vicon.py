@@ -19,10 +19,7 @@ _TARGET = "TargetLocalPointToWorldPoint"
 def read_vsk(content: bytes) -> Markers:
     """Read the markers of a Vicon subject that is one rigid body.
 
-    Raises
-    ------
-    BadKeyError
-        If the file is no such XML, is a skeleton, or lacks a parameter.
+    Raises BadKeyError if the file is no such XML, is a skeleton, or lacks a parameter.
     """
     text = as_text(content)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
