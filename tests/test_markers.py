@@ -255,7 +255,7 @@ def trajectories(frames: int, markers: int = 2, first: int = 0) -> Trajectories:
 
 def test_lengths_are_in_mm_and_a_small_residual_is_still_one(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
-    from mixpose.poses.c3d_file import write_c3d
+    from mixpose.poses.trajectories import write_c3d
 
     mixed = trajectories(3)
     mixed.residuals[1, 0] = 2.0  # so large that 0.01 mm would be rounded to nothing beside it
@@ -268,7 +268,7 @@ def test_lengths_are_in_mm_and_a_small_residual_is_still_one(tmp_path: Path) -> 
 
 def test_frames_whose_numbers_are_too_large_begin_at_one(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
-    from mixpose.poses.c3d_file import LAST_FRAME, write_c3d
+    from mixpose.poses.trajectories import LAST_FRAME, write_c3d
 
     path = tmp_path / "a.c3d"
     assert write_c3d(path, trajectories(10, first=LAST_FRAME - 10))
@@ -296,7 +296,7 @@ def test_own_files_are_replaced_and_others_are_kept(
 def test_a_file_of_very_many_markers_is_known_as_own(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
     from mixpose.cli.output import refuse_to_overwrite_but
-    from mixpose.poses.c3d_file import write_c3d
+    from mixpose.poses.trajectories import write_c3d
 
     write_c3d(tmp_path / "a.c3d", trajectories(2, 250))
     refuse_to_overwrite_but(tmp_path / "a.c3d", [], "mixpose")

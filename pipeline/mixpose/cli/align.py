@@ -16,7 +16,6 @@ from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.cli.run import named_sources
 from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
 from mixpose.runner import run
@@ -72,7 +71,7 @@ def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate
         lines = [line for line in poses.poses if line.status == "ok"]
         if not lines:
             raise RecordingError(f"--floor {words}: found no pose that is ok")
-        return [estimate_of(line) for line in lines]
+        return list(lines)
     label, at, frame = words.rpartition("@")
     if not at or label not in session.labels or not frame.isdecimal():
         raise SessionError(

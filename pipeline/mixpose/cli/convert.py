@@ -25,7 +25,6 @@ from mixpose.cli.request import SUFFIXES
 from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import (
-    estimate_of,
     first_answers,
     header_of,
     objects_of,
@@ -124,7 +123,7 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
         output = _output(stack, name, header, labels, options, request.output)
         stack.enter_context(output)
         for line in lines:
-            output.write(relative_to(T_sensor_world, estimate_of(line)))
+            output.write(relative_to(T_sensor_world, line))
 
 
 def _output(

@@ -19,7 +19,6 @@ from mixpose.pictures.plots import require_matplotlib
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, prefixes_of
 from mixpose.pictures.signature import refuse_foreign, write_png
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.runner import clouds_of, observe, open_sources, scene_of
@@ -111,7 +110,7 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
             f"--poses {path}: lengths are in {file.unit}, those of the session in {session.unit}; "
             "give poses of this session"
         )
-    found = []
+    found: list[Estimate] = []
     for label in session.labels:
         own = [pose for pose in file.poses if pose.label == label]
         if not own:
@@ -127,7 +126,7 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
                 f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to "
                 f"{max(numbers)}"
             )
-        found.append(estimate_of(of_frame[0]))
+        found.append(of_frame[0])
     return found
 
 

@@ -13,11 +13,9 @@ from mixpose.body import Body
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
-from mixpose.poses.c3d_file import write_c3d
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, rate_of
-from mixpose.poses.trc import write_trc
+from mixpose.poses.trajectories import Trajectories, rate_of, write_c3d, write_trc
 from mixpose.rigid import transform
 from mixpose.session import Session
 from mixpose.whole_files import appearing_whole

@@ -12,9 +12,10 @@ from typing import TextIO, cast
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.errors import SessionError
-from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY, PoseWriter
+from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
+from mixpose.poses.writing import PoseWriter
 from mixpose.records import Estimate
 
 _FIRST_WORDS = (

@@ -18,7 +18,6 @@ import numpy as np
 
 from mixpose.errors import RecordingError
 from mixpose.frames.containers import container_of
-from mixpose.frames.quiet import quieten_opencv
 from mixpose.records import Image
 
 # How long a stream may take to open, and then to deliver its next frame.
@@ -177,3 +176,17 @@ def retrieve(
 def name_of(address: str | int) -> str:
     """What people call a source of frames."""
     return f"camera:{address}" if isinstance(address, int) else address
+
+
+def quieten_opencv() -> None:
+    """Turn off the messages of OpenCV and of its FFmpeg backend.
+
+    A recording that cannot be read is one line on standard error, written by mixpose; the
+    decoders' own account of the same fault would surround it with dozens more.  Whoever set
+    ``OPENCV_LOG_LEVEL`` or ``OPENCV_FFMPEG_LOGLEVEL`` wants to see it and keeps it.
+
+    FFmpeg's level counts only before the first video is opened, so call this before that.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

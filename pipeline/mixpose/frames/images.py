@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.quiet import quieten_opencv
+from mixpose.frames.capture import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
 from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS

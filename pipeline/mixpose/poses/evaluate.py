@@ -28,12 +28,17 @@ import numpy as np
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.consistency import Consistency, consistency, normalised_error_squared
-from mixpose.poses.constant_offset import ConstantOffset, constant_offset
+from mixpose.poses.consistency import (
+    Consistency,
+    ConstantOffset,
+    consistency,
+    constant_offset,
+    normalised_error_squared,
+)
+from mixpose.poses.estimates import in_unit
 from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.units import in_unit
 from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5

@@ -15,40 +15,31 @@ from mixpose import rigid
 from mixpose.errors import RecordingError, SessionError
 from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
-from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
+from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
 from mixpose.records import Estimate, Floats, Label, MeasuredPoint
 
 _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
 
 
-class JsonlWriter:
+class JsonlWriter(PoseWriter):
     """Writes a header line, unless a run goes on in a file that has it, and a line per frame.
 
     Lines are ASCII (other characters are escaped), so that the bytes depend on no locale.
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
-        self._stream = stream
+        super().__init__(stream, header)
         if not resume:
             self._write_line(header_line(header))
+            self._stream.flush()
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the line of one frame and flush it.
-
-        Raises ValueError if the estimate holds a value that is not finite.
-        """
-        require_finite(estimate)
+    def _write(self, estimate: Estimate) -> None:
         self._write_line(pose_line(estimate))
-
-    def close(self) -> None:
-        """Flush; the stream stays open."""
-        self._stream.flush()
 
     def _write_line(self, line: Mapping[str, Any]) -> None:
         # One call for the whole line: an interruption rarely leaves half of it.
         self._stream.write(json.dumps(line, allow_nan=False) + "\n")
-        self._stream.flush()
 
 
 def header_line(header: Header) -> dict[str, Any]:
@@ -90,7 +81,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         "quaternion_xyzw": plain_or_none(turn),
         "covariance": plain_or_none(covariance),
         "confidence": plain_or_none(estimate.confidence),
-        "score": plain(estimate.score),
+        "score": plain(1.0 if estimate.score is None else estimate.score),
         "sensors": {
             name: {
                 "used": bool(report.used),
@@ -110,7 +101,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
             }
             for rival in estimate.hypotheses
         ],
-        "latency_ms": plain(estimate.latency_ms),
+        "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
         **({"filled": True} if estimate.filled else {}),
     }

@@ -8,7 +8,7 @@ from dataclasses import replace
 from types import TracebackType
 
 from mixpose.poses.header import Header
-from mixpose.poses.plain import require_finite
+from mixpose.poses.writing import require_finite
 from mixpose.publishing.address import parse
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.channel import Channel

@@ -17,7 +17,6 @@ from scipy.special import chdtri
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.trajectories.choices import NONE, Alternatives, Choice, choices
@@ -116,11 +115,11 @@ def smooth_body(
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
-        whole = tuple(estimate_of(line) for line in ordered)
+        whole = tuple(ordered)
         return SmoothedBody(whole, None, 0, 0, 0, (), times is not None)
     model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
     segments = _segments(ordered, at, posed, fill_s, rules)
-    done: dict[int, Estimate] = {line.frame: estimate_of(line) for line in ordered}
+    done: dict[int, Estimate] = {line.frame: line for line in ordered}
     counts = [0, 0, 0]
     refused: list[int] = []
     for segment in segments:
@@ -330,7 +329,7 @@ def _estimate(
     rules: SmoothingRules,
 ) -> Estimate:
     """The estimate of a line at its smoothed pose."""
-    one = replace(estimate_of(line), T_world_object=T, covariance=covariance)
+    one = replace(line, T_world_object=T, covariance=covariance)
     if choice is None:
         if is_met:
             return one

@@ -42,11 +42,13 @@ def _turned(line: PoseLine, before: Floats, symmetries: Floats) -> PoseLine:
     assert T is not None
     S = _nearest(T, before, symmetries)
     arm, C = T[:3, :3] @ S[:3, 3], line.covariance
+    tip = line.tip_object
     rivals = [each.T_world_object for each in line.hypotheses]
     return replace(
         line,
         T_world_object=T @ S,
         covariance=None if C is None else rigid.covariance_at(C, arm),
+        tip_object=None if tip is None else S[:3, :3].T @ (tip - S[:3, 3]),
         hypotheses=tuple(
             replace(each, T_world_object=rival @ _nearest(rival, before, symmetries))
             for each, rival in zip(line.hypotheses, rivals, strict=True)

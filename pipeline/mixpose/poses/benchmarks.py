@@ -1,5 +1,8 @@
-"""BOP result tables: ``scene_id,im_id,obj_id,score,R,t,time``; the BOP toolkit opens them.
+"""Poses as benchmarks have them: TUM trajectories and BOP result tables.
 
+TUM: ``time tx ty tz qx qy qz qw``, metres; `evo` opens them,
+https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+BOP: ``scene_id,im_id,obj_id,score,R,t,time``; the BOP toolkit opens them,
 https://bop.felk.cvut.cz/challenges/bop-challenge-2020/#howtoparticipate
 """
 
@@ -7,14 +10,32 @@ from __future__ import annotations
 
 from typing import TextIO
 
+from mixpose import rigid
 from mixpose.poses.header import UNITS_PER_METRE, Header
-from mixpose.poses.plain import plain, pose_of, require_finite
+from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate
 
-COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
+BOP_COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 
-class BopWriter:
+class TumWriter(PoseWriter):
+    """Writes one line per frame that has a pose; lost frames are left out."""
+
+    def __init__(self, stream: TextIO, header: Header) -> None:
+        super().__init__(stream, header)
+        self._stamps = Stamps(stream, "tum")
+
+    def _write(self, estimate: Estimate) -> None:
+        T = pose_of(estimate)
+        if T is None:
+            return
+        time = self._stamps.time_of(estimate)
+        position = plain(T[:3, 3] / UNITS_PER_METRE[self._header.unit])
+        turn = plain(rigid.quaternion_xyzw(T))
+        self._stream.write(" ".join(repr(value) for value in [time, *position, *turn]) + "\n")
+
+
+class BopWriter(PoseWriter):
     """Writes one row per frame that has a pose; lost frames are left out.
 
     R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
@@ -26,36 +47,30 @@ class BopWriter:
     def __init__(
         self, stream: TextIO, header: Header, *, scene_id: int = 0, obj_id: int = 1
     ) -> None:
-        self._stream = stream
+        super().__init__(stream, header)
         self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
         self._scene_id = scene_id
         self._first_obj_id = obj_id
         self._obj_ids: dict[str, int] = {}
-        self._stream.write(COLUMNS + "\n")
+        self._stream.write(BOP_COLUMNS + "\n")
         self._stream.flush()
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the row of one frame and flush it."""
-        require_finite(estimate)
+    def _write(self, estimate: Estimate) -> None:
         obj_id = self._obj_ids.setdefault(estimate.object, self._first_obj_id + len(self._obj_ids))
         T = pose_of(estimate)
         if T is None:
             return
         R = plain(T[:3, :3].ravel())
         t_mm = plain(T[:3, 3] * self._mm_per_unit)
-        seconds = estimate.latency_ms / 1000.0 if estimate.latency_ms > 0 else -1.0
+        latency_ms = estimate.latency_ms or 0.0
+        seconds = latency_ms / 1000.0 if latency_ms > 0 else -1.0
         cells = (
             str(self._scene_id),
             str(estimate.frame),
             str(obj_id),
-            repr(plain(estimate.score)),
+            repr(plain(1.0 if estimate.score is None else estimate.score)),
             " ".join(map(repr, R)),
             " ".join(map(repr, t_mm)),
             repr(plain(seconds)),
         )
         self._stream.write(",".join(cells) + "\n")
-        self._stream.flush()
-
-    def close(self) -> None:
-        """Flush; the stream stays open."""
-        self._stream.flush()
