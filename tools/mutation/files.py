@@ -142,7 +142,7 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-equidistant-is-pinhole",
-        "session/calibration/plain.py",
+        "session/calibration/camera.py",
         '"equidistant": "fisheye"',
         '"equidistant": "pinhole"',
         "a fisheye calibration is used for a pinhole camera",

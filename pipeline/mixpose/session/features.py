@@ -11,13 +11,12 @@ from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.body.features import SEGMENT_NODES
 from mixpose.limits import MOST_FEATURES
 from mixpose.records import Floats
-from mixpose.session.arrays import is_number, numbers
 from mixpose.session.marker_files import read_marker_file
 from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, is_number, numbers
 
 FEWEST_FEATURES = 3
 

@@ -8,8 +8,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.arrays import numbers
 from mixpose.session.messages import BadKeyError, found
+from mixpose.session.values import numbers
 
 CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.arrays import is_number
 from mixpose.session.messages import BadKeyError, found, in_file
 from mixpose.session.text_files import as_text, read_bytes
+from mixpose.session.values import is_number
 
 _HEADER = ["name", "x", "y", "z"]
 _SIGMA_COLUMNS = (0, 1, 3, 9)

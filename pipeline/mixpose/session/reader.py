@@ -19,8 +19,7 @@ from mixpose.session.motion import read_motion
 from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
 from mixpose.session.setup import ObjectSetup, Session, Start
-from mixpose.session.text_files import as_text, read_bytes
-from mixpose.session.toml_text import parse_toml
+from mixpose.session.text_files import as_text, parse_toml, read_bytes
 from mixpose.session.validation import validate
 
 _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mixpose.session.calibration.aniposelib import ANIPOSELIB
-from mixpose.session.calibration.caliscope import CALISCOPE
+from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Rig
 from mixpose.session.calibration.colmap import COLMAP
 from mixpose.session.calibration.content import Content, read_content
@@ -14,7 +13,7 @@ from mixpose.session.calibration.kalibr import KALIBR
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
 from mixpose.session.calibration.pycalib import PYCALIB
 from mixpose.session.calibration.ros import ROS
-from mixpose.session.calibration.ros_ini import ROS_INI
+from mixpose.session.calibration.ros import ROS_INI
 from mixpose.session.intrinsics import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable

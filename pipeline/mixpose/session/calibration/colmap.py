@@ -13,17 +13,17 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.arrays import LARGEST
 from mixpose.session.calibration.camera import (
     CalibratedCamera,
     Format,
     Group,
     motion_of_quaternion,
+    size_of,
 )
 from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.values import LARGEST
 
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer

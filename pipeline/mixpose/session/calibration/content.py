@@ -9,10 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mixpose.session.calibration.yaml_text import parse_yaml
 from mixpose.session.messages import BadKeyError, in_file
-from mixpose.session.text_files import as_text, read_bytes
-from mixpose.session.toml_text import parse_toml
+from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_bytes
 
 # how a NumPy array, an archive of them, and a pickle of Python begin
 _NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")

@@ -12,13 +12,20 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.arrays import numbers
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
+from mixpose.session.calibration.camera import (
+    CalibratedCamera,
+    Format,
+    Group,
+    model_of_distortion,
+    plain,
+    present,
+    size_of,
+)
 from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import model_of_distortion, plain, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid
+from mixpose.session.values import numbers
 
 _MATRIX = "a 4x4 matrix, four rows of four numbers"
 
