@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mixpose.body import Body, PointFeature
-from mixpose.cli import main, markers
+from mixpose.cli import main, session_formats
 from mixpose.density import Observation
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -224,7 +224,9 @@ def line(frame: int, *, time_s: float | None = None, name: str = "tracker") -> P
 
 def test_frames_that_are_not_there_are_gaps(session: Session) -> None:
     lines = tuple(line(frame, time_s=frame / 50) for frame in (3, 4, 7))
-    found = markers.trajectories_of(PoseFile(Path("p"), {}, lines), lines, session, measured=False)
+    found = session_formats.trajectories_of(
+        PoseFile(Path("p"), {}, lines), lines, session, measured=False
+    )
     assert found.first == 3
     assert found.rate == pytest.approx(50)
     np.testing.assert_array_equal(
@@ -337,7 +339,7 @@ def test_the_extra_to_install_is_named(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(markers, "find_spec", lambda name: None)
+    monkeypatch.setattr(session_formats, "find_spec", lambda name: None)
     assert convert(poses, "-o", tmp_path / "a.c3d") == 2
     assert "python -m pip install 'mixpose[c3d]'" in last_error(capfd)
     assert not (tmp_path / "a.c3d").exists()

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mixpose import __version__, rigid
+from mixpose.cli.app_after import AlignRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.output import refuse_to_overwrite_but, write_text
 from mixpose.cli.run import named_sources
-from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
@@ -28,22 +27,13 @@ MARK = "# Aligned by mixpose"
 _ALL = 17  # digits: the frame is as exact as float64
 
 
-@dataclass(frozen=True)
-class AlignRequest:
-    """The options of ``mixpose align``."""
-
-    floor: tuple[str, ...]  # files of poses, or bodies in frames of the recording, ``OBJECT@FRAME``
-    output: Path
-    up: Axis
-    sources: tuple[str, ...]  # ``NAME=PATH``
-
-
-def align_session(path: Path, request: AlignRequest) -> None:
+def align_session(request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
     Raises SessionError if the session or the options are wrong, or directions of the world are
     held in it. Raises RecordingError if the poses tell no floor.
     """
+    path = request.session
     session = load_session(path)
     if len(session.estimator.free) < len(rigid.TWIST_NAMES):
         raise SessionError(
@@ -52,7 +42,8 @@ def align_session(path: Path, request: AlignRequest) -> None:
         )
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
-    estimates = [one for each in request.floor for one in _told(each, session, request.sources)]
+    sources = request.source or ()
+    estimates = [one for each in request.floor for one in _told(each, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
     _tell(session, floor, request.up)

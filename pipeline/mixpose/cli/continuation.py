@@ -119,7 +119,9 @@ def _continued(
 ) -> Continuation:
     file.rewind(reached.size, reached.checksum)
     after = _after(wanted, reached.frame)
-    if not _has_frames(opened, after):
+    with closing(pair(opened, after.start, after.stop, after.step)) as frames:
+        is_done = next(frames, None) is None
+    if is_done:
         return Continuation(file, after, is_done=True)
     note = _note(poses, header.mixpose)
     if note is not None:
@@ -141,11 +143,6 @@ def _after(wanted: Selection, last: int) -> Selection:
     elif wanted.step > 1:
         begin = last + wanted.step
     return replace(wanted, start=begin)
-
-
-def _has_frames(opened: dict[str, Source], wanted: Selection) -> bool:
-    with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
-        return next(frames, None) is not None
 
 
 def _note(poses: Path, version: str) -> Note | None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mixpose.body import Body
+from mixpose.cli.app import InspectRequest
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
@@ -26,27 +27,19 @@ from mixpose.session import Session, load_session
 from mixpose.tracking import with_clouds
 
 
-def inspect_frame(
-    path: Path,
-    number: int | None,
-    folder: Path,
-    *,
-    poses: Path | None,
-    sources: Sequence[str],
-    allow_code: bool = False,
-) -> None:
-    """Write pictures of one frame, else of the first, into a folder and print what was found in
-    it.
+def inspect_frame(request: InspectRequest) -> None:
+    """Write pictures of one frame into a folder and print what was found in it.
 
-    `poses` of a run stand in place of estimating this frame on its own, `sources` (``NAME=PATH``)
-    in place of the session's. Raises SessionError if the session or an option is wrong, or the
-    folder holds other people's files, and RecordingError if the recording or the poses cannot be
-    read.
+    Poses of a run may stand in place of estimating this frame on its own. Raises SessionError if
+    the session or an option is wrong, or the folder holds other people's files, and RecordingError
+    if the recording or the poses cannot be read.
     """
-    session = load_session(path, allow_code=allow_code)
+    folder, poses = request.output, request.poses
+    session = load_session(request.session, allow_code=request.allow_code)
     require_matplotlib()
     _check_folder(folder, session)
-    frame_set = _frame(open_sources(session, named_sources(sources)), number)
+    opened = open_sources(session, named_sources(request.source or ()))
+    frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
     scene = scene_of(session)

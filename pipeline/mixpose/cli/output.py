@@ -1,4 +1,4 @@
-"""Where poses are written: to a stream, or to a file that is never something else."""
+"""Where poses and texts are written: to a stream, or to a file that is never something else."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
 from mixpose.poses.writing import PoseWriter
 from mixpose.records import Estimate
+from mixpose.whole_files import appearing_whole
 
 _FIRST_WORDS = (
     *('{"type": "header"', "frame,time_s,object", "scene_id,im_id"),
@@ -86,7 +87,7 @@ class Output:
         return self._writer
 
 
-class OutputPerBody:
+class OutputPerBody(ExitStack):
     """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
 
     ``poses.tum`` stands for ``poses.<body>.tum``, whose output `start` makes. Raises SessionError
@@ -102,25 +103,15 @@ class OutputPerBody:
         labels: Sequence[str],
         start: Callable[[Path], Output],
     ) -> None:
+        super().__init__()
         if path is None:
             raise SessionError(
                 f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
                 "with -o: each body gets one with its own name in it"
             )
-        self._outputs = {label: start(body_path(path, label)) for label in labels}
-
-    def __enter__(self) -> OutputPerBody:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with ExitStack() as stack:
-            for output in self._outputs.values():
-                stack.callback(output.__exit__, kind, error, trace)
+        self._outputs = {
+            label: self.enter_context(start(body_path(path, label))) for label in labels
+        }
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame of one body, at once."""
@@ -202,3 +193,15 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def write_text(path: Path, text: str, option: str) -> None:
+    """Write a text to the file that an option names.
+
+    Raises SessionError if it cannot be written.
+    """
+    try:
+        with appearing_whole(path) as part:
+            part.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error

@@ -137,7 +137,7 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
             outcome = _put_in_place(part, job, outcome)
     except OSError as error:
         reason = f"{error.filename or part}: cannot be written: {error.strerror}"
-        outcome = replace(_outcome(job, FAILED, 2), reason=reason)
+        outcome = replace(outcome_of(job, FAILED, 2), reason=reason)
     finally:
         if job.shared:
             shutil.rmtree(part, ignore_errors=True)
@@ -159,7 +159,7 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
     outcome = replace(
-        _outcome(job, state, 128 - status if status < 0 else status),
+        outcome_of(job, state, 128 - status if status < 0 else status),
         frames=_frames(lines),
         warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
         reason=None
@@ -206,11 +206,12 @@ def _not_shared(job: Job) -> Outcome | None:
                     f"{path}: not there on worker {socket.gethostname()}; sessions, recordings and "
                     "-o must lie in a folder that all workers see under the same name"
                 )
-            return replace(_outcome(job, FAILED, 2), reason=reason)
+            return replace(outcome_of(job, FAILED, 2), reason=reason)
     return None
 
 
-def _outcome(job: Job, state: str, exit_status: int) -> Outcome:
+def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
+    """How a job ended on this machine."""
     return Outcome(
         name=job.name,
         session=job.session,

@@ -15,7 +15,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from mixpose.cli.recording_job import (
     Outcome,
     Running,
     finished,
+    outcome_of,
     run_job,
 )
 from mixpose.cli.request import SUFFIXES, RunRequest
@@ -147,10 +148,7 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-    return Outcome(
-        job.name, job.session, job.session_sha256, job.options, job.mixpose, FAILED, 3,
-        reason=reason,
-    )  # fmt: skip
+    return replace(outcome_of(job, FAILED, 3), reason=reason, host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:

@@ -1,4 +1,7 @@
-"""Wrong options and arguments in one line, worded as every other error of mixpose."""
+"""What was typed: options whose value may be left out, and what is wrong, in one line.
+
+The line is worded as every other error of mixpose.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,10 @@ _WORDINGS = (
     (r"No such command '(.*)'\. Did you mean (.*)\?", r"\1: no such command; did you mean \2?"),
     (r"No such command '(.*)'\.?", r"\1: no such command"),
 )
+
+_ADDRESS = re.compile(r"(.*:)?\d+")
+OPTIONAL = {"--view": _ADDRESS}
+"""What a value of each looks like; anything else after it is the next argument."""
 
 
 def usage_message(error: typer.TyperException, arguments: Sequence[str]) -> str:
@@ -64,3 +71,14 @@ def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
         if option in names:
             return value if equals else next(iter(arguments[i + 1 : i + 2]), None)
     return None
+
+
+def with_values(arguments: Sequence[str]) -> list[str]:
+    """Arguments in which each of these options has a value, an empty one where none was given."""
+    given: list[str] = []
+    for k, argument in enumerate(arguments):
+        pattern = OPTIONAL.get(argument)
+        following = arguments[k + 1] if k + 1 < len(arguments) else ""
+        has_value = pattern is None or pattern.fullmatch(following) is not None
+        given.append(argument if has_value else f"{argument}=")
+    return given

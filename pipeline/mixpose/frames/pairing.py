@@ -69,7 +69,12 @@ def pair(
 
 def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, None, None]:
     with ExitStack() as stack:
-        streams = {sensor: _stream(source, wanted) for sensor, source in sources.items()}
+        streams = {}
+        for sensor, source in sources.items():
+            frames_of = source.frames(wanted.start, wanted.stop, wanted.step)
+            if source.ahead:
+                frames_of = prefetch(frames_of, source.ahead, _more_ahead)
+            streams[sensor] = frames_of
         for stream in streams.values():
             stack.callback(stream.close)
         heads = {sensor: next(stream, None) for sensor, stream in streams.items()}
@@ -80,24 +85,16 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
                 for sensor, head in heads.items()
                 if head is not None and head.number == number
             }
-            yield FrameSet(number, _time(frames), frames)
+            times = (frame.time_s for frame in frames.values() if frame.time_s is not None)
+            yield FrameSet(number, next(times, None), frames)
             for sensor in frames:
                 heads[sensor] = next(streams[sensor], None)
-
-
-def _stream(source: Source, wanted: range) -> Generator[RawFrame, None, None]:
-    frames = source.frames(wanted.start, wanted.stop, wanted.step)
-    return prefetch(frames, source.ahead, _more_ahead) if source.ahead else frames
 
 
 def _more_ahead(frame: RawFrame) -> int:
     """How many more frames like this one are worth keeping ready: small ones, for slow poses."""
     size = frame.data.nbytes if isinstance(frame.data, np.ndarray) else READY_BYTES
     return min(MOST_MORE, READY_BYTES // max(size, 1))
-
-
-def _time(frames: Mapping[str, RawFrame]) -> float | None:
-    return next((frame.time_s for frame in frames.values() if frame.time_s is not None), None)
 
 
 def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:

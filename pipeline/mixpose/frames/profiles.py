@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.csv_rows import csv_rows, finite
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, require_times
+from mixpose.frames.times import Clock, csv_rows, finite, require_times
 from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
@@ -130,7 +129,8 @@ def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # NumPy reads the header as Python, which fails in many ways
         raise RecordingError(f"{path}: not a .npy file or cut short") from error
-    if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or not _are_counts(shape):
+    are_counts = all(type(count) is int and count > 0 for count in shape)
+    if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or not are_counts:
         order = " by columns" if by_columns else ""
         raise RecordingError(
             f"{path}: found {dtype} of shape {shape}{order}, allowed are numbers in the shape "
@@ -142,10 +142,6 @@ def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
         raise RecordingError(f"{path}: cut short: profile 0 is not whole")
     rows = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(min(held, promised), bins))
     return rows, promised, bins
-
-
-def _are_counts(shape: Sequence[Any]) -> bool:
-    return all(type(count) is int and count > 0 for count in shape)
 
 
 def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:

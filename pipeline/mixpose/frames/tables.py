@@ -15,9 +15,8 @@ from typing import ClassVar, NoReturn, TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.csv_rows import csv_rows, finite, header, whole
 from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, FrameTimes, require_times
+from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, require_times, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 

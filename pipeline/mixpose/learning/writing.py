@@ -7,7 +7,7 @@ import io
 
 from mixpose.learning.adjusting import Learnt
 from mixpose.learning.telling import digits_of
-from mixpose.session.markers import LEARNT_COLUMNS
+from mixpose.session.marker_files import LEARNT_COLUMNS
 
 MARK = ",".join(LEARNT_COLUMNS)
 """By which mixpose knows the tables that it wrote."""

@@ -11,8 +11,7 @@ from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.body.features import SEGMENT_NODES
 from mixpose.limits import MOST_FEATURES
 from mixpose.records import Floats
-from mixpose.session.marker_files import read_marker_file
-from mixpose.session.markers import Markers
+from mixpose.session.marker_files import Markers, read_marker_file
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
 from mixpose.session.setup import Unit
@@ -34,20 +33,18 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
     nodes = len(points) + SEGMENT_NODES * len(segments)
+    given = "file" if table.file is not None else "points"
     if nodes > MOST_FEATURES:
         raise BadKeyError(
             f"found {len(points)} points and {len(segments)} segments; allowed: {MOST_FEATURES} "
             f"together, a segment counting as {SEGMENT_NODES}",
-            "file" if table.file is not None else "points",
+            given,
         )
     if count < FEWEST_FEATURES:
-        key = "file" if table.file is not None else "points"
-        if table.segments is not None:
-            key = "segments"
         raise BadKeyError(
             f"found {count} feature{'s' * (count != 1)}; allowed: at least three points and "
             "segments together",
-            key,
+            given if table.segments is None else "segments",
         )
     for i, (start, end) in enumerate(segments):
         if np.array_equal(start, end):
@@ -59,15 +56,15 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
         raise BadKeyError(
             f"found {count} features at {places} place{'s' * (places != 1)}; allowed: at least "
             "three features at places of their own",
-            "file" if table.file is not None else "points",
+            given,
         )
     spreads = _spreads(table, markers, count)
     kind = table.spread
     features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
-    normals = _normals(_stated_normals(table, markers, count), count)
-    _refuse_repeated(points, spreads, normals, "file" if table.file is not None else "points")
+    normals = _normals(table, markers, count)
+    _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
     gravity, names = _gravity(table), _names(markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
@@ -237,15 +234,11 @@ def _positive(covariance: Floats) -> Floats:
     return covariance
 
 
-def _stated_normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
-    """Those of the session, else those of the marker file where it has all features."""
-    if table.normals is not None or markers is None or markers.normals is None:
-        return table.normals
-    return markers.normals if len(markers.normals) == count else None
-
-
-def _normals(normals: Floats | None, count: int) -> Floats | None:
-    """Unit normals (N, 3)."""
+def _normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+    """Unit normals (N, 3), else those of the marker file where it has all features."""
+    normals = table.normals
+    if normals is None and markers is not None and markers.normals is not None:
+        normals = markers.normals if len(markers.normals) == count else None
     if normals is None:
         return None
     if len(normals) != count:

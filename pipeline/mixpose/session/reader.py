@@ -161,13 +161,4 @@ def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> Estimat
             "[start]; add one with the pose they are held at, or leave free out to estimate all",
             "free",
         )
-    return EstimatorOptions(
-        table.objective,
-        table.free,
-        table.samples,
-        table.seed,
-        table.fuse,
-        table.search,
-        table.confidence,
-        table.mirrors,
-    )
+    return EstimatorOptions(**dict(table))

@@ -119,7 +119,9 @@ def _build_sensor(
                 table.pixel_size, table.principal_point, resolution, _T_sensor_world(table)
             )
         case LaterationTable():
-            _check_profile(table)
+            if (table.range_min is None) != (table.bin_size is None):
+                missing = "range_min" if table.range_min is None else "bin_size"
+                raise BadKeyError("missing; a profile needs range_min and bin_size", missing)
             # the far end of a profile is known only when its bins are counted
             sensor = RangeSensor(table.position, table.range_bias)
         case CloudTable():
@@ -244,9 +246,3 @@ def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
 def _T_sensor_world(table: PlacedTable | CloudTable) -> Floats:
     T = read_motion(table, "T_sensor_world")
     return np.eye(4) if T is None else T
-
-
-def _check_profile(table: LaterationTable) -> None:
-    if (table.range_min is None) != (table.bin_size is None):
-        missing = "range_min" if table.range_min is None else "bin_size"
-        raise BadKeyError("missing; a profile needs range_min and bin_size", missing)

@@ -8,7 +8,7 @@ from pathlib import Path
 from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Rig
 from mixpose.session.calibration.colmap import COLMAP
-from mixpose.session.calibration.content import Content, read_content
+from mixpose.session.calibration.camera import Content, read_content
 from mixpose.session.calibration.kalibr import KALIBR
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
 from mixpose.session.calibration.pycalib import PYCALIB

@@ -1,9 +1,13 @@
-"""What a calibration file says of a camera, how formats are registered, and how values are read."""
+"""A calibration file, what it says of a camera, and how a format of such files is registered."""
 
 from __future__ import annotations
 
+import json
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics
-from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.messages import BadKeyError, found, in_file, one_of, under
 from mixpose.session.motion import rigid
 from mixpose.session.setup import Unit
+from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_bytes
 from mixpose.session.values import numbers, resolution
 
-Group: TypeAlias = Sequence[Content]
+Group: TypeAlias = "Sequence[Content]"
 
 # Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
 MODELS: dict[str, CameraModel] = {
@@ -29,6 +33,9 @@ MODELS: dict[str, CameraModel] = {
     "equidistant": "fisheye",
     "fisheye": "fisheye",
 }
+
+# how a NumPy array, an archive of them, and a pickle of Python begin
+_NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
 
 
 @dataclass(frozen=True)
@@ -143,3 +150,73 @@ def plain(value: Any) -> Any:
 def size_of(value: Any) -> tuple[int, int] | None:
     """Width and height; None where they are missing or, as some drivers write, zero."""
     return None if value in (None, [0, 0]) else resolution(value)
+
+
+@dataclass(frozen=True)
+class Content:
+    """A calibration file."""
+
+    name: str  # as the user wrote it
+    text: str
+
+    @property
+    def stem(self) -> str:
+        """The file's name without folder and ending."""
+        return Path(self.name).stem
+
+    @cached_property
+    def lines(self) -> list[str]:
+        """Lines of the text without blanks around them."""
+        return [line.strip() for line in self.text.splitlines()]
+
+    def parsed(self) -> Any:
+        """What the text says as JSON or YAML.
+
+        Raises BadKeyError if it is neither; by its name's ending, why it is no TOML or JSON.
+        """
+        no_json = ""
+        if self.text.lstrip().startswith("{"):
+            try:
+                return json.loads(self.text)
+            except (ValueError, RecursionError) as error:
+                no_json = f"not JSON: {error}"  # YAML allows braces too
+        try:
+            return parse_yaml(self.text)
+        except BadKeyError:
+            ending = Path(self.name).suffix.lower()
+            if ending == ".toml":
+                parse_toml(self.text)
+            if ending == ".json" and no_json:
+                raise BadKeyError(no_json) from None
+            raise
+
+    @cached_property
+    def mapping(self) -> dict[Any, Any]:
+        """Keys and values of JSON or YAML; empty where it is neither, or OpenCV's own dialect."""
+        if "opencv-matrix" in self.text or self.text.lstrip().startswith("<"):
+            return {}
+        try:
+            content = self.parsed()
+        except BadKeyError:
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    @cached_property
+    def toml(self) -> dict[str, Any]:
+        """Tables of TOML; empty where it is none."""
+        try:
+            return tomllib.loads(self.text)
+        except (ValueError, RecursionError):
+            return {}
+
+
+def read_content(path: Path, name: str) -> Content:
+    """Read a calibration file. Raises BadKeyError if it is missing or no text."""
+    content = read_bytes(path)
+    with in_file(name):
+        if content.startswith(_NO_TEXT):
+            raise BadKeyError(
+                "a NumPy or pickle file; write camera matrix and distortion with cv2.FileStorage, "
+                "or as numbers into camera_matrix and distortion in place of calibration"
+            )
+        return Content(name, as_text(content))

@@ -22,12 +22,12 @@ from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.session.calibration.camera import (
     CalibratedCamera,
+    Content,
     Format,
     Group,
     model_of_distortion,
     motion_of,
 )
-from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid

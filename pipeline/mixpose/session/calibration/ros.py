@@ -10,6 +10,7 @@ from typing import Any
 from mixpose.session.calibration.camera import (
     MODELS,
     CalibratedCamera,
+    Content,
     Format,
     Group,
     model_of_distortion,
@@ -17,15 +18,10 @@ from mixpose.session.calibration.camera import (
     present,
     size_of,
 )
-from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, one_of, under
 
 _INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")
-
-
-def _recognises(content: Content) -> bool:
-    return bool({"camera_matrix", "K", "k"} & set(map(str, content.mapping)))
 
 
 def _names(group: Group) -> list[str]:
@@ -86,10 +82,6 @@ def _matrix_data(value: Any) -> Any:
     return plain(value.get("data") if isinstance(value, dict) else value)
 
 
-def _is_ini(content: Content) -> bool:
-    return "[image]" in content.lines and "camera matrix" in content.lines
-
-
 def _ini_names(group: Group) -> list[str]:
     headings = [line[1:-1] for line in group[0].lines if line.startswith("[") and line[-1] == "]"]
     return [next((name for name in headings if name and name != "image"), group[0].stem)]
@@ -137,17 +129,17 @@ def _integer(values: dict[str, list[float]], word: str) -> int | float | None:
 ROS = Format(
     "a ROS file",
     "ROS camera_info (camera_matrix ...)",
-    _recognises,
-    _names,
-    _read,
+    recognises=lambda content: bool({"camera_matrix", "K", "k"} & set(map(str, content.mapping))),
+    names=_names,
+    read=_read,
     holds_several=False,
 )
 
 ROS_INI = Format(
     "a ROS INI file",
     "the same as INI ([image] ... camera matrix)",
-    _is_ini,
-    _ini_names,
-    _read_ini,
+    recognises=lambda content: {"[image]", "camera matrix"} <= set(content.lines),
+    names=_ini_names,
+    read=_read_ini,
     holds_several=False,
 )

@@ -12,13 +12,13 @@ from typing import Any, TypeAlias
 
 from mixpose.session.calibration.camera import (
     CalibratedCamera,
+    Content,
     Format,
     Group,
     motion_of,
     present,
     size_of,
 )
-from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.session.setup import Unit
