@@ -13,7 +13,6 @@ from pose_lines import covariance_of, lines_of, write_poses
 import mixpose as package
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.estimates import estimate_of
 from mixpose.records import Estimate, Floats
 from mixpose.trajectories.floor import floor_of
 
@@ -49,7 +48,7 @@ position = [100, -200, 50]
 
 
 def estimates_at(poses: Floats, names: list[str] | None = None) -> list[Estimate]:
-    lines = [estimate_of(line) for line in lines_of(poses, covariance_of(0.01, 1e-4))]
+    lines: list[Estimate] = [*lines_of(poses, covariance_of(0.01, 1e-4))]
     if names is None:
         return lines
     return [replace(one, object=name, frame=0) for one, name in zip(lines, names, strict=True)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import command, mixpose
 
-from mixpose.cli.watching import watched
+from mixpose.cli.notices import watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.session import load_session
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.frames import SourceSpec, open_source, pair
-from mixpose.frames.moments import CaptureTimes
+from mixpose.frames.live import CaptureTimes
 
 FRAMES = 300
 

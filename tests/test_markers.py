@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mixpose.body import Body, PointFeature
-from mixpose.cli import main, markers
+from mixpose.cli import main, session_formats
 from mixpose.density import Observation
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -224,7 +224,9 @@ def line(frame: int, *, time_s: float | None = None, name: str = "tracker") -> P
 
 def test_frames_that_are_not_there_are_gaps(session: Session) -> None:
     lines = tuple(line(frame, time_s=frame / 50) for frame in (3, 4, 7))
-    found = markers.trajectories_of(PoseFile(Path("p"), {}, lines), lines, session, measured=False)
+    found = session_formats.trajectories_of(
+        PoseFile(Path("p"), {}, lines), lines, session, measured=False
+    )
     assert found.first == 3
     assert found.rate == pytest.approx(50)
     np.testing.assert_array_equal(
@@ -255,7 +257,7 @@ def trajectories(frames: int, markers: int = 2, first: int = 0) -> Trajectories:
 
 def test_lengths_are_in_mm_and_a_small_residual_is_still_one(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
-    from mixpose.poses.c3d_file import write_c3d
+    from mixpose.poses.trajectories import write_c3d
 
     mixed = trajectories(3)
     mixed.residuals[1, 0] = 2.0  # so large that 0.01 mm would be rounded to nothing beside it
@@ -268,7 +270,7 @@ def test_lengths_are_in_mm_and_a_small_residual_is_still_one(tmp_path: Path) -> 
 
 def test_frames_whose_numbers_are_too_large_begin_at_one(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
-    from mixpose.poses.c3d_file import LAST_FRAME, write_c3d
+    from mixpose.poses.trajectories import LAST_FRAME, write_c3d
 
     path = tmp_path / "a.c3d"
     assert write_c3d(path, trajectories(10, first=LAST_FRAME - 10))
@@ -296,7 +298,7 @@ def test_own_files_are_replaced_and_others_are_kept(
 def test_a_file_of_very_many_markers_is_known_as_own(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
     from mixpose.cli.output import refuse_to_overwrite_but
-    from mixpose.poses.c3d_file import write_c3d
+    from mixpose.poses.trajectories import write_c3d
 
     write_c3d(tmp_path / "a.c3d", trajectories(2, 250))
     refuse_to_overwrite_but(tmp_path / "a.c3d", [], "mixpose")
@@ -337,7 +339,7 @@ def test_the_extra_to_install_is_named(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(markers, "find_spec", lambda name: None)
+    monkeypatch.setattr(session_formats, "find_spec", lambda name: None)
     assert convert(poses, "-o", tmp_path / "a.c3d") == 2
     assert "python -m pip install 'mixpose[c3d]'" in last_error(capfd)
     assert not (tmp_path / "a.c3d").exists()

@@ -14,7 +14,6 @@ from pose_lines import covariance_of, lines_of, measured, write_poses
 import mixpose as package
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.estimates import estimate_of
 from mixpose.records import Floats
 from mixpose.trajectories.pivot import Pivoting, find_tip, fixed_in, fixed_in_world
 
@@ -135,7 +134,7 @@ def test_a_tip_is_written_into_the_session_and_told_with_each_pose(tmp_path: Pat
 def test_the_covariance_of_a_tip_is_that_of_drawn_poses() -> None:
     covariance = covariance_of(0.1, 0.002)
     (line,) = lines_of(about_its_tip(turning(3), np.repeat(POINT[None], 3, 0))[1:2], covariance)
-    one = replace(estimate_of(line), tip_object=TIP)
+    one = replace(line, tip_object=TIP)
     drawn = measured(np.repeat(one.T_world_object[None], 20_000, 0), covariance)  # type: ignore[index]
     tips = rigid.transform(drawn, TIP[None])[:, 0]
     # of 20,000 draws 1 %, and turns of 0.1 degrees are straight to 1e-3
@@ -147,9 +146,7 @@ def test_the_covariance_of_a_tip_is_that_of_drawn_poses() -> None:
 def test_options_that_name_nothing_are_refused(tmp_path: Path) -> None:
     pivoting = run_of(1)
     path = tmp_path / "poses.jsonl"
-    write_poses(
-        path, [estimate_of(line) for line in lines_of(pivoting.poses, pivoting.covariances[0])]
-    )
+    write_poses(path, lines_of(pivoting.poses, pivoting.covariances[0]))
     done = mixpose("pivot", path, "--reference", "base")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "--reference base" in done.stderr

@@ -30,7 +30,9 @@ def line(
     rivals: tuple[Floats, ...] = (),
 ) -> PoseLine:
     hypotheses = tuple(Hypothesis(T_rival, 1.0 / len(rivals)) for T_rival in rivals)
-    return PoseLine(frame + 2, frame, None, name, status, T, covariance, 1.0, {}, hypotheses, None)
+    return PoseLine(
+        *(frame, None, name, status, T, covariance, 1.0, {}, hypotheses, None), line=frame + 2
+    )
 
 
 def file_of(

@@ -22,7 +22,7 @@ NOISE_MM = 0.01
 
 def file_of(poses: list[Floats], covariance: Floats | None = None) -> PoseFile:
     lines = tuple(
-        PoseLine(n + 2, n, None, "tool", "ok", T, covariance, 1.0, {}, (), None)
+        PoseLine(n, None, "tool", "ok", T, covariance, 1.0, {}, (), None, line=n + 2)
         for n, T in enumerate(poses)
     )
     return PoseFile(Path("some.jsonl"), {}, lines, "mm", {})

@@ -159,7 +159,7 @@ def test_what_a_recording_needs_is_told(
 def test_missing_package_is_told_with_what_to_install(
     poses: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("mixpose.cli.rerun.find_spec", lambda _: None)
+    monkeypatch.setattr("mixpose.cli.session_formats.find_spec", lambda _: None)
     assert convert(poses, "-o", tmp_path / "x.rrd") == 2
     assert "python -m pip install 'mixpose[rerun]'" in capfd.readouterr().err
 

@@ -11,8 +11,7 @@ import pytest
 from session_lines import message_of, with_lines
 
 from mixpose.records import Floats
-from mixpose.session.marker_files import read_marker_file
-from mixpose.session.markers import Markers
+from mixpose.session.marker_files import Markers, read_marker_file
 from mixpose.session.messages import BadKeyError
 
 POINTS = np.array([[0, 0, 0], [0, 30, 40], [0, 0, 90], [10, -45, 40.0]])

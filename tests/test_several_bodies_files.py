@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from mixpose import rigid
-from mixpose.cli.convert import ConvertRequest, convert_poses
+from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.convert import convert_poses
 from mixpose.errors import SessionError
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.formats import FORMATS
@@ -56,10 +57,6 @@ def estimate(frame: int, body: tuple[str, int | None], x: float, status: Status 
 
 def three_bodies(frames: int) -> list[Estimate]:
     return [estimate(f, body, 100.0 * k) for f in range(frames) for k, body in enumerate(BODIES)]
-
-
-def request_for(output: Path) -> ConvertRequest:
-    return ConvertRequest(output, None, None, None, False, None, None, None, None, ())
 
 
 def written(name: str, estimates: list[Estimate]) -> str:
@@ -142,12 +139,12 @@ def test_a_run_goes_on_after_the_last_frame_that_has_all_bodies(tmp_path: Path) 
 
 def test_a_trajectory_of_each_body_goes_to_a_file_of_its_own(tmp_path: Path) -> None:
     file = file_of(tmp_path, "poses.jsonl", three_bodies(2))
-    convert_poses(file.path, request_for(tmp_path / "out.tum"))
+    convert_poses(ConvertRequest(file.path, tmp_path / "out.tum"))
     found = {path.name for path in tmp_path.glob("*.tum")}
     assert found == {"out.tool.tum", "out.rod-0.tum", "out.rod-1.tum"}
     last = (tmp_path / "out.rod-1.tum").read_text().splitlines()[-1]
     assert last == "1.0 0.2 0.0 0.0 0.0 0.0 0.0 1.0"
-    convert_poses(file.path, replace(request_for(tmp_path / "one.tum"), object="rod-0"))
+    convert_poses(ConvertRequest(file.path, tmp_path / "one.tum", object="rod-0"))
     assert (tmp_path / "one.tum").read_text().splitlines()[1].startswith("0.0 0.1 ")
 
 

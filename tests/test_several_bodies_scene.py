@@ -19,7 +19,6 @@ import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import SharedDensities, View, matched_objective, together
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -35,14 +34,7 @@ RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 
 def test_a_recording_of_two_different_and_two_identical_bodies() -> None:
     session = mixpose.load_session(RECORDING / "session.toml")
-    lines = []
-    for k, one in enumerate(mixpose.run(session)):
-        lines.append(
-            PoseLine(
-                *(k, one.frame, one.time_s, one.object, one.status, one.T_world_object),
-                *(one.covariance, one.score, one.sensors, one.hypotheses, None, one.instance),
-            )
-        )
+    lines = [PoseLine(**vars(one)) for one in mixpose.run(session)]
     found = evaluate(
         PoseFile(Path("poses"), {}, tuple(lines), "mm"), read_poses(RECORDING / "truth.jsonl")
     )
@@ -336,5 +328,5 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
 
 
 def test_an_estimate_is_the_same_line_by_line() -> None:
-    line = PoseLine(1, 0, None, "rod", "ok", np.eye(4), None, 1.0, {}, (), None, 2)
-    assert estimate_of(line).label == "rod-2"
+    line = PoseLine(0, None, "rod", "ok", np.eye(4), None, 1.0, {}, (), None, 2, line=1)
+    assert line.label == "rod-2"

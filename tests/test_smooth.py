@@ -24,7 +24,6 @@ from pose_lines import (
 import mixpose as package
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import read_poses
 from mixpose.poses.poseline import PoseLine
@@ -328,7 +327,7 @@ def test_poses_of_two_cameras_err_by_at_most_0_7_of_what_they_did(
 def test_the_command_writes_all_bodies_in_the_order_of_frames(tmp_path: Path) -> None:
     covariance, poses = covariance_of(0.1, 0.001), swinging(12)
     lines = [
-        replace(estimate_of(line), object=name, tip_object=tip)
+        replace(line, object=name, tip_object=tip)
         for line in lines_of(poses, covariance)
         for name, tip in (("tool", np.array([0, 0, -100.0])), ("base", None))
     ]

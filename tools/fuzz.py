@@ -41,7 +41,7 @@ from fuzzed.recordings import KINDS, with_table
 
 import mixpose
 from mixpose.cli import main as command_line
-from mixpose.frames.quiet import quieten_opencv
+from mixpose.frames.capture import quieten_opencv
 
 LONGEST_S = 10.0
 LARGEST_BYTES = 2 * 10**9

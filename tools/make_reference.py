@@ -16,10 +16,9 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator
-from enum import StrEnum
 from pathlib import Path
 from types import ModuleType
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 from pydantic.fields import FieldInfo
@@ -246,15 +245,15 @@ def _option(name: str, kind: Any, info: Any, default: Any) -> str:
     if default is inspect.Parameter.empty:
         described += f" Needed{least}."
     elif default is not None and default is not False:
-        described += f" Default: {getattr(default, 'value', default)}{least}."
+        described += f" Default: {default}{least}."
     return textwrap.fill(described, 100, subsequent_indent="  ", break_on_hyphens=False)
 
 
 def _word_for(kind: Any) -> str:
     """What stands for a value of a type in a usage line."""
     for each in (kind, *get_args(kind)):
-        if inspect.isclass(each) and issubclass(each, StrEnum):
-            return "|".join(each)
+        if get_origin(each) is Literal:
+            return "|".join(get_args(each))
     words = {Path: "PATH", int: "N", float: "NUMBER", str: "TEXT"}
     return next((words[each] for each in (kind, *get_args(kind)) if each in words), "")
 

@@ -11,7 +11,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
 
@@ -34,13 +34,7 @@ class Executor(Protocol):
     def run(
         self, function: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Do a function for each task.
-
-        Yields
-        ------
-        number, result : int, object
-            Place of the task and what the function returned or raised, as tasks are done.
-        """
+        """Do a function for each task; as they are done, places and results, or what was raised."""
 
 
 class _Pool:
@@ -79,9 +73,9 @@ class _Cluster:
 
 
 @contextmanager
-def in_threads(workers: int) -> Iterator[Executor]:
-    """As many tasks at a time as there are workers, in threads: for tasks that mostly wait."""
-    with futures.ThreadPoolExecutor(workers) as pool:
+def _pooled(started: futures.Executor) -> Iterator[Executor]:
+    """Tasks of a pool; after an error none is begun any more."""
+    with started as pool:
         try:
             yield _Pool(pool)
         except BaseException:
@@ -89,36 +83,25 @@ def in_threads(workers: int) -> Iterator[Executor]:
             raise
 
 
-@contextmanager
-def in_processes(workers: int | None = None) -> Iterator[Executor]:
+def in_threads(workers: int) -> AbstractContextManager[Executor]:
+    """As many tasks at a time as there are workers, in threads: for tasks that mostly wait."""
+    return _pooled(futures.ThreadPoolExecutor(workers))
+
+
+def in_processes(workers: int | None = None) -> AbstractContextManager[Executor]:
     """The same in processes, as many as there are processors if not said: for tasks that compute.
 
     The linear algebra of each has one thread.
     """
     context = multiprocessing.get_context("spawn")
-    with futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread) as pool:
-        try:
-            yield _Pool(pool)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    return _pooled(futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread))
 
 
 @contextmanager
 def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]:
-    """The workers of a scheduler.
+    """The workers of a scheduler at an address, or of this machine's own cluster (`LOCAL`).
 
-    Parameters
-    ----------
-    scheduler : str
-        Its address, or `LOCAL`.
-    workers : int or None
-        Of a local cluster: as many as there are processors if not said.
-
-    Raises
-    ------
-    SessionError
-        If ``dask.distributed`` is not installed, or no scheduler answers.
+    Raises SessionError if ``dask.distributed`` is not installed, or no scheduler answers.
     """
     if find_spec("distributed") is None:
         raise SessionError(
@@ -128,12 +111,9 @@ def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]
     from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra
 
     if scheduler == LOCAL:
+        count = workers or os.cpu_count() or 1
         with (
-            LocalCluster(
-                n_workers=workers or os.cpu_count() or 1,
-                threads_per_worker=1,
-                dashboard_address=None,
-            ) as cluster,
+            LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
             yield _Cluster(client)
@@ -149,6 +129,6 @@ def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]
         yield _Cluster(client)
 
 
-def executor(scheduler: str | None, workers: int | None = None) -> Any:
+def executor(scheduler: str | None, workers: int | None = None) -> AbstractContextManager[Executor]:
     """A context with the processes of this machine, or with a cluster where one is named."""
     return in_processes(workers) if scheduler is None else on_cluster(scheduler, workers)

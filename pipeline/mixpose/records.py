@@ -339,8 +339,9 @@ class Estimate:
     confidence : float or None
         Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
         lost, None where a file does not say.
-    score : float
-        0 to 1: how well the predicted densities meet the observed ones, over all sensors.
+    score : float or None
+        0 to 1: how well the predicted densities meet the observed ones, over all sensors; None
+        where a file does not say, as `latency_ms` is then.
     instance : int or None
         Which of identical bodies, from 0; None where the session has one of this name.
     proposer : str
@@ -373,10 +374,10 @@ class Estimate:
     status: Status
     T_world_object: Floats | None
     covariance: Floats | None
-    score: float
+    score: float | None
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...] = ()
-    latency_ms: float = field(default=0.0, compare=False)
+    latency_ms: float | None = field(default=0.0, compare=False)
     instance: int | None = None
     confidence: float | None = None
     proposer: str = field(default="", compare=False)

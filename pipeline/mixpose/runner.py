@@ -58,15 +58,9 @@ LEAST_DELAY_S = 1e-6
 
 @dataclass(frozen=True)
 class Memory:
-    """All that a run knows between two frames.
+    """All that a run knows between two frames."""
 
-    Attributes
-    ----------
-    tracks : tuple of Track
-        One per body.
-    """
-
-    tracks: tuple[Track, ...]
+    tracks: tuple[Track, ...]  # one per body
 
 
 _KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
@@ -183,12 +177,8 @@ def _tracker(
 def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
     """Open the recordings of all sensors.
 
-    Raises
-    ------
-    SessionError
-        If a replaced sensor is not in the session, or a sensor has no source.
-    RecordingError
-        If a recording cannot be opened.
+    Raises SessionError if a replaced sensor is not in the session, or a sensor has no source.
+    Raises RecordingError if a recording cannot be opened.
     """
     names = [setup.name for setup in session.sensors]
     for name in replaced:
@@ -233,10 +223,11 @@ def _estimates(
 ) -> Generator[Estimate, None, None]:
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
     bodies = {one.body.name: one.body for one in session.objects}
-    clouds = clouds_of(session)
-    tips = {one.body.name: one.body.tip for one in session.objects}
+    clouds, names = clouds_of(session), [setup.name for setup in session.sensors]
     with closing(frames):
         for frame_set in frames:
+            frames_of = frame_set.frames.items()
+            images = {name for name, one in frames_of if isinstance(one.data, np.ndarray)}
             began = time.perf_counter()
             with one_blas_thread(), prompt_switching():
                 tracks, estimates, views = windowed.advance(
@@ -244,7 +235,7 @@ def _estimates(
                     frame_set.number,
                     frame_set.time_s,
                     partial(observe, session, frame_set),
-                    _images(frame_set),
+                    images,
                 )
             latency_ms = 1e3 * (time.perf_counter() - began)
             views = as_sensors(session, frame_set, views)
@@ -253,19 +244,15 @@ def _estimates(
                 estimate = with_clouds(one, clouds)
                 if labels:
                     estimate = labelled(estimate, seen, bodies[one.object])
-                estimate = _with_silent_sensors(estimate, session.sensors)
-                tip = tips[estimate.object]
-                estimate = replace(estimate, latency_ms=latency_ms, tip_object=tip)
+                # also of sensors without a frame
+                reports = {name: estimate.sensors.get(name, SensorReport(False)) for name in names}
+                tip = bodies[estimate.object].tip
+                estimate = replace(estimate, latency_ms=latency_ms, tip_object=tip, sensors=reports)
                 if watch is not None:
                     watch(frame_set, views, estimate)
                 if remember is not None and k == 0:
                     remember(Memory(tracks))
                 yield estimate
-
-
-def _images(frame_set: FrameSet) -> set[str]:
-    """Sensors whose frames are images."""
-    return {name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)}
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
@@ -303,7 +290,11 @@ def observe(
 def _view(
     setup: SensorSetup, observation: Observation, frame_set: FrameSet, frame: RawFrame
 ) -> View:
-    """What a sensor observed, and when."""
+    """What a sensor observed, and when: how much later than the set's time, as far as is known."""
+    delay = 0.0
+    if frame.time_s is not None and frame_set.time_s is not None:
+        delay = frame.time_s - frame_set.time_s
+    delay = delay if abs(delay) > LEAST_DELAY_S else 0.0
     told = 0.0 if setup.delay == "estimate" else setup.delay
     error = setup.calibration_error
     if (setup.delay or setup.readout) and frame_set.time_s is None:
@@ -316,19 +307,11 @@ def _view(
         setup.name,
         setup.sensor,
         observation,
-        _delay(frame_set, frame) + told,
+        delay + told,
         setup.readout,
         DelayEvidence.unknown_s if setup.delay == "estimate" else None,
         doubts=doubted(setup.sensor, error) if error else (),
     )
-
-
-def _delay(frame_set: FrameSet, frame: RawFrame) -> float:
-    """Seconds by which a sensor's frame is later than the set's time; 0 where not known."""
-    if frame.time_s is None or frame_set.time_s is None:
-        return 0.0
-    delay = frame.time_s - frame_set.time_s
-    return delay if abs(delay) > LEAST_DELAY_S else 0.0
 
 
 def observation_of(
@@ -385,9 +368,3 @@ def as_sensors(session: Session, frame_set: FrameSet, views: list[View]) -> list
             for name in plane_names(setup.name):
                 by_name.pop(name)
     return list(by_name.values())
-
-
-def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:
-    """Reports for all sensors in the session's order, also for those without a frame."""
-    reports = {s.name: estimate.sensors.get(s.name, SensorReport(False)) for s in setups}
-    return replace(estimate, sensors=reports)

@@ -319,8 +319,8 @@ _RUNNER = (
     Mutant(
         "runner-silent-sensors-have-no-report",
         "runner.py",
-        "for s in setups}",
-        "for s in setups if s.name in estimate.sensors}",
+        "for name in names}",
+        "for name in names if name in estimate.sensors}",
         "a table of poses lacks the columns of a sensor without a frame",
     ),
     Mutant(

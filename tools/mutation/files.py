@@ -142,7 +142,7 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-equidistant-is-pinhole",
-        "session/calibration/plain.py",
+        "session/calibration/camera.py",
         '"equidistant": "fisheye"',
         '"equidistant": "pinhole"',
         "a fisheye calibration is used for a pinhole camera",
@@ -215,7 +215,7 @@ _EVALUATION = (
     ),
     Mutant(
         "poses-symmetries-keep-their-unit",
-        "poses/units.py",
+        "poses/estimates.py",
         "symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}",
         "symmetries = dict(file.symmetries)",
         "symmetries of a truth in another unit are far off",
@@ -274,30 +274,30 @@ _EVALUATION = (
 _FORMATS = (
     Mutant(
         "poses-tum-in-the-unit-of-the-file",
-        "poses/tum.py",
-        "T[:3, 3] / self._per_metre",
+        "poses/benchmarks.py",
+        "T[:3, 3] / UNITS_PER_METRE[self._header.unit]",
         "T[:3, 3]",
         "trajectories in mm are read as metres",
     ),
     Mutant(
         "poses-bop-in-metres",
-        "poses/bop.py",
+        "poses/benchmarks.py",
         "1000.0 / UNITS_PER_METRE[header.unit]",
         "1.0 / UNITS_PER_METRE[header.unit]",
         "BOP results are a thousand times too near",
     ),
     Mutant(
         "poses-bop-rotation-by-columns",
-        "poses/bop.py",
+        "poses/benchmarks.py",
         "plain(T[:3, :3].ravel())",
         "plain(T[:3, :3].T.ravel())",
         "BOP results are turned by the inverse rotation",
     ),
     Mutant(
         "poses-bop-time-in-milliseconds",
-        "poses/bop.py",
-        "estimate.latency_ms / 1000.0 if",
-        "estimate.latency_ms if",
+        "poses/benchmarks.py",
+        "latency_ms / 1000.0 if",
+        "latency_ms if",
         "BOP takes an estimate for a thousand times slower than it is",
     ),
     Mutant(
@@ -316,7 +316,7 @@ _FORMATS = (
     ),
     Mutant(
         "poses-negative-zeros",
-        "poses/plain.py",
+        "poses/writing.py",
         "(np.asarray(values, dtype=np.float64) + 0.0).tolist()",
         "np.asarray(values, dtype=np.float64).tolist()",
         "equal poses are unequal bytes",

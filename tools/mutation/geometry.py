@@ -88,8 +88,8 @@ _RECORDS = (
     Mutant(
         "records-latency-tells-estimates-apart",
         "records.py",
-        "latency_ms: float = field(default=0.0, compare=False)",
-        "latency_ms: float = field(default=0.0)",
+        "latency_ms: float | None = field(default=0.0, compare=False)",
+        "latency_ms: float | None = field(default=0.0)",
         "the same run twice no longer compares as the same",
     ),
 )

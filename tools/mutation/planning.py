@@ -49,7 +49,7 @@ _FORMATS = (
     ),
     Mutant(
         "session-bodies-keep-their-unit",
-        "session/marker_files/__init__.py",
+        "session/marker_files.py",
         "points=markers.points * scale_between(stated, unit)",
         "points=markers.points",
         "an .obj in metres is a thousandth as large",
@@ -57,7 +57,7 @@ _FORMATS = (
     ),
     Mutant(
         "session-damaged-rom-passes",
-        "session/marker_files/ndi.py",
+        "session/marker_files.py",
         "sum(content[_SUMMED_FROM:]) & 0xFFFF != stated",
         "False",
         "markers of a damaged file are believed",

@@ -29,12 +29,12 @@ _PAIRING = (
     Mutant(
         "frames-pair-reads-one-ahead",
         "frames/pairing.py",
-        "            yield FrameSet(number, _time(frames), frames)\n"
+        "            yield FrameSet(number, next(times, None), frames)\n"
         "            for sensor in frames:\n"
         "                heads[sensor] = next(streams[sensor], None)\n",
         "            for sensor in frames:\n"
         "                heads[sensor] = next(streams[sensor], None)\n"
-        "            yield FrameSet(number, _time(frames), frames)\n",
+        "            yield FrameSet(number, next(times, None), frames)\n",
         "a pose waits for the frame after it, and a damaged frame costs the one before it",
     ),
 )

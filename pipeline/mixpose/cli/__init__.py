@@ -72,7 +72,7 @@ def _status(arguments: list[str]) -> int:
     import typer  # noqa: PLC0415
 
     from mixpose.cli.app import app  # noqa: PLC0415
-    from mixpose.cli.optional_values import with_values  # noqa: PLC0415
+    from mixpose.cli.usage import with_values  # noqa: PLC0415
     from mixpose.errors import MixposeError  # noqa: PLC0415
 
     debug = "--debug" in arguments

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mixpose import __version__, rigid
+from mixpose.cli.app_after import AlignRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.output import refuse_to_overwrite_but, write_text
 from mixpose.cli.run import named_sources
-from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
 from mixpose.runner import run
@@ -29,36 +27,13 @@ MARK = "# Aligned by mixpose"
 _ALL = 17  # digits: the frame is as exact as float64
 
 
-@dataclass(frozen=True)
-class AlignRequest:
-    """The options of ``mixpose align``.
-
-    Attributes
-    ----------
-    floor : tuple of str
-        Files of poses, or bodies in frames of the recording, ``OBJECT@FRAME``.
-    output : Path
-    up : {"x", "y", "z"}
-    sources : tuple of str
-        ``NAME=PATH``.
-    """
-
-    floor: tuple[str, ...]
-    output: Path
-    up: Axis
-    sources: tuple[str, ...]
-
-
-def align_session(path: Path, request: AlignRequest) -> None:
+def align_session(request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong, or directions of the world are held in it.
-    RecordingError
-        If the poses tell no floor.
+    Raises SessionError if the session or the options are wrong, or directions of the world are
+    held in it. Raises RecordingError if the poses tell no floor.
     """
+    path = request.session
     session = load_session(path)
     if len(session.estimator.free) < len(rigid.TWIST_NAMES):
         raise SessionError(
@@ -67,7 +42,8 @@ def align_session(path: Path, request: AlignRequest) -> None:
         )
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
-    estimates = [one for each in request.floor for one in _told(each, session, request.sources)]
+    sources = request.source or ()
+    estimates = [one for each in request.floor for one in _told(each, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
     _tell(session, floor, request.up)
@@ -86,7 +62,7 @@ def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate
         lines = [line for line in poses.poses if line.status == "ok"]
         if not lines:
             raise RecordingError(f"--floor {words}: found no pose that is ok")
-        return [estimate_of(line) for line in lines]
+        return list(lines)
     label, at, frame = words.rpartition("@")
     if not at or label not in session.labels or not frame.isdecimal():
         raise SessionError(

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mixpose.cli.app_calibrate import calibrate
-from mixpose.cli.app_design import design
-from mixpose.cli.app_learn import learn
+from mixpose.cli.app_after import align, convert, evaluate, pivot, report, schema, smooth
+from mixpose.cli.app_before import calibrate, design, import_, learn
 from mixpose.cli.app_simulate import simulate
-from mixpose.cli.app_trajectories import align, pivot, smooth
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.words import (
-    AllowCode,
-    ConvertFormat,
-    Format,
-    LengthUnit,
-    PosesFile,
-    SessionFile,
-    Start,
-    Step,
-    Stop,
-)
+from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, Start, Step, Stop, taking
 
 app = typer.Typer(
     name="mixpose",
@@ -164,8 +154,7 @@ def run(
     selection, output = Selection(start, stop, step), output_of(output)
     sources, debug = tuple(source or ()), bool(context.obj)
     many = are_many(sessions, scheduler)
-    named = None if format is None else format.value
-    written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
+    written = (format or "jsonl") if many else format_of(output, format)  # of many: a folder
     request = RunRequest(
         output,
         written,
@@ -214,169 +203,47 @@ def check(
     check_session(session, quick=quick, sources=tuple(source or ()), allow_code=allow_code)
 
 
-@app.command(cls=Command)
-def inspect(
-    session: SessionFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
+@dataclass(frozen=True)
+class InspectRequest:
+    """What was asked for."""
+
+    session: SessionFile
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")]
     frame: Annotated[
         int | None, typer.Option(help="Number of the frame; else the recording's first.")
-    ] = None,
+    ] = None
     poses: Annotated[
         Path | None,
         typer.Option(
             metavar="POSES.jsonl", help="Take the pose from a run, not from this frame alone."
         ),
-    ] = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
-    ] = None,
-    allow_code: AllowCode = False,
-) -> None:
+    ] = None
+    source: Recordings = None
+    allow_code: AllowCode = False
+
+
+@app.command(cls=Command)
+@taking(InspectRequest)
+def inspect(request: InspectRequest) -> None:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
     from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
 
-    inspect_frame(
-        session,
-        frame,
-        output,
-        poses=poses,
-        sources=tuple(source or ()),
-        allow_code=allow_code,
-    )
+    inspect_frame(request)
 
 
-@app.command("import", cls=Command)
-def import_(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and bodies: .csv, .rom, .vsk or .obj.",
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The session file, which must be new.")
-    ],
-    unit: Annotated[
-        LengthUnit, typer.Option(help="Unit of lengths in the session.")
-    ] = LengthUnit.mm,
-    lengths: Annotated[
-        LengthUnit | None,
-        typer.Option(help="Unit of translations in files whose format does not fix it."),
-    ] = None,
-) -> None:
-    """Make a session of the calibration files of other programs."""
-    from mixpose.cli.importing import import_files  # noqa: PLC0415
-
-    import_files(files, output, unit=unit.value, lengths=None if lengths is None else lengths.value)
-
-
-app.command(cls=Command)(simulate)
-
-
-@app.command(cls=Command)
-def evaluate(
-    poses: PosesFile,
-    truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-) -> None:
-    """Errors of poses against the truth, modulo the object's symmetries."""
-    from mixpose.cli.evaluate import evaluate_poses  # noqa: PLC0415
-
-    evaluate_poses(poses, truth, as_json=json)
-
-
-@app.command(cls=Command)
-def convert(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout (-).")
-    ] = None,
-    format: Annotated[
-        ConvertFormat | None,
-        typer.Option(
-            help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
-        ),
-    ] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
-    ] = None,
-    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None,
-    only_ok: Annotated[
-        bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")
-    ] = False,
-    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None,
-    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None,
-    relative_to: Annotated[
-        str | None,
-        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
-    ] = None,
-    session: Annotated[
-        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
-    ] = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
-    ] = None,
-    measured: Annotated[
-        bool,
-        typer.Option(
-            "--measured", help="c3d, trc: leave gaps where a marker was not measured by itself."
-        ),
-    ] = False,
-    fps: Annotated[
-        float | None,
-        typer.Option(min=1e-6, max=1e6, help="c3d, trc: frames a second, in place of times."),
-    ] = None,
-    allow_code: AllowCode = False,
-) -> None:
-    """Write poses in the format of another program."""
-    from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
-    from mixpose.cli.request import output_of  # noqa: PLC0415
-
-    request = ConvertRequest(
-        output=output_of(output),
-        format=None if format is None else format.value,
-        unit=unit,
-        object=object,
-        only_ok=only_ok,
-        scene_id=scene_id,
-        obj_id=obj_id,
-        relative_to=relative_to,
-        session=session,
-        sources=tuple(source or ()),
-        allow_code=allow_code,
-        measured=measured,
-        fps=fps,
-    )
-    convert_poses(poses, request)
-
-
-@app.command(cls=Command)
-def schema() -> None:
-    """Print the JSON Schema of pose lines."""
-    from mixpose.poses.schema import schema_text  # noqa: PLC0415
-
-    typer.echo(schema_text(), nl=False)
-
-
-@app.command(cls=Command)
-def report(
-    poses: PosesFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
-    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
-) -> None:
-    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
-    from mixpose.cli.report import write_report  # noqa: PLC0415
-
-    write_report(poses, truth, output)
-
-
-app.command(cls=Command)(calibrate)
-app.command(cls=Command)(design)
-app.command(cls=Command)(pivot)
-app.command(cls=Command)(align)
-app.command(cls=Command)(smooth)
-app.command(cls=Command)(learn)
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "import": import_,
+    "simulate": simulate,
+    "evaluate": evaluate,
+    "convert": convert,
+    "schema": schema,
+    "report": report,
+    "calibrate": calibrate,
+    "design": design,
+    "pivot": pivot,
+    "align": align,
+    "smooth": smooth,
+    "learn": learn,
+}
+for name, command in _COMMANDS.items():
+    app.command(name, cls=Command)(command)

@@ -6,7 +6,7 @@ import hashlib
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +26,10 @@ from mixpose.calibration.words import (
     words_of,
 )
 from mixpose.calibration.writing import MARK, calibrated_text
-from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.app_before import CalibrateRequest
+from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.output import refuse_to_overwrite_but, write_text
 from mixpose.cli.run import named_sources
-from mixpose.cli.watching import watched
-from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
 from mixpose.poses.jsonl import read_poses
@@ -40,47 +39,14 @@ from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
 
 
-@dataclass(frozen=True)
-class CalibrateRequest:
-    """What was asked for.
-
-    Attributes
-    ----------
-    output : Path or None
-    poses : Path or None
-        Known poses of the body.
-    free : tuple of str
-    sources : tuple of str
-        ``NAME=PATH``.
-    report : Path or None
-    check : bool
-        Whether an old calibration is only judged.
-    length : str or None
-        ``SENSOR:SENSOR=LENGTH``.
-    world : str or None
-        Whose frame becomes the world's: a sensor's, or ``body@FRAME``.
-    """
-
-    output: Path | None
-    poses: Path | None
-    free: tuple[str, ...]
-    sources: tuple[str, ...]
-    report: Path | None
-    check: bool = False
-    length: str | None = None
-    world: str | None = None
-
-
-def calibrate_session(path: Path, request: CalibrateRequest) -> None:
+def calibrate_session(request: CalibrateRequest) -> None:
     """Calibrate a session and write what was found.
 
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the output would overwrite something else.
-    RecordingError
-        If the recording or the poses cannot be read, or do not show the body.
+    Raises SessionError if the session or an option is wrong, or the output would overwrite
+    something else. Raises RecordingError if the recording or the poses cannot be read, or do not
+    show the body.
     """
+    path = request.session
     session = load_session(path)
     output = request.output
     if (output is None) is not request.check:
@@ -148,14 +114,16 @@ def task_of(
     late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
     rig = replace(rig, delays=np.array(late, dtype=np.float64))
     known = None if request.poses is None else known_poses(request.poses, session)
-    free, body = free_parameters(rig, request.free, poses_known=known is not None)
+    # one word of --free may hold several
+    free_words = [part for word in request.free or () for part in word.split()]
+    free, body = free_parameters(rig, free_words, poses_known=known is not None)
     pair = None
     if request.length is not None:
         rig, pair = with_length(rig, request.length)
     kinds = {kind for each in free.values() for kind in each}
     runs = bool(kinds & {"delay", "drift"})
     frames = read_frames(
-        session, named_sources(request.sources), rules, progress, runs=runs, known=known
+        session, named_sources(request.source or ()), rules, progress, runs=runs, known=known
     )
     if runs and any(frame.time_s is None for frame in frames):
         raise SessionError(
@@ -189,10 +157,7 @@ def task_of(
 def known_poses(path: Path, session: Session) -> dict[int, Floats]:
     """Poses of the session's body by frame number.
 
-    Raises
-    ------
-    RecordingError
-        If the file holds none, or its unit is another.
+    Raises RecordingError if the file holds none, or its unit is another.
     """
     poses = read_poses(path)
     if poses.unit is not None and poses.unit != session.unit:
@@ -239,8 +204,3 @@ def _warn(found: Calibration, unit: str) -> None:
     if found.bad:
         numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
         warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")
-
-
-def parse_free(words: Sequence[str]) -> tuple[str, ...]:
-    """Words of ``--free``, which may be several in one."""
-    return tuple(part for word in words for part in word.split())

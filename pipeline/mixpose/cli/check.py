@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from mixpose.checking import (
     typical_poses,
     with_image_sizes,
 )
+from mixpose.cli.notices import bar
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
@@ -58,7 +59,7 @@ class _Report:
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     of_counts: list[str] = field(default_factory=list)  # of features
-    untested: str = ""
+    first: int = 0  # frame of the recording
     of: str = ""  # of several bodies, which one is spoken of
 
     def say(self, title: str, text: str) -> None:
@@ -71,7 +72,10 @@ class _Report:
         for warning in self.warnings:
             self.say("warning", warning)
         if not self.warnings:
-            self.say("warnings", f"none; {self.untested}")
+            # what takes estimates of a few frames to know, and how to have them
+            shown = f"mixpose run --stop {self.first + 3} shows, as far as it can be seen"
+            text = f"none; whether the geometry fits the recording, {shown}"
+            self.say("warnings", text)
         sys.stdout.write("\n".join(self.lines) + "\n")
         self.lines, self.warnings = [], []
 
@@ -81,23 +85,10 @@ def check_session(
 ) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
-    Parameters
-    ----------
-    path : Path
-    quick : bool
-        Look at a few frames only instead of all.
-    sources : sequence of str
-        Recordings in place of the session's, as ``left=frames/``.
-    allow_code : bool
-        Whether functions that the session names may be run.
-
-    Raises
-    ------
-    SessionError
-        As ``mixpose run`` would before its first frame.
-    RecordingError
-        If a recording cannot be opened or its table of times lacks rows, or, after all has been
-        printed, if a frame is damaged.
+    `quick` looks at a few frames only; `sources` (``left=frames/``) stand in place of the
+    session's. Raises SessionError as ``mixpose run`` would before its first frame, and
+    RecordingError if a recording cannot be opened or its table of times lacks rows, or, after all
+    has been printed, if a frame is damaged.
     """
     session = load_session(path, allow_code=allow_code)
     replaced = named_sources(sources)
@@ -110,11 +101,13 @@ def check_session(
         _say_object(report, session, one)
     surveys: dict[str, Survey] = {}
     some = None if quick else some_of(opened)
-    with _progress(opened, quick=quick) as done:
+    lengths = [source.length for source in opened.values()]
+    total = None if None in lengths else sum(length or 0 for length in lengths)
+    with bar("reading frames", total, shown=not quick) as moved:
         for setup in session.sensors:
             source = opened[setup.name]
             surveys[setup.name] = survey(
-                session, setup, source, quick=quick, looked_at=some, done=done
+                session, setup, source, quick=quick, looked_at=some, done=partial(moved, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
@@ -130,19 +123,13 @@ def check_session(
     report.warnings += doubts.warnings
     if not doubts.explains:
         report.warnings = told_apart(report.of_counts) + report.warnings
-    report.untested = _untested(surveys)
+    first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
+    report.first = first
     report.write()
     damage = [text for each in surveys.values() for text in each.damage]
     if damage:
         more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
         raise RecordingError(f"{damage[0]}{more}")
-
-
-def _untested(surveys: Mapping[str, Survey]) -> str:
-    """What takes estimates of a few frames to know, and how to have them."""
-    first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
-    shown = f"mixpose run --stop {first + 3} shows, as far as it can be seen"
-    return f"whether the geometry fits the recording, {shown}"
 
 
 def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
@@ -362,19 +349,3 @@ def _deviations(deviations: Floats, unit: str, free: NDArray[np.bool_]) -> str:
         )
         if is_free
     )
-
-
-@contextmanager
-def _progress(sources: Mapping[str, Source], *, quick: bool) -> Iterator[Callable[[], None]]:
-    """A bar on standard error while a person is watching; yields what moves it on."""
-    if quick or not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console  # noqa: PLC0415 - only where it is shown
-    from rich.progress import Progress  # noqa: PLC0415
-
-    lengths = [source.length for source in sources.values()]
-    total = None if None in lengths else sum(length or 0 for length in lengths)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("reading frames", total=total)
-        yield lambda: progress.advance(task)

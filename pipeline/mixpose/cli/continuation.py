@@ -31,20 +31,11 @@ INTERVAL_S = 0.1
 
 @dataclass(frozen=True)
 class Note:
-    """What a run knew after a frame.
+    """What a run knew after a frame."""
 
-    Attributes
-    ----------
-    mixpose : str
-        Version; others may know other things.
-    frame : int
-    size, checksum : int
-        Of the poses so far: bytes and CRC-32.
-    memory : Memory
-    """
-
-    mixpose: str
+    mixpose: str  # version; others may know other things
     frame: int
+    # of the poses so far: bytes and CRC-32
     size: int
     checksum: int
     memory: Memory
@@ -84,27 +75,15 @@ class Notes:
 
 @dataclass(frozen=True)
 class Continuation:
-    """How a run goes on.
+    """How a run goes on."""
 
-    Attributes
-    ----------
-    file : LineFile or None
-        What it writes to, at the place where it goes on; None: a file that is opened afresh.
-    selection : Selection
-        Frames to estimate.
-    memory : Memory or None
-        What is known before the first of them.
-    there : ResumePoint or None
-        The last line that is there already, where frames are estimated again up to it.
-    is_done : bool
-        Whether nothing is left to do.
-    """
-
+    # what it writes to, at the place where it goes on; None: a file that is opened afresh
     file: LineFile | None
-    selection: Selection
-    memory: Memory | None = None
+    selection: Selection  # frames to estimate
+    memory: Memory | None = None  # what is known before the first of them
+    # the last line that is there already, where frames are estimated again up to it
     there: ResumePoint | None = None
-    is_done: bool = False
+    is_done: bool = False  # whether nothing is left to do
 
 
 def continuation(
@@ -112,12 +91,8 @@ def continuation(
 ) -> Continuation:
     """How a run goes on in a poses file.
 
-    Raises
-    ------
-    SessionError
-        If the file is of another run, or another run writes to it.
-    RecordingError
-        If the file holds no poses, or the recording cannot be read.
+    Raises SessionError if the file is of another run, or another run writes to it. Raises
+    RecordingError if the file holds no poses, or the recording cannot be read.
     """
     if not poses.is_file():
         return Continuation(None, wanted)
@@ -144,7 +119,9 @@ def _continued(
 ) -> Continuation:
     file.rewind(reached.size, reached.checksum)
     after = _after(wanted, reached.frame)
-    if not _has_frames(opened, after):
+    with closing(pair(opened, after.start, after.stop, after.step)) as frames:
+        is_done = next(frames, None) is None
+    if is_done:
         return Continuation(file, after, is_done=True)
     note = _note(poses, header.mixpose)
     if note is not None:
@@ -166,11 +143,6 @@ def _after(wanted: Selection, last: int) -> Selection:
     elif wanted.step > 1:
         begin = last + wanted.step
     return replace(wanted, start=begin)
-
-
-def _has_frames(opened: dict[str, Source], wanted: Selection) -> bool:
-    with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
-        return next(frames, None) is not None
 
 
 def _note(poses: Path, version: str) -> Note | None:

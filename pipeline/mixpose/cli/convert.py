@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.markers import FORMATS as MARKER_FORMATS
-from mixpose.cli.markers import write_markers
+from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import (
     Output,
@@ -21,11 +20,10 @@ from mixpose.cli.output import (
     refuse_to_overwrite,
     written_paths,
 )
-from mixpose.cli.request import SUFFIXES
-from mixpose.cli.session_of_poses import session_of
+from mixpose.cli.request import SUFFIXES, output_of
+from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import (
-    estimate_of,
     first_answers,
     header_of,
     objects_of,
@@ -42,36 +40,14 @@ from mixpose.whole_files import appearing_whole
 _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 
 
-@dataclass(frozen=True)
-class ConvertRequest:
-    """The options of ``mixpose convert``."""
-
-    output: Path | None
-    format: str | None
-    unit: str | None
-    object: str | None
-    only_ok: bool
-    scene_id: int | None
-    obj_id: int | None
-    relative_to: str | None
-    session: Path | None
-    sources: tuple[str, ...]
-    allow_code: bool = False
-    measured: bool = False
-    fps: float | None = None
-
-
-def convert_poses(path: Path, request: ConvertRequest) -> None:
+def convert_poses(request: ConvertRequest) -> None:
     """Write the poses of a file in another format.
 
-    Raises
-    ------
-    SessionError
-        If the options are wrong or do not say enough.
-    RecordingError
-        If the poses file cannot be read, or holds what the format cannot say.
+    Raises SessionError if the options are wrong or do not say enough. Raises RecordingError if the
+    poses file cannot be read, or holds what the format cannot say.
     """
-    name = _format(request)
+    request = replace(request, output=output_of(request.output))
+    path, name = request.poses, _format(request)
     _refuse_options_of_other_formats(name, request)
     poses = read_poses(path)
     lines = _selected(poses, name, request)
@@ -83,14 +59,12 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
         if output.is_file() | (not output.exists()):
             refuse_to_overwrite(output, [path])
     if name == "rerun":
-        from mixpose.cli.rerun import write_rerun  # noqa: PLC0415
-
         write_rerun(
             poses,
             lines,
             request.output,
             request.session,
-            request.sources,
+            request.source or (),
             allow_code=request.allow_code,
         )
     elif name in MARKER_FORMATS:
@@ -128,7 +102,7 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
         output = _output(stack, name, header, labels, options, request.output)
         stack.enter_context(output)
         for line in lines:
-            output.write(relative_to(T_sensor_world, estimate_of(line)))
+            output.write(relative_to(T_sensor_world, line))
 
 
 def _output(
@@ -186,7 +160,7 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
         "--scene-id": (request.scene_id, ("bop",)),
         "--obj-id": (request.obj_id, ("bop",)),
         "--relative-to": (request.relative_to, ("bop", "ros", "tum")),
-        "--source": (request.sources or None, ("rerun",)),
+        "--source": (request.source, ("rerun",)),
         "--measured": (request.measured or None, MARKER_FORMATS),
         "--fps": (request.fps, MARKER_FORMATS),
     }

@@ -6,18 +6,18 @@ import json
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mixpose.checking import with_image_sizes
+from mixpose.cli.app_before import DesignRequest
 from mixpose.cli.notices import say
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
-from mixpose.executing import Executor, in_processes, on_cluster
+from mixpose.executing import Executor, executor
 from mixpose.pictures.signature import refuse_foreign, sign_figure
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Floats
@@ -27,32 +27,9 @@ from mixpose.whole_files import appearing_whole
 _MOST_POSES = 2000
 
 
-@dataclass(frozen=True)
-class DesignRequest:
-    """Options of the command, as typed."""
-
-    poses: Path | None
-    count: int
-    volume: str | None
-    turn: float | None
-    tip: str | None
-    noise: tuple[str, ...]
-    runs: int
-    seed: int
-    tolerance: float | None
-    json: Path | None
-    plot: Path | None
-    workers: int = 1
-    scheduler: str | None = None
-
-
-def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
-    """Print a study of the systems of several session files.
-
-    Raises
-    ------
-    SessionError
-    """
+def design_sessions(asked: DesignRequest) -> None:
+    """Print a study of the systems of several session files. Raises SessionError."""
+    paths = asked.sessions
     sessions = [with_image_sizes(load_session(path), {}) for path in paths]
     for path, session in zip(paths, sessions, strict=True):
         if session.unit != sessions[0].unit:
@@ -65,12 +42,12 @@ def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
     request = Request(
         poses=_poses(sessions[0], asked),
         tip=None if asked.tip is None else _three("--tip", asked.tip),
-        noises=_noises(asked.noise, sessions, names),
-        runs=asked.runs,
+        noises=_noises(asked.noise or (), sessions, names),
+        runs=asked.monte_carlo,
         seed=asked.seed,
         tolerance=asked.tolerance,
     )
-    told = say if sys.stderr.isatty() else _silent
+    told = say if sys.stderr.isatty() else lambda text: None
     with _simulating(asked) as workers:
         found = study(list(zip(names, sessions, strict=True)), request, told, workers)
     sys.stdout.write(study_text(found))
@@ -101,15 +78,9 @@ def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
 
 def _simulating(asked: DesignRequest) -> AbstractContextManager[Executor | None]:
     """What does the simulated frames: this process, others, or a cluster."""
-    if not asked.runs or (asked.workers == 1 and asked.scheduler is None):
+    if not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None):
         return nullcontext()
-    if asked.scheduler is None:
-        return in_processes(asked.workers)
-    return on_cluster(asked.scheduler, asked.workers if asked.workers > 1 else None)
-
-
-def _silent(text: str) -> None:
-    pass
+    return executor(asked.scheduler, asked.workers if asked.workers > 1 else None)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

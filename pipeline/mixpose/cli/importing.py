@@ -19,10 +19,7 @@ def import_files(
 ) -> None:
     """Write a session file, and say on standard error what is in it.
 
-    Raises
-    ------
-    SessionError
-        If a file cannot be read, or the output is there already.
+    Raises SessionError if a file cannot be read, or the output is there already.
     """
     if output.exists():
         raise SessionError(f"-o {output}: is there already; name a new file")

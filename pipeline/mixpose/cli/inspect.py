@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mixpose.body import Body
+from mixpose.cli.app import InspectRequest
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
@@ -19,7 +20,6 @@ from mixpose.pictures.plots import require_matplotlib
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, prefixes_of
 from mixpose.pictures.signature import refuse_foreign, write_png
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.runner import clouds_of, observe, open_sources, scene_of
@@ -27,43 +27,19 @@ from mixpose.session import Session, load_session
 from mixpose.tracking import with_clouds
 
 
-def inspect_frame(
-    path: Path,
-    number: int | None,
-    folder: Path,
-    *,
-    poses: Path | None,
-    sources: Sequence[str],
-    allow_code: bool = False,
-) -> None:
+def inspect_frame(request: InspectRequest) -> None:
     """Write pictures of one frame into a folder and print what was found in it.
 
-    Parameters
-    ----------
-    path : Path
-        The session file.
-    number : int or None
-        Of the frame; None is the first of the recording.
-    folder : Path
-        Made if there is none.
-    poses : Path or None
-        Poses of a run, in place of estimating this frame on its own.
-    sources : sequence of str
-        ``NAME=PATH``, recordings in place of the session's.
-    allow_code : bool
-        Whether functions that the session names may be run.
-
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the folder holds other people's files.
-    RecordingError
-        If the recording or the poses cannot be read.
+    Poses of a run may stand in place of estimating this frame on its own. Raises SessionError if
+    the session or an option is wrong, or the folder holds other people's files, and RecordingError
+    if the recording or the poses cannot be read.
     """
-    session = load_session(path, allow_code=allow_code)
+    folder, poses = request.output, request.poses
+    session = load_session(request.session, allow_code=request.allow_code)
     require_matplotlib()
     _check_folder(folder, session)
-    frame_set = _frame(open_sources(session, named_sources(sources)), number)
+    opened = open_sources(session, named_sources(request.source or ()))
+    frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
     scene = scene_of(session)
@@ -127,7 +103,7 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
             f"--poses {path}: lengths are in {file.unit}, those of the session in {session.unit}; "
             "give poses of this session"
         )
-    found = []
+    found: list[Estimate] = []
     for label in session.labels:
         own = [pose for pose in file.poses if pose.label == label]
         if not own:
@@ -143,7 +119,7 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
                 f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to "
                 f"{max(numbers)}"
             )
-        found.append(estimate_of(of_frame[0]))
+        found.append(of_frame[0])
     return found
 
 

@@ -4,56 +4,28 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.app_before import LearnRequest
+from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.output import refuse_to_overwrite_but, write_text
 from mixpose.cli.run import named_sources
-from mixpose.cli.watching import watched
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
 from mixpose.learning.telling import MARK, doubts_of, lines_of, look_alikes, table_text
 from mixpose.session import Session, load_scene
-from mixpose.session.marker_files import read_marker_file
-from mixpose.session.markers import Markers
+from mixpose.session.marker_files import Markers, read_marker_file
 from mixpose.session.messages import BadKeyError
-from mixpose.whole_files import appearing_whole
 
 
-@dataclass(frozen=True)
-class LearnRequest:
-    """What was asked for.
-
-    Attributes
-    ----------
-    output : Path
-    axes : str or None
-        ``ORIGIN,X,Y``: markers by name.
-    like : Path or None
-        An older table of the same markers.
-    sources : tuple of str
-        ``NAME=PATH``.
-    allow_code : bool
-    """
-
-    output: Path
-    axes: str | None = None
-    like: Path | None = None
-    sources: tuple[str, ...] = ()
-    allow_code: bool = False
-
-
-def learn_session(path: Path, request: LearnRequest) -> None:
+def learn_session(request: LearnRequest) -> None:
     """Learn the bodies of a recording and write a table of each.
 
-    Raises
-    ------
-    SessionError
-        If the session or an option is wrong, or the output would overwrite something else.
-    RecordingError
-        If the recording cannot be read, or no body is seen to move.
+    Raises SessionError if the session or an option is wrong, or the output would overwrite
+    something else. Raises RecordingError if the recording cannot be read, or no body is seen to
+    move.
     """
+    path = request.session
     session = load_scene(path, allow_code=request.allow_code)
     inputs = [path] if request.like is None else [path, request.like]
     refuse_to_overwrite_but(request.output, inputs, MARK)
@@ -61,12 +33,12 @@ def learn_session(path: Path, request: LearnRequest) -> None:
     _warn_of_late(session)
     rules = LearningRules()
     with watched() as progress:
-        lesson = learn(session, named_sources(request.sources), rules, progress)
+        lesson = learn(session, named_sources(request.source or ()), rules, progress)
     bodies = _in_frames(lesson, request, older)
     files = [_file(request.output, k) for k in range(len(bodies))]
     for file, body in zip(files, bodies, strict=True):
         refuse_to_overwrite_but(file, inputs, MARK)
-        _write(file, table_text(body))
+        write_text(file, table_text(body), "-o")
     _tell(lesson, bodies, files, session, rules)
 
 
@@ -104,14 +76,6 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
 
 def _file(output: Path, index: int) -> Path:
     return output if not index else output.with_name(f"{output.stem}-{index + 1}{output.suffix}")
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        with appearing_whole(path) as part:
-            part.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"-o {path}: cannot be written: {error.strerror}") from error
 
 
 def _tell(

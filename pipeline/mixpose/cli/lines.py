@@ -22,21 +22,10 @@ def note_path(poses: Path) -> Path:
 class LineFile:
     """What the writers of poses take for a text stream.
 
-    What is written between two flushes reaches the file in one call or not at all.  No two runs
-    write to one file: it is locked, as far as the system can.
-
-    Parameters
-    ----------
-    path : Path
-    afresh : bool
-        Whether what is there goes; else it stays until `rewind` says where to go on.
-    called : Path or None
-        What messages call it, where that is not `path`.
-
-    Raises
-    ------
-    SessionError
-        If it cannot be opened, or another run writes to it.
+    What is written between two flushes reaches the file in one call or not at all. What was there
+    goes (`afresh`), or stays until `rewind` says where to go on; messages call the file `called`.
+    No two runs write to one file: it is locked, as far as the system can. Raises SessionError if it
+    cannot be opened, or another run writes to it.
     """
 
     def __init__(self, path: Path, *, afresh: bool = True, called: Path | None = None) -> None:
@@ -69,12 +58,8 @@ class LineFile:
     def flush(self) -> None:
         """Write what is due.
 
-        Raises
-        ------
-        SessionError
-            If it cannot be written; the file is then as it was before.
-        BrokenPipeError
-            If nobody reads a pipe any more.
+        Raises SessionError if it cannot be written; the file is then as it was before. Raises
+        BrokenPipeError if nobody reads a pipe any more.
         """
         data = "".join(self._due).encode("utf-8")
         self._due = []

@@ -1,15 +1,18 @@
-"""Remarks to people on standard error, a line each."""
+"""Remarks to people on standard error, a line each, and the progress of long work."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # whoever only has to say something need not load them
+    from mixpose.calibration.task import Progress
     from mixpose.frames import Source
     from mixpose.objective import View
     from mixpose.records import DelaySeen, Estimate, FrameSet, Status
@@ -25,6 +28,9 @@ _FAR_OFF = 0.5
 _SURELY_LATE = 6.0  # standard deviations
 _LATE_S = 5e-4  # less is rarely worth a key
 _REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
+
+_TIMED = 4  # frames by which it is told how long the search takes
+_FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
 
 
 def say(message: str) -> None:
@@ -209,3 +215,57 @@ class Summary:
             return f"{frames} only one of 2 sensors is explained: {check}"
         each = ", ".join(f"{name!r} in {count}" for name, count in self.split.items())
         return f"{frames} not all of {len(self.posed)} sensors are explained ({each} not): {check}"
+
+
+@contextmanager
+def bar(what: str, total: int | None, *, shown: bool = True) -> Iterator[Callable[..., None]]:
+    """What moves a bar on standard error on, while a person is watching; else nothing is seen."""
+    if not shown or not sys.stderr.isatty():
+        yield lambda **moved: None
+        return
+    from rich.console import Console  # noqa: PLC0415 - only where it is shown
+    from rich.progress import Progress as Bar  # noqa: PLC0415
+
+    with Bar(console=Console(stderr=True), transient=True) as progress:
+        yield partial(progress.update, progress.add_task(what, total=total))
+
+
+@contextmanager
+def watched() -> Iterator[Progress]:
+    """Progress: a bar on a terminal; and how long the search will take, before it does."""
+    last: dict[str, float] = {}
+    took: dict[str, list[float]] = {}
+
+    def expect(stage: str, done: int, total: int) -> None:
+        if not stage.startswith("searching") or total <= 20:
+            return
+        now = time.perf_counter()
+        step, last[stage] = now - last.get(stage, now), now
+        steps = took.setdefault(stage, [])
+        if step < _FOUND_BEFORE_S or len(steps) == _TIMED:
+            return
+        steps.append(step)
+        if len(steps) == _TIMED:
+            left, each = total - done, sum(steps) / _TIMED
+            seconds = each * left
+            about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+            say(f"{left} frames of cameras left to search, about {about}")
+
+    if not sys.stderr.isatty():
+        yield expect
+        return
+    from rich.console import Console  # noqa: PLC0415 - only where it is shown
+    from rich.progress import Progress as Bar  # noqa: PLC0415
+
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, object] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            expect(stage, done, total)
+            if stage not in tasks:
+                for other in tasks.values():
+                    bar.update(other, visible=False)  # type: ignore[arg-type]
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield show

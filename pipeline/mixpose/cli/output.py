@@ -1,4 +1,4 @@
-"""Where poses are written: to a stream, or to a file that is never something else."""
+"""Where poses and texts are written: to a stream, or to a file that is never something else."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from typing import TextIO, cast
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.errors import SessionError
-from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY, PoseWriter
+from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
+from mixpose.poses.writing import PoseWriter
 from mixpose.records import Estimate
+from mixpose.whole_files import appearing_whole
 
 _FIRST_WORDS = (
     *('{"type": "header"', "frame,time_s,object", "scene_id,im_id"),
@@ -26,19 +28,9 @@ _FIRST_WORDS = (
 class Output:
     """Writes poses; a file is opened with the first of them, so that no failure empties it.
 
-    Parameters
-    ----------
-    path : Path or None
-        None is standard output.
-    format_name : str
-        Of `mixpose.poses.formats.FORMATS`.
-    header : Header
-    goes_on : LineFile or None
-        A file of JSON lines that has its header already, in place of opening `path`.
-    options : mapping
-        What the writer of the format takes besides.
-    called : Path or None
-        What messages call the file, where that is not `path`.
+    Without a path poses go to standard output. `goes_on` is a file of JSON lines that has its
+    header already, in place of opening `path`; `options` are what the writer of the format takes
+    besides; `called` is what messages call the file, where that is not `path`.
     """
 
     def __init__(
@@ -95,23 +87,11 @@ class Output:
         return self._writer
 
 
-class OutputPerBody:
+class OutputPerBody(ExitStack):
     """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
 
-    Parameters
-    ----------
-    path : Path or None
-        ``poses.tum`` stands for ``poses.<body>.tum``.
-    format_name : str
-    labels : sequence of str
-        Names of the bodies, identical ones numbered.
-    start : callable
-        Makes the output of one body from the path of its file.
-
-    Raises
-    ------
-    SessionError
-        If there is no path.
+    ``poses.tum`` stands for ``poses.<body>.tum``, whose output `start` makes. Raises SessionError
+    if there is no path.
     """
 
     file: LineFile | None = None
@@ -123,25 +103,15 @@ class OutputPerBody:
         labels: Sequence[str],
         start: Callable[[Path], Output],
     ) -> None:
+        super().__init__()
         if path is None:
             raise SessionError(
                 f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
                 "with -o: each body gets one with its own name in it"
             )
-        self._outputs = {label: start(body_path(path, label)) for label in labels}
-
-    def __enter__(self) -> OutputPerBody:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        with ExitStack() as stack:
-            for output in self._outputs.values():
-                stack.callback(output.__exit__, kind, error, trace)
+        self._outputs = {
+            label: self.enter_context(start(body_path(path, label))) for label in labels
+        }
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame of one body, at once."""
@@ -172,10 +142,7 @@ def _as_stream(file: LineFile) -> TextIO:
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     """Make sure that a file about to be written is new, or holds poses that mixpose wrote.
 
-    Raises
-    ------
-    SessionError
-        If it is an input of the run, or holds something else.
+    Raises SessionError if it is an input of the run, or holds something else.
     """
     beginning = _beginning(path, inputs)
     first = beginning.partition("\n")[0]
@@ -190,22 +157,10 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
 ) -> None:
-    """Make sure that a file about to be written is new, empty, or begins with a mark in it.
+    """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
+    it.
 
-    Parameters
-    ----------
-    path : Path
-    inputs : iterable of Path
-        Files that must stay.
-    mark : str
-        Words by which mixpose knows its own files of this kind.
-    option : str
-        By which the file was named.
-
-    Raises
-    ------
-    SessionError
-        If it is one of the inputs, or holds something else.
+    Raises SessionError if it is one of the inputs, or holds something else; `option` named it.
     """
     beginning = _beginning(path, inputs, option)
     if beginning and mark not in beginning:
@@ -238,3 +193,15 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def write_text(path: Path, text: str, option: str) -> None:
+    """Write a text to the file that an option names.
+
+    Raises SessionError if it cannot be written.
+    """
+    try:
+        with appearing_whole(path) as part:
+            part.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error

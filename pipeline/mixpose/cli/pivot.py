@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from mixpose.cli.app_after import PivotRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.written import write_text
+from mixpose.cli.output import write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -29,33 +29,13 @@ _DIGITS = 8
 _SLIPPED = 2.0  # times the deviations: a tip that stays where it is gives 1 within a few percent
 
 
-@dataclass(frozen=True)
-class PivotRequest:
-    """The options of ``mixpose pivot``.
-
-    Attributes
-    ----------
-    object, reference : str or None
-        Bodies by their names: the tool, and what its tip stays at a point of.
-    into : Path or None
-        The session that gets the tip.
-    """
-
-    object: str | None
-    reference: str | None
-    into: Path | None
-
-
-def pivot_poses(path: Path, request: PivotRequest) -> None:
+def pivot_poses(request: PivotRequest) -> None:
     """Find the tip of a tool, tell it, and write it into a session.
 
-    Raises
-    ------
-    SessionError
-        If an option names what is not there.
-    RecordingError
-        If the poses cannot be read, or do not tell the tip.
+    Raises SessionError if an option names what is not there. Raises RecordingError if the poses
+    cannot be read, or do not tell the tip.
     """
+    path = request.poses
     poses = read_poses(path)
     tool = _tool(poses, request)
     pivoting = _pivoting(poses, tool, request.reference)

@@ -35,54 +35,22 @@ _INTERRUPTED_STATUS = 130
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be done; text only, as it may travel to another machine.
+    """What is to be done; text only, as it may travel to another machine."""
 
-    Attributes
-    ----------
-    session : str
-        Absolute path.
-    session_sha256 : str
-        Of its bytes; empty where it cannot be read.
-    folder, name : str
-        Absolute path of the folder of all recordings, and the name of this one's in it.
-    poses : str
-        Name of the file with the poses.
-    options : tuple of str
-        Of ``mixpose run``.
-    mixpose : str
-        Version.
-    shared : bool
-        Whether another worker may come to do the same.
-    """
-
-    session: str
-    session_sha256: str
+    session: str  # absolute path
+    session_sha256: str  # of its bytes; empty where it cannot be read
+    # absolute path of the folder of all recordings, and the name of this one's in it
     folder: str
     name: str
-    poses: str
-    options: tuple[str, ...]
-    mixpose: str
-    shared: bool = False
+    poses: str  # name of the file with the poses
+    options: tuple[str, ...]  # of ``mixpose run``
+    mixpose: str  # version
+    shared: bool = False  # whether another worker may come to do the same
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a recording ended: what its status file holds.
-
-    Attributes
-    ----------
-    state : {"done", "failed", "interrupted"}
-    exit_status : int
-        Of ``mixpose run``.
-    frames : mapping of str to int
-        By status of their poses.
-    warnings : int
-        In the log.
-    reason : str or None
-        Why it failed: the last line of the log.
-    seconds : float
-    host : str
-    """
+    """How a recording ended: what its status file holds."""
 
     name: str
     session: str
@@ -90,10 +58,10 @@ class Outcome:
     options: tuple[str, ...]
     mixpose: str
     state: str
-    exit_status: int
-    frames: Mapping[str, int] = field(default_factory=dict)
-    warnings: int = 0
-    reason: str | None = None
+    exit_status: int  # of ``mixpose run``
+    frames: Mapping[str, int] = field(default_factory=dict)  # by status of their poses
+    warnings: int = 0  # in the log
+    reason: str | None = None  # why it failed: the last line of the log
     seconds: float = 0.0
     host: str = ""
 
@@ -154,16 +122,7 @@ def finished(job: Job) -> Outcome | None:
 
 
 def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
-    """Do a job, if it is not done yet.
-
-    Parameters
-    ----------
-    job : Job
-    running : Running or None
-        What an interrupt reaches the process through.
-    threads : int
-        Of OpenCV.
-    """
+    """Do a job, if it is not done yet; an interrupt reaches its process through `running`."""
     before = finished(job)
     if before is not None:
         return before
@@ -178,7 +137,7 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
             outcome = _put_in_place(part, job, outcome)
     except OSError as error:
         reason = f"{error.filename or part}: cannot be written: {error.strerror}"
-        outcome = replace(_outcome(job, FAILED, 2), reason=reason)
+        outcome = replace(outcome_of(job, FAILED, 2), reason=reason)
     finally:
         if job.shared:
             shutil.rmtree(part, ignore_errors=True)
@@ -200,7 +159,7 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
     outcome = replace(
-        _outcome(job, state, 128 - status if status < 0 else status),
+        outcome_of(job, state, 128 - status if status < 0 else status),
         frames=_frames(lines),
         warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
         reason=None
@@ -247,11 +206,12 @@ def _not_shared(job: Job) -> Outcome | None:
                     f"{path}: not there on worker {socket.gethostname()}; sessions, recordings and "
                     "-o must lie in a folder that all workers see under the same name"
                 )
-            return replace(_outcome(job, FAILED, 2), reason=reason)
+            return replace(outcome_of(job, FAILED, 2), reason=reason)
     return None
 
 
-def _outcome(job: Job, state: str, exit_status: int) -> Outcome:
+def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
+    """How a job ended on this machine."""
     return Outcome(
         name=job.name,
         session=job.session,

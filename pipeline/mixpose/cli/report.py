@@ -6,11 +6,10 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.notices import say
-from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.output import refuse_to_overwrite_but, write_text
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.report.page import MARK, find_session, render
-from mixpose.whole_files import appearing_whole
 
 _PAGES = (".html", ".htm")
 
@@ -18,12 +17,8 @@ _PAGES = (".html", ".htm")
 def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
     """Write the report of a run to a page of its own.
 
-    Raises
-    ------
-    SessionError
-        If the output would overwrite something else, or a library is missing.
-    RecordingError
-        If the poses or the truth cannot be read or compared.
+    Raises SessionError if the output would overwrite something else, or a library is missing.
+    Raises RecordingError if the poses or the truth cannot be read or compared.
     """
     poses, cut = read_unfinished_poses(poses_path)
     truth = None if truth_path is None else read_poses(truth_path)
@@ -34,11 +29,6 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
             f"-o {output}: found the suffix {output.suffix}; a report is a page for a browser: "
             f"name it {output.with_suffix('.html').name}, and print that for a PDF"
         )
-    page = render(poses, truth, cut=cut, version=__version__)
-    try:
-        with appearing_whole(output) as part:
-            part.write_text(page, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
+    write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
     count = len(poses.poses)
     say(f"{count} frame{'s' * (count != 1)} -> {output}")

@@ -48,10 +48,8 @@ class RunRequest:
     def ahead_s(self) -> float:
         """How far poses that are published are foretold.
 
-        Raises
-        ------
-        SessionError
-            If nothing is published, or the time is not one that can be looked ahead.
+        Raises SessionError if nothing is published, or the time is not one that can be looked
+        ahead.
         """
         seconds = self.predict
         if seconds is None:
@@ -77,11 +75,8 @@ def format_of(output: Path | None, named: str | None) -> str:
     """The format of poses: the one that is named, else that of the file's suffix.
 
     Without either, poses are JSON lines: to standard output, a pipe, or a name without a suffix.
-
-    Raises
-    ------
-    SessionError
-        If the suffix is that of no format, or of one that is not written while poses are estimated.
+    Raises SessionError if the suffix is that of no format, or of one that is not written while
+    poses are estimated.
     """
     if named is not None:
         return named

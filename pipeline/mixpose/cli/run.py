@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -29,18 +29,15 @@ from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
 from mixpose.threads import prompt_switching
+from mixpose.tracking import Foreseen
 from mixpose.tracking.proposers import predicted
 
 
 def run_session(path: Path, request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong.
-    RecordingError
-        If the recording cannot be read; frames already estimated stay written.
+    Raises SessionError if the session or the options are wrong. Raises RecordingError if the
+    recording cannot be read; frames already estimated stay written.
     """
     with ExitStack() as pages:  # what outlives the poses
         _run_session(path, request, pages)
@@ -161,12 +158,23 @@ def _publishing(
     ahead_s = request.ahead_s
     if not request.publish:
         return None
-    from mixpose.cli.foreseeing import foreseeing  # noqa: PLC0415 - only where it is published
-    from mixpose.publishing import Publishing  # noqa: PLC0415
+    from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
-    foresee = foreseeing(session, ahead_s) if ahead_s else None
-    publishing = Publishing(request.publish, header, say, foresee, ahead_s)
+    each = [(label, one.body) for one in session.objects for label in one.labels]
+    foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
+    publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
     return stack.enter_context(publishing).watch
+
+
+def _foresee(known: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
+    """Foretells the poses of a body so many seconds ahead, by the estimates it is called with."""
+
+    def foresee(estimate: Estimate) -> Estimate:
+        nonlocal known
+        known = known.after(estimate)
+        return known.ahead(estimate, seconds)
+
+    return foresee
 
 
 def _view(
@@ -232,10 +240,7 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
 def named_sources(named: Iterable[str]) -> dict[str, str]:
     """Recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
 
-    Raises
-    ------
-    SessionError
-        If a text is not of this form.
+    Raises SessionError if a text is not of this form.
     """
     sources = {}
     for text in named:

@@ -15,7 +15,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from mixpose.cli.recording_job import (
     Outcome,
     Running,
     finished,
+    outcome_of,
     run_job,
 )
 from mixpose.cli.request import SUFFIXES, RunRequest
@@ -57,10 +58,7 @@ def are_many(named: Sequence[str], scheduler: str | None) -> bool:
 def sessions_of(named: Sequence[str]) -> list[Path]:
     """The sessions that arguments name: files, patterns, or text files with one to a line.
 
-    Raises
-    ------
-    SessionError
-        If a pattern matches nothing, or a list cannot be read or is empty.
+    Raises SessionError if a pattern matches nothing, or a list cannot be read or is empty.
     """
     sessions: dict[Path, None] = {}
     for text in named:
@@ -94,27 +92,12 @@ def _listed(path: Path) -> list[Path]:
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) -> int:
-    """Estimate many recordings, and say in the end how each of them went.
+    """Estimate many recordings, say in the end how each of them went, and return the worst exit
+    status.
 
-    What is done already, with the same session and options, is not done again.
-
-    Parameters
-    ----------
-    sessions : sequence of Path
-    request : RunRequest
-        Its output is a folder, made if it is not there.
-    workers : int
-        Most recordings at a time; of a cluster only where it is a local one.
-
-    Returns
-    -------
-    int
-        The largest exit status of all.
-
-    Raises
-    ------
-    SessionError
-        If there is no folder for the poses, or an option is given that serves a single recording.
+    What is done already, with the same session and options, is not done again. The folder of the
+    output is made if it is not there; `workers` count on a cluster only where it is a local one.
+    Raises SessionError if there is no folder for the poses, or an option serves a single recording.
     """
     alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
     for option, value in alone.items():
@@ -165,10 +148,7 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-    return Outcome(
-        job.name, job.session, job.session_sha256, job.options, job.mixpose, FAILED, 3,
-        reason=reason,
-    )  # fmt: skip
+    return replace(outcome_of(job, FAILED, 3), reason=reason, host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from dataclasses import fields
 
+from mixpose.cli.app_simulate import SimulateRequest
+from mixpose.cli.notices import bar
 from mixpose.errors import SessionError
 from mixpose.session import load_session
 from mixpose.session.values import LONGEST_DELAY_S
@@ -13,13 +15,7 @@ from mixpose.simulation.session_copy import SESSION_NAME
 
 
 def delays_of(given: list[str]) -> dict[str, float]:
-    """Seconds by sensor, of texts NAME=SECONDS.
-
-    Raises
-    ------
-    SessionError
-        If a text is not like that.
-    """
+    """Seconds by sensor, of texts NAME=SECONDS. Raises SessionError if a text is not like that."""
     delays = {}
     for text in given:
         name, _, seconds = text.rpartition("=")
@@ -34,32 +30,25 @@ def delays_of(given: list[str]) -> dict[str, float]:
     return delays
 
 
-def simulate_session(
-    path: Path, folder: Path, options: SimulationOptions, *, overwrite: bool
-) -> None:
+def simulate_session(request: SimulateRequest) -> None:
     """Render the recording of a session into a folder.
 
-    Raises
-    ------
-    SessionError
-        If the session or the options are wrong, or the folder holds a recording already.
+    Raises SessionError if the session or the options are wrong, or the folder holds a recording
+    already.
     """
-    session = load_session(path)
-    if not sys.stderr.isatty():
-        simulate(session, folder, options, overwrite=overwrite)
-    else:
-        from rich.console import Console  # noqa: PLC0415 - only where it is shown
-        from rich.progress import Progress  # noqa: PLC0415
-
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("simulating", total=options.frames)
-            simulate(
-                session,
-                folder,
-                options,
-                overwrite=overwrite,
-                progress=lambda done: progress.update(task, completed=done),
-            )
+    names = {one.name for one in fields(SimulationOptions)} - {"delay"}
+    given = {name: value for name, value in vars(request).items() if name in names}
+    options = SimulationOptions(**given, delay=delays_of(request.delay or []))
+    folder, overwrite = request.output, request.overwrite
+    session = load_session(request.session)
+    with bar("simulating", options.frames) as moved:
+        simulate(
+            session,
+            folder,
+            options,
+            overwrite=overwrite,
+            progress=lambda done: moved(completed=done),
+        )
     count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}",

@@ -24,12 +24,8 @@ from mixpose.whole_files import appearing_whole
 def smooth_poses(path: Path, output: Path | None, *, fill_s: float, motion: str | None) -> None:
     """Smooth the poses of a file and write them.
 
-    Raises
-    ------
-    SessionError
-        If the output would overwrite something else.
-    RecordingError
-        If the poses cannot be read, were smoothed before, or say too little.
+    Raises SessionError if the output would overwrite something else. Raises RecordingError if the
+    poses cannot be read, were smoothed before, or say too little.
     """
     poses = read_poses(path)
     if poses.header.get("smoothed"):

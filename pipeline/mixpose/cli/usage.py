@@ -1,4 +1,7 @@
-"""Wrong options and arguments in one line, worded as every other error of mixpose."""
+"""What was typed: options whose value may be left out, and what is wrong, in one line.
+
+The line is worded as every other error of mixpose.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,13 @@ _WORDINGS = (
     (r"No such command '(.*)'\.?", r"\1: no such command"),
 )
 
+_ADDRESS = re.compile(r"(.*:)?\d+")
+OPTIONAL = {"--view": _ADDRESS}
+"""What a value of each looks like; anything else after it is the next argument."""
+
 
 def usage_message(error: typer.TyperException, arguments: Sequence[str]) -> str:
-    """One line: which option, what was found, what is allowed, and where to read on.
-
-    Parameters
-    ----------
-    error : TyperException
-        What typer found wrong.
-    arguments : sequence of str
-        What was typed, to say what was found.
-    """
+    """One line: which option, what was found of what was typed, what is allowed, what to read."""
     typed = " ".join(["mixpose", *arguments[:1]]) if arguments[0][:1] != "-" else "mixpose"
     command = getattr(getattr(error, "ctx", None), "command_path", typed)
     text = _text(error, arguments).rstrip(". ")
@@ -72,3 +71,14 @@ def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
         if option in names:
             return value if equals else next(iter(arguments[i + 1 : i + 2]), None)
     return None
+
+
+def with_values(arguments: Sequence[str]) -> list[str]:
+    """Arguments in which each of these options has a value, an empty one where none was given."""
+    given: list[str] = []
+    for k, argument in enumerate(arguments):
+        pattern = OPTIONAL.get(argument)
+        following = arguments[k + 1] if k + 1 < len(arguments) else ""
+        has_value = pattern is None or pattern.fullmatch(following) is not None
+        given.append(argument if has_value else f"{argument}=")
+    return given

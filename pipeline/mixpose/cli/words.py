@@ -1,14 +1,26 @@
-"""Arguments and options that several commands share, and the words that they allow."""
+"""Arguments and options that several commands share, and commands that take a record of them."""
 
 from __future__ import annotations
 
-from enum import StrEnum
+from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
 
 import typer
 
+Request = TypeVar("Request")
+
+Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
+ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
+LengthUnit: TypeAlias = Literal["m", "cm", "mm", "um"]
+
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
+PosesFile = Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")]
+Recordings = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+]
 AllowCode = Annotated[
     bool,
     typer.Option(
@@ -16,41 +28,25 @@ AllowCode = Annotated[
         help='Run functions that the session names: method = "module:function".',
     ),
 ]
-
-
-class Format(StrEnum):
-    """Formats of poses."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-
-
-class LengthUnit(StrEnum):
-    """Units of length."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
-    um = "um"
-
-
-class ConvertFormat(StrEnum):
-    """Formats that poses are converted to."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-    rerun = "rerun"
-    c3d = "c3d"
-    trc = "trc"
-
-
 Step = Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")]
 Start = Annotated[int | None, typer.Option(help="First frame number.")]
 Stop = Annotated[int | None, typer.Option(help="Frame number to stop before.")]
-PosesFile = Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")]
+
+
+def taking(request: type[Request]) -> Callable[[Callable[[Request], None]], Callable[..., None]]:
+    """Make a command of a function of a record, whose fields are its arguments and options."""
+
+    def decorated(command: Callable[[Request], None]) -> Callable[..., None]:
+        hints = get_type_hints(request, include_extras=True)
+        form = signature(request)
+        typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
+
+        def called(**given: Any) -> None:
+            command(request(**given))
+
+        called.__name__, called.__doc__ = command.__name__, command.__doc__
+        called.__annotations__ = hints
+        called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
+        return called
+
+    return decorated

@@ -8,7 +8,7 @@ from mixpose.frames.opening import files_of, open_source
 from mixpose.frames.pairing import pair
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import ALL_NUMBERS, SensorKind, Source, SourceSpec
-from mixpose.frames.stamps import paired_by_stamp
+from mixpose.frames.pairing import paired_by_stamp
 
 __all__ = [
     "ALL_NUMBERS",

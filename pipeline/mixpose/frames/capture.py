@@ -18,7 +18,6 @@ import numpy as np
 
 from mixpose.errors import RecordingError
 from mixpose.frames.containers import container_of
-from mixpose.frames.quiet import quieten_opencv
 from mixpose.records import Image
 
 # How long a stream may take to open, and then to deliver its next frame.
@@ -64,16 +63,9 @@ def _is(kind: Callable[[int], bool], address: str) -> bool:
 def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
     """A capture that is released at the end; grey videos keep their depth.
 
-    Parameters
-    ----------
-    address : str or int
-        Path of a file, a pipe or a device, address of a stream (with ``://``), or index of a
-        camera.
-
-    Raises
-    ------
-    RecordingError
-        If it does not open, a stream or a pipe within `PATIENCE_S`.
+    `address` is the path of a file, a pipe or a device, the address of a stream (with ``://``), or
+    the index of a camera. Raises RecordingError if it does not open, a stream or a pipe within
+    `PATIENCE_S`.
     """
     quieten_opencv()
     with contextlib.ExitStack() as stack:
@@ -129,10 +121,7 @@ def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
 def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
     """Go to the next frame; False where there is none.
 
-    Raises
-    ------
-    SilentError
-        If a stream falls silent without ending.
+    Raises SilentError if a stream falls silent without ending.
     """
     began = time.monotonic()
     found = capture.grab()
@@ -148,13 +137,9 @@ class ColourRoom:
     """Where the coloured frames of a capture are put, one after the other.
 
     To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
-
-    Attributes
-    ----------
-    image : (H, W, 3 or 4) array or None
-        The last coloured frame; None before the first.
     """
 
+    # (H, W, 3 or 4), the last coloured frame; None before the first
     image: cv2.typing.MatLike | None = None
 
 
@@ -165,17 +150,9 @@ def retrieve(
     expected: tuple[int, int] | None,
     room: ColourRoom | None = None,
 ) -> Image:
-    """Convert the grabbed frame to grey values, (H, W).
+    """Convert the grabbed frame to grey values, (H, W); `room` is kept from frame to frame.
 
-    Parameters
-    ----------
-    room : ColourRoom or None
-        Kept from frame to frame of a capture; None: nothing is kept.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be decoded or has not the expected width and height.
+    Raises RecordingError if it cannot be decoded or has not the expected width and height.
     """
     found, image = capture.retrieve() if room is None else capture.retrieve(room.image)
     if not found or image is None:
@@ -199,3 +176,17 @@ def retrieve(
 def name_of(address: str | int) -> str:
     """What people call a source of frames."""
     return f"camera:{address}" if isinstance(address, int) else address
+
+
+def quieten_opencv() -> None:
+    """Turn off the messages of OpenCV and of its FFmpeg backend.
+
+    A recording that cannot be read is one line on standard error, written by mixpose; the
+    decoders' own account of the same fault would surround it with dozens more.  Whoever set
+    ``OPENCV_LOG_LEVEL`` or ``OPENCV_FFMPEG_LOGLEVEL`` wants to see it and keeps it.
+
+    FFmpeg's level counts only before the first video is opened, so call this before that.
+    """
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

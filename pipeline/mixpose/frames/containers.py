@@ -38,20 +38,8 @@ def container_of(path: Path) -> Container | None:
 def missing_bytes(path: Path) -> int:
     """How many bytes a video file lacks of those that its outermost parts promise.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    int
-        0 for a whole file, and for one whose structure does not say.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
+    0 for a whole file, and for one whose structure does not say. Raises OSError if it cannot be
+    read.
     """
     container = container_of(path)
     with path.open("rb") as file:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.quiet import quieten_opencv
+from mixpose.frames.capture import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
 from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS
@@ -37,31 +37,20 @@ _END_OF_IMAGE = b"\xff\xd9"
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """Images of one camera, by ascending frame number.
-
-    Attributes
-    ----------
-    paths, numbers : tuple of Path, tuple of int
-        The files and their frame numbers, ascending; at least one.
-    resolution : (width, height) or None
-        Size of every image in px; None means that of the first one read.
-    clock : callable or None
-        Gives the time of a frame number.
-    is_stamped : bool
-        Whether the numbers are times in nanoseconds, which the clock goes by.
-    has_fps : bool
-        Whether the session states a rate.
-    """
+    """Images of one camera, by ascending frame number."""
 
     kind: ClassVar[SourceKind] = "images"
     ahead: ClassVar[int] = 3
 
+    # the files and their frame numbers, ascending; at least one
     paths: tuple[Path, ...]
     numbers: tuple[int, ...]
+    # size of every image in px; None means that of the first one read
     resolution: tuple[int, int] | None
-    clock: Clock | None
+    clock: Clock | None  # gives the time of a frame number
+    # whether the numbers are times in nanoseconds, which the clock goes by
     is_stamped: bool = False
-    has_fps: bool = False
+    has_fps: bool = False  # whether the session states a rate
 
     @property
     def length(self) -> int:
@@ -176,17 +165,11 @@ def natural_order(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_image(path: Path) -> Image:
-    """Read one image file as grey values.
+    """Read one image file as grey values (H, W): uint8, uint16 or float32, as deep as the file has
+    them.
 
-    Returns
-    -------
-    (H, W) uint8, uint16 or float32 array
-        Grey values as deep as the file has them.
-
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read, is cut short, damaged or no image, or holds NaN.
+    Raises RecordingError if the file cannot be read, is cut short, damaged or no image, or holds
+    NaN.
     """
     quieten_opencv()
     data = _bytes_of(path)

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 import cv2
 
+from mixpose.constants import constant
 from mixpose.errors import RecordingError
 from mixpose.frames.capture import (
     NotOpenedError,
@@ -34,10 +35,9 @@ from mixpose.frames.capture import (
     opened,
     retrieve,
 )
-from mixpose.frames.moments import CaptureTimes
 from mixpose.frames.source import SourceKind, selection
 from mixpose.frames.times import Clock
-from mixpose.records import FrameSet, RawFrame
+from mixpose.records import FrameSet, Moment, RawFrame
 
 _CAMERA = re.compile(r"camera:(\d{1,4})")
 _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"}
@@ -53,6 +53,10 @@ RETURN_S = 60.0
 
 _KEPT = 8  # frames of each source to choose from where several are paired
 _AGAIN_S = 0.5  # between two attempts to open it
+
+# RTP and MPEG transport streams carry the sender's clock; multipart JPEG and bare streams do not,
+# and FFmpeg makes their stamps up from a nominal rate
+_STAMPED = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
 
 
 def live_address(source: str) -> str | int | None:
@@ -70,26 +74,17 @@ def live_address(source: str) -> str | int | None:
 
 @dataclass(frozen=True)
 class LiveSource:
-    """A camera or a stream, opened when its frames are asked for.
-
-    Attributes
-    ----------
-    address : str or int
-        Of a stream or a device, or the index of a camera.
-    resolution : (width, height) or None
-        Size that every frame must have, in px.
-    clock : callable or None
-        Gives the time of a frame number; None means when the frame was captured, or arrived where
-        the source does not tell, in s since the start.
-    """
+    """A camera or a stream, opened when its frames are asked for."""
 
     kind: ClassVar[SourceKind] = "live"
     ahead: ClassVar[int] = 0
     first: ClassVar[int] = 0
     length: ClassVar[None] = None
 
-    address: str | int
-    resolution: tuple[int, int] | None
+    address: str | int  # of a stream or a device, or the index of a camera
+    resolution: tuple[int, int] | None  # size that every frame must have, in px
+    # gives the time of a frame number; None means when the frame was captured, or arrived where the
+    # source does not tell, in s since the start
     clock: Clock | None
 
     def describe(self) -> str:
@@ -108,10 +103,7 @@ class LiveSource:
     ) -> Generator[RawFrame, None, None]:
         """Each time the newest frame, once there is one that has not been given yet.
 
-        Raises
-        ------
-        RecordingError
-            If the source does not open or falls silent.
+        Raises RecordingError if the source does not open or falls silent.
         """
         wanted = selection(start, stop, step, self.first)
         for frame_set in join_live({"": self}, wanted):
@@ -122,18 +114,10 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
     """The newest frames of all sources, once each has one that was not given yet.
 
     The frames of a set are those that were captured nearest to the latest moment which all have
-    reached: at most half a period apart, however long each was on its way.  A source that has
-    ended is left out of further sets, and one that is silent until it gives frames again.
-
-    Yields
-    ------
-    FrameSet
-        Numbered by the source that has given most frames.
-
-    Raises
-    ------
-    RecordingError
-        If a source does not open or falls silent.
+    reached: at most half a period apart, however long each was on its way. Sets are numbered by the
+    source that has given most frames. One that has ended is left out of further sets, and one that
+    is silent until it gives frames again. Raises RecordingError if a source does not open or falls
+    silent.
     """
     began = time.monotonic()
     with ExitStack() as stack:
@@ -271,3 +255,44 @@ class _Reader:
                 self._count += 1
         if isinstance(address, int) and not self._stop.is_set():
             raise RecordingError(f"{name_of(address)}: gives no frames any more")
+
+
+@dataclass(frozen=True)
+class ClockRules:
+    """What is believed of the clocks of cameras."""
+
+    drift: float = constant(1e-4, "by which clocks of cameras differ at most: quartz errs by 5e-5")
+    longest_s: float = constant(
+        1.0, "from capture to arrival: stamps that are later are of another clock than they were"
+    )
+
+
+class CaptureTimes:
+    """Tells from the stamps of a live source when its frames were captured.
+
+    A camera at this machine (V4L2) stamps frames by the machine's own clock. Stamps of a stream are
+    of a clock that is off by an unknown time; as no frame arrives before it was captured, the least
+    difference seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor
+    Synchronization Problem*, IROS 2010). Moments are then late by the shortest transmission, and
+    free of what others took longer.
+    """
+
+    def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:
+        self._is_device = isinstance(address, int) or is_device(address)
+        self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
+        self._rules = rules
+        self._last: tuple[float, float] | None = None  # stamp, and least difference
+
+    def moment(self, stamp_s: float, arrived: float | None = None) -> Moment:
+        """When a frame was captured that arrived, now if not said, with a stamp in seconds."""
+        arrived = time.monotonic() if arrived is None else arrived
+        last, self._last = self._last, None
+        if not self._has_stamps or not stamp_s > (0.0 if last is None else last[0]):
+            return Moment(arrived, "arrival")
+        off = arrived - stamp_s
+        if self._is_device and 0 <= off < self._rules.longest_s:
+            return Moment(stamp_s, "capture")
+        if last is not None and off - last[1] < self._rules.longest_s:
+            off = min(off, last[1] + self._rules.drift * (stamp_s - last[0]))
+        self._last = stamp_s, off
+        return Moment(stamp_s + off, "capture")

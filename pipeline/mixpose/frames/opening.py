@@ -13,13 +13,12 @@ from pathlib import Path
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.capture import is_pipe
-from mixpose.frames.csv_rows import csv_rows
 from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
 from mixpose.frames.live import LiveSource, live_address
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
 from mixpose.frames.tables import open_table
-from mixpose.frames.times import Clock, clock_of
+from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
 # A scheme has two letters or more; one letter is a drive.
@@ -51,12 +50,8 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
 def open_source(spec: SourceSpec) -> Source:
     """Find the recording of a sensor and open it, without reading more than its beginning.
 
-    Raises
-    ------
-    SessionError
-        If the options of the source contradict each other, or do not fit the recording.
-    RecordingError
-        If there is no such recording or its beginning cannot be read.
+    Raises SessionError if the options of the source contradict each other, or do not fit the
+    recording. Raises RecordingError if there is no such recording or its beginning cannot be read.
     """
     clock = clock_of(spec)
     source = spec.source
@@ -80,10 +75,7 @@ def open_source(spec: SourceSpec) -> Source:
 def files_of(spec: SourceSpec) -> list[str]:
     """The files that a recording is read from, or the address of a camera or stream.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such recording.
+    Raises RecordingError if there is no such recording.
     """
     return _recognise(spec, spec.source)[1]
 
@@ -112,7 +104,10 @@ def _recognise_files(
         return "images", _listed(spec, source)
     path = spec.base / source
     if source and path.is_dir():
-        return "images", _images_in(path)
+        images = [each for each in path.iterdir() if _is_image(each) and each.is_file()]
+        if not images:
+            raise RecordingError(f"{path}: no images in this folder; {_looked_in(path / '*')}")
+        return "images", natural_order(images)
     if is_pipe(str(path)):
         return "video", [path]
     if path.is_file():
@@ -173,13 +168,6 @@ def _looked_in(path: Path) -> str:
     shown = ", ".join(list(kinds.values())[::-1][:_SHOWN])
     more = f", ... ({len(names)} in all)" if len(names) > min(len(kinds), _SHOWN) else ""
     return f"{text}, where there is {shown}{more}" if names else f"{text}, which is empty"
-
-
-def _images_in(folder: Path) -> list[Path]:
-    images = [path for path in folder.iterdir() if _is_image(path) and path.is_file()]
-    if not images:
-        raise RecordingError(f"{folder}: no images in this folder; {_looked_in(folder / '*')}")
-    return natural_order(images)
 
 
 def _is_image(path: Path) -> bool:

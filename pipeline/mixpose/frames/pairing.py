@@ -1,13 +1,23 @@
-"""Frames of several sensors, joined by their numbers."""
+"""Frames of several sensors, joined by their numbers, or by the stamps that images are named after.
+
+Robots' recorders name images after the nanosecond they were taken in.  The names then say when, and
+cameras that were triggered together differ by some microseconds: their frames are paired by the
+nearest stamp instead of by equal numbers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from bisect import bisect_left
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
+from itertools import pairwise
+from statistics import median
 
 import numpy as np
 
 from mixpose.errors import SessionError
+from mixpose.frames.images import ImageSequence
 from mixpose.frames.live import LiveSource, join_live
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Source, selection
@@ -19,6 +29,8 @@ READY_BYTES = 2**24
 MOST_MORE = 13
 """Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
 
+_SHARE = 0.5  # of the usual distance of frames: farther apart they belong to different moments
+
 
 def pair(
     sources: Mapping[str, Source],
@@ -28,29 +40,15 @@ def pair(
 ) -> Generator[FrameSet, None, None]:
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
-    A number that some sources lack yields a set without them.  Of each source only a few frames
-    are in memory, more of small ones, decoded ahead in a thread of its own where that pays; the
-    threads end with this generator.
+    Numbers are those of ``range(start, stop, step)``, without `start` from the first that there is.
+    One that some sources lack yields a set without them; the time of a set is that of the first
+    sensor, in the order of `sources`, that has one. Of each source only a few frames are in memory,
+    more of small ones, decoded ahead in a thread of its own where that pays; the threads end with
+    this generator.
 
-    Parameters
-    ----------
-    sources : mapping of str to Source
-        Sources by sensor name; the order counts, see Returns.
-    start, stop, step : int
-        Numbers to read, like those of `range`.  Without `start` the first number there is.
-
-    Returns
-    -------
-    generator of FrameSet
-        The time of a set is that of the first sensor, in the order of `sources`, that has one.
-
-    Raises
-    ------
-    SessionError
-        At once, if `step` is less than 1, or live sources and recordings are mixed.
-    RecordingError
-        At once, if a table of times lacks rows for frames of that range; else in place of the
-        first set that a source cannot be read for.
+    Raises at once: SessionError if `step` is less than 1, or live sources and recordings are mixed;
+    RecordingError if a table of times lacks rows for frames of that range. What cannot be read is a
+    RecordingError in place of the first set that lacks it.
     """
     live = {sensor: source for sensor, source in sources.items() if isinstance(source, LiveSource)}
     if live and len(live) < len(sources):
@@ -71,7 +69,12 @@ def pair(
 
 def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, None, None]:
     with ExitStack() as stack:
-        streams = {sensor: _stream(source, wanted) for sensor, source in sources.items()}
+        streams = {}
+        for sensor, source in sources.items():
+            frames_of = source.frames(wanted.start, wanted.stop, wanted.step)
+            if source.ahead:
+                frames_of = prefetch(frames_of, source.ahead, _more_ahead)
+            streams[sensor] = frames_of
         for stream in streams.values():
             stack.callback(stream.close)
         heads = {sensor: next(stream, None) for sensor, stream in streams.items()}
@@ -82,14 +85,10 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
                 for sensor, head in heads.items()
                 if head is not None and head.number == number
             }
-            yield FrameSet(number, _time(frames), frames)
+            times = (frame.time_s for frame in frames.values() if frame.time_s is not None)
+            yield FrameSet(number, next(times, None), frames)
             for sensor in frames:
                 heads[sensor] = next(streams[sensor], None)
-
-
-def _stream(source: Source, wanted: range) -> Generator[RawFrame, None, None]:
-    frames = source.frames(wanted.start, wanted.stop, wanted.step)
-    return prefetch(frames, source.ahead, _more_ahead) if source.ahead else frames
 
 
 def _more_ahead(frame: RawFrame) -> int:
@@ -98,5 +97,58 @@ def _more_ahead(frame: RawFrame) -> int:
     return min(MOST_MORE, READY_BYTES // max(size, 1))
 
 
-def _time(frames: Mapping[str, RawFrame]) -> float | None:
-    return next((frame.time_s for frame in frames.values() if frame.time_s is not None), None)
+def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
+    """Sources of which those named by stamps count frames alike; each keeps its own times.
+
+    A frame gets the number of the nearest one of the sensors before, if that is nearer than half
+    the usual distance between frames and has no nearer one of the same sensor.
+    """
+    stamped = {
+        name: source
+        for name, source in sources.items()
+        if isinstance(source, ImageSequence) and source.is_stamped
+    }
+    if len(stamped) < 2:
+        return dict(sources)
+    paired = dict(sources)
+    known: list[int] = []
+    reach = _SHARE * min(_usual_step(source.numbers) for source in stamped.values())
+    for name, source in stamped.items():
+        numbers = _nearest(source.numbers, known, reach)
+        paired[name] = _renumbered(source, numbers)
+        known = sorted({*known, *numbers})
+    return paired
+
+
+def _usual_step(numbers: Sequence[int]) -> float:
+    steps = [after - before for before, after in pairwise(numbers)]
+    return median(steps) if steps else float("inf")
+
+
+def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
+    """For each number the nearest known one within reach, or itself; none is given twice."""
+    owners: dict[int, tuple[int, int]] = {}
+    for place, number in enumerate(numbers):
+        at = bisect_left(known, number)
+        near = min(known[max(at - 1, 0) : at + 1], key=lambda one: abs(one - number), default=None)
+        if near is not None and abs(near - number) < reach:
+            owners[near] = min(owners.get(near, (abs(near - number), place)),
+                               (abs(near - number), place))  # fmt: skip
+    found = list(numbers)
+    for near, (_, place) in owners.items():
+        found[place] = near
+    return found
+
+
+def _renumbered(source: ImageSequence, numbers: Sequence[int]) -> ImageSequence:
+    """The same images with other numbers, and the times that they had."""
+    clock = source.clock
+    assert clock is not None, "stamps tell the time"
+    times = {new: clock(old) for new, old in zip(numbers, source.numbers, strict=True)}
+    order = sorted(range(len(numbers)), key=numbers.__getitem__)
+    return replace(
+        source,
+        paths=tuple(source.paths[i] for i in order),
+        numbers=tuple(numbers[i] for i in order),
+        clock=times.__getitem__,
+    )

@@ -27,18 +27,11 @@ def prefetch(
 ) -> Generator[T, None, None]:
     """Yield `items` in order while a worker thread fetches the next ones.
 
-    Pays where fetching releases the interpreter lock, as decoding images does.  The thread starts
+    Pays where fetching releases the interpreter lock, as decoding images does. The thread starts
     with the first ``next`` and has ended when this generator is exhausted, closed or collected;
-    `items` is advanced, and closed if it can be, in that thread only.
-
-    Parameters
-    ----------
-    items : iterator
-        What to read; an exception it raises comes out in its place, after the items before it.
-    depth : int
-        Most items that wait; one more may be on its way.
-    more : callable or None
-        Told the first item, how many more may wait.
+    `items` is advanced, and closed if it can be, in that thread only. An exception of theirs comes
+    out in its place, after the items before it. At most `depth` items wait, one more may be on its
+    way; `more`, told the first item, says how many more may wait.
     """
     waiting: SimpleQueue[_Item[T] | _End] = SimpleQueue()
     room: SimpleQueue[None] = SimpleQueue()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,38 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.csv_rows import csv_rows, finite
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, require_times
+from mixpose.frames.times import Clock, csv_rows, finite, require_times
 from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
 
 @dataclass(frozen=True)
 class RangeProfiles:
-    """Range profiles of one sensor, numbered from 0.
-
-    Attributes
-    ----------
-    path : Path
-        ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without
-        a header, a row per frame.
-    range_min, bin_size : float
-        Range of the first bin and distance from bin to bin, in length units.
-    clock : callable or None
-        Gives the time of a frame number.
-    bins : int
-        Number of bins in each profile.
-    """
+    """Range profiles of one sensor, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "profiles"
     ahead: ClassVar[int] = 0
 
+    # ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without a
+    # header, a row per frame
     path: Path
+    # range of the first bin and distance from bin to bin, in length units
     range_min: float
     bin_size: float
-    clock: Clock | None
-    bins: int
+    clock: Clock | None  # gives the time of a frame number
+    bins: int  # number of bins in each profile
 
     @cached_property
     def length(self) -> int:
@@ -93,12 +82,8 @@ class RangeProfiles:
 def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
     """Open a file of range profiles and learn its shape.
 
-    Raises
-    ------
-    SessionError
-        If `range_min` or `bin_size` is not given or makes no grid.
-    RecordingError
-        If the file is no array of frames x bins.
+    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid. Raises
+    RecordingError if the file is no array of frames x bins.
     """
     range_min = _option(spec, "range_min", spec.range_min)
     bin_size = _option(spec, "bin_size", spec.bin_size)
@@ -144,7 +129,8 @@ def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # NumPy reads the header as Python, which fails in many ways
         raise RecordingError(f"{path}: not a .npy file or cut short") from error
-    if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or not _are_counts(shape):
+    are_counts = all(type(count) is int and count > 0 for count in shape)
+    if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or not are_counts:
         order = " by columns" if by_columns else ""
         raise RecordingError(
             f"{path}: found {dtype} of shape {shape}{order}, allowed are numbers in the shape "
@@ -156,10 +142,6 @@ def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
         raise RecordingError(f"{path}: cut short: profile 0 is not whole")
     rows = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(min(held, promised), bins))
     return rows, promised, bins
-
-
-def _are_counts(shape: Sequence[Any]) -> bool:
-    return all(type(count) is int and count > 0 for count in shape)
 
 
 def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:

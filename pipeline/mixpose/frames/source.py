@@ -22,37 +22,21 @@ ALL_NUMBERS = range(-_BEYOND_ALL_NUMBERS, _BEYOND_ALL_NUMBERS)
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """What the session says about the recording of one sensor.
+    """What the session says about the recording of one sensor."""
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor; only for messages.
-    source : str or tuple of str
-        A glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a
-        list of images.
-    base : Path
-        Folder that a relative `source` starts from.
-    kind : {"camera", "lateration", "cloud"}
-        What the sensor measures.
-    resolution : (width, height) or None
-        Size of every image in px; None means like the first one.
-    times : Path or None
-        Table ``frame,time_s`` that gives frames their times; as it is opened, `base` is not put
-        before it.
-    fps : float or None
-        Frames per second: the time of frame n is n / fps.
-    range_min, bin_size : float or None
-        Range of the first bin of a profile and distance from bin to bin, in length units.
-    """
-
-    sensor: str
+    sensor: str  # name of the sensor; only for messages
+    # a glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a list
+    # of images
     source: str | tuple[str, ...]
-    base: Path
-    kind: SensorKind
+    base: Path  # folder that a relative `source` starts from
+    kind: SensorKind  # what the sensor measures
+    # size of every image in px; None means like the first one
     resolution: tuple[int, int] | None = None
+    # table ``frame,time_s`` that gives frames their times; as it is opened, `base` is not put
+    # before it
     times: Path | None = None
-    fps: float | None = None
+    fps: float | None = None  # frames per second: the time of frame n is n / fps
+    # range of the first bin of a profile and distance from bin to bin, in length units
     range_min: float | None = None
     bin_size: float | None = None
 
@@ -85,10 +69,8 @@ class Source(Protocol):
     def check_times(self, wanted: range) -> None:
         """Look for a time for each frame in a range of numbers, without decoding frames.
 
-        Raises
-        ------
-        RecordingError
-            If the table of times lacks rows, as far as the frame numbers are known in advance.
+        Raises RecordingError if the table of times lacks rows, as far as the frame numbers are
+        known in advance.
         """
 
     def frames(
@@ -96,29 +78,15 @@ class Source(Protocol):
     ) -> Generator[RawFrame, None, None]:
         """Frames by ascending number, those of ``range(start, stop, step)`` only.
 
-        Skipped frames are not decoded.  Without `start` the range begins at the first frame.
-
-        Raises
-        ------
-        RecordingError
-            In place of the first frame that cannot be read.
+        Skipped frames are not decoded. Without `start` the range begins at the first frame. Raises
+        RecordingError in place of the first frame that cannot be read.
         """
 
 
 def selection(start: int | None, stop: int | None, step: int, first: int | None) -> range:
-    """Frame numbers to read, as a range.
+    """Frame numbers to read, as by `range`; without `start` from the first, without `stop` all.
 
-    Parameters
-    ----------
-    start, stop, step : int
-        Like those of `range`; without `start` it begins at `first`, without `stop` it is open.
-    first : int or None
-        Number of the first frame there is.
-
-    Raises
-    ------
-    SessionError
-        If `step` is less than 1.
+    Raises SessionError if `step` is less than 1.
     """
     if step < 1:
         raise SessionError(f"step: found {step}, allowed is a whole number from 1")

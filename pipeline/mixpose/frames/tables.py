@@ -15,9 +15,8 @@ from typing import ClassVar, NoReturn, TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.csv_rows import csv_rows, finite, header, whole
 from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, FrameTimes, require_times
+from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, require_times, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -52,26 +51,16 @@ class DetectionTable:
 
     A table whose frames ascend is streamed, whatever its length.  One with its rows in another
     order is read whole and sorted.
-
-    Attributes
-    ----------
-    path : Path
-        The CSV file.
-    columns : tuple of str
-        Its header: ``frame`` or ``time_s`` or both, the coordinates, perhaps ``weight``.
-    coordinates : tuple of str
-        Names of the columns that make up a point, in order.
-    clock : callable or None
-        Gives the time of a frame number; None means the times in the table.
     """
 
     kind: ClassVar[SourceKind] = "detections"
     ahead: ClassVar[int] = 0
 
-    path: Path
+    path: Path  # the CSV file
+    # its header: ``frame`` or ``time_s`` or both, the coordinates, perhaps ``weight``
     columns: tuple[str, ...]
-    coordinates: tuple[str, ...]
-    clock: Clock | None
+    coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
+    clock: Clock | None  # gives the time of a frame number; None means the times in the table
 
     @property
     def length(self) -> int:
@@ -226,10 +215,7 @@ class DetectionTable:
 def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTable:
     """Read the header of a table of detections.
 
-    Raises
-    ------
-    RecordingError
-        If the file cannot be read or its header names other columns than it may.
+    Raises RecordingError if the file cannot be read or its header names other columns than it may.
     """
     coordinates = _COORDINATES[spec.kind]
     _, cells = next(csv_rows(path), (0, []))

@@ -1,15 +1,19 @@
-"""When frames were taken: from a table of times or from a rate."""
+"""When frames were taken, from a table of times or a rate; rows of CSV files, line by line.
+
+Every complaint about a cell names the file and the line.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import NoReturn, TypeAlias
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.csv_rows import csv_rows, finite, header, whole
 from mixpose.frames.source import SourceSpec
 
 Clock: TypeAlias = Callable[[int], float]
@@ -17,21 +21,19 @@ Clock: TypeAlias = Callable[[int], float]
 _COLUMNS = ["frame", "time_s"]
 _LISTED = 5  # frame numbers that a message names
 
+# As many digits as a file name may have.
+_LARGEST_NUMBER = 10**255
+
+# Characters: a profile of a million bins.
+_LONGEST_LINE = 16_000_000
+
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """A table of times; called with a frame number it gives that frame's time.
+    """A table of times; called with a frame number it gives that frame's time."""
 
-    Attributes
-    ----------
-    path : Path
-        Where the table comes from; only for messages.
-    seconds : mapping of int to float
-        Times in s by frame number.
-    """
-
-    path: Path
-    seconds: Mapping[int, float]
+    path: Path  # where the table comes from; only for messages
+    seconds: Mapping[int, float]  # times in s by frame number
 
     def __call__(self, number: int) -> float:
         """Time of frame `number` in s; RecordingError where the table has none."""
@@ -45,10 +47,7 @@ class FrameTimes:
 def read_times(path: Path) -> FrameTimes:
     """Read a table with the header ``frame,time_s``, rows in any order.
 
-    Raises
-    ------
-    RecordingError
-        If it cannot be read, a cell is no finite number or a frame comes twice.
+    Raises RecordingError if it cannot be read, a cell is no finite number or a frame comes twice.
     """
     times: dict[int, float] = {}
     rows = csv_rows(path)
@@ -76,10 +75,7 @@ def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
     """Refuse a table of times that lacks a row for one of some frames.
 
-    Raises
-    ------
-    RecordingError
-        In one line: the table, which frames it lacks and what is allowed.
+    Raises RecordingError in one line: the table, which frames it lacks and what is allowed.
     """
     missing = untimed(clock, numbers)
     if not missing:
@@ -96,12 +92,8 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 def clock_of(spec: SourceSpec) -> Clock | None:
     """What gives the frames of a source their times; None where the session does not say.
 
-    Raises
-    ------
-    SessionError
-        If both `times` and `fps` are given, or `fps` is no positive number.
-    RecordingError
-        If the table of times cannot be read.
+    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number. Raises
+    RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:
         raise SessionError(f"sensor {spec.sensor!r}: found times and fps, only one is allowed")
@@ -113,3 +105,69 @@ def clock_of(spec: SourceSpec) -> Clock | None:
     if not (math.isfinite(fps) and fps > 0):
         raise SessionError(f"sensor {spec.sensor!r}: fps: found {fps}, allowed is above 0")
     return lambda number: number / fps
+
+
+def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
+
+    Raises RecordingError if the file cannot be read as text, or a row has more or fewer cells than
+    the first.
+    """
+    width = None
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            # a line that is longer comes in pieces, and has not as many cells as the first
+            pieces = iter(partial(file.readline, _LONGEST_LINE), "")
+            reader = csv.reader(pieces, skipinitialspace=True)
+            for cells in reader:
+                if not cells or not (cells[0] or any(map(str.strip, cells))):
+                    continue
+                if width is None:
+                    width = len(cells)
+                elif len(cells) != width:
+                    raise RecordingError(
+                        f"{path}, line {reader.line_num}: found {len(cells)} cells, "
+                        f"the first row has {width}"
+                    )
+                yield reader.line_num, cells
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: not a text file in UTF-8") from error
+    except csv.Error as error:
+        raise RecordingError(f"{path}: not a CSV file: {error}") from error
+
+
+def header(cells: list[str]) -> tuple[str, ...]:
+    """Column names as they are compared: without blanks around them, in small letters."""
+    return tuple(cell.strip().casefold() for cell in cells)
+
+
+def finite(cell: str, path: Path, line: int, column: str) -> float:
+    """Read a cell as a finite number, else raise RecordingError."""
+    try:
+        value = float(cell)
+    except ValueError:
+        _complain(cell, path, line, column, "a number")
+    if not math.isfinite(value):
+        _complain(cell, path, line, column, "a finite number")
+    return value
+
+
+def whole(cell: str, path: Path, line: int, column: str) -> int:
+    """Read a cell as a whole number (``12`` or ``12.0``), else raise RecordingError."""
+    try:
+        value = int(cell)
+    except ValueError:
+        number = finite(cell, path, line, column)
+        value = int(number)
+        if value != number:
+            _complain(cell, path, line, column, "a whole number")
+    if abs(value) > _LARGEST_NUMBER:
+        _complain(cell, path, line, column, "a number of at most 255 digits")
+    return value
+
+
+def _complain(cell: str, path: Path, line: int, column: str, allowed: str) -> NoReturn:
+    found = repr(cell.strip()) if cell.strip() else "an empty cell"
+    raise RecordingError(f"{path}, line {line}: {column}: found {found}, allowed is {allowed}")

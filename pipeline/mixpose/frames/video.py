@@ -31,34 +31,20 @@ from mixpose.records import Moment, RawFrame
 
 @dataclass(frozen=True)
 class Video:
-    """A video, numbered from 0.
-
-    Attributes
-    ----------
-    address : str
-        Path of the file or pipe, or address of a stream (with ``://``).
-    resolution : (width, height) or None
-        Size that every frame must have, in px.
-    clock : callable or None
-        Gives the time of a frame number; None means the times that the video holds.
-    size : (width, height) or None
-        Size that the container states; None for a stream, which is not opened in advance.
-    promised : int or None
-        Number of frames that the container states or lets expect.
-    missing : int
-        Bytes that the file lacks; see `missing_bytes`.
-    """
+    """A video, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "video"
     ahead: ClassVar[int] = 3
     first: ClassVar[int] = 0
 
-    address: str
-    resolution: tuple[int, int] | None
+    address: str  # path of the file or pipe, or address of a stream (with ``://``)
+    resolution: tuple[int, int] | None  # size that every frame must have, in px
+    # gives the time of a frame number; None means the times that the video holds
     clock: Clock | None
+    # size that the container states; None for a stream, which is not opened in advance
     size: tuple[int, int] | None
-    promised: int | None
-    missing: int
+    promised: int | None  # number of frames that the container states or lets expect
+    missing: int  # bytes that the file lacks; see `missing_bytes`
 
     @property
     def length(self) -> int | None:
@@ -102,11 +88,8 @@ class Video:
     ) -> Generator[RawFrame, None, None]:
         """Decode the frames in the range; those between are passed over, not converted.
 
-        Raises
-        ------
-        RecordingError
-            After the frames that can be read: if the file is cut short or frames are lost.
-            The last frame of a file that is cut short may be half a frame and is left out.
+        Raises RecordingError after the frames that can be read: if the file is cut short or frames
+        are lost. The last frame of a file that is cut short may be half a frame and is left out.
         """
         wanted = selection(start, stop, step, self.first)
         with _opened(self.address) as capture:
@@ -185,10 +168,7 @@ class Video:
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
     """Open a video to learn its size and length; a stream or a pipe is left for later.
 
-    Raises
-    ------
-    RecordingError
-        If it does not open.
+    Raises RecordingError if it does not open.
     """
     if is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)

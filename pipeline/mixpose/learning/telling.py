@@ -14,7 +14,7 @@ from mixpose.learning.adjusting import Learnt
 from mixpose.learning.axes import body_of
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats
-from mixpose.session.markers import LEARNT_COLUMNS
+from mixpose.session.marker_files import LEARNT_COLUMNS
 
 MARK = ",".join(LEARNT_COLUMNS)
 """By which mixpose knows the tables that it wrote."""

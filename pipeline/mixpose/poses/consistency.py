@@ -1,35 +1,34 @@
-"""Whether covariances tell the truth."""
+"""What errors say together: whether covariances are right, or one transform is wrong."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from mixpose import rigid
 from mixpose.records import Floats
 
 CONFIDENCE = 0.95
 
+_FEWEST = 5  # frames
+_ZERO = 1e-9  # of a length that is written
+_LEFT = 0.1  # of the errors, at most, for a constant transform to explain them
+
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether the covariances tell the truth, over "ok" frames that have one.
-
-    Attributes
-    ----------
-    frames : int
-    nees_per_dimension : float
-        Mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they
-        promise too much.
-    inside_95 : float
-        Share of frames whose truth lies inside the 95 % ellipsoid.
-    """
+    """Whether the covariances tell the truth, over "ok" frames that have one."""
 
     frames: int
+    # mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they promise
+    # too much
     nees_per_dimension: float
-    inside_95: float
+    inside_95: float  # share of frames whose truth lies inside the 95 % ellipsoid
 
 
 def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
@@ -46,22 +45,11 @@ def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
 
 
 def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
-    """Mahalanobis distance squared of an error, and its number of dimensions.
+    """Mahalanobis distance squared of an error (6,), and its dimensions: the rank of the
+    covariance.
 
     Only directions that the covariance leaves free count: an axis that is held at the start pose
-    has no variance, and its error no measure.
-
-    Parameters
-    ----------
-    twist : (6,) array
-    covariance : (6, 6) array
-
-    Returns
-    -------
-    nees : float or None
-        None if the covariance leaves no direction free.
-    dimensions : int
-        Rank of the covariance.
+    has no variance, and its error no measure. None where it leaves none free.
     """
     variance = np.diag(covariance)
     kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)
@@ -75,3 +63,72 @@ def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float |
     if not dimensions:
         return None, 0
     return float(np.sum(along[kept] ** 2 / values[kept])), dimensions
+
+
+@dataclass(frozen=True)
+class ConstantOffset:
+    """A transform that takes all poses near to the truth."""
+
+    # whether it stands right of the poses, ``T_truth = T_pose T``, or left of them
+    of: Literal["object", "world"]
+    T: Floats  # (4, 4)
+    # RMS errors that are left with it
+    rotation_deg: float
+    translation: float
+
+    def text(self, unit: str) -> str:
+        """In words."""
+        turn = float(rigid.rotation_angle_deg(self.T, np.eye(4)))
+        moved = np.where(np.abs(self.T[:3, 3]) < _ZERO, 0.0, self.T[:3, 3])
+        shift = ", ".join(f"{value:.4g}" for value in moved)
+        asked = {
+            "object": "has the truth another origin or other axes of the object?",
+            "world": "is the truth in another frame of the world?",
+        }
+        return (
+            f"one transform explains most of this, in the axes of the {self.of}: turned by "
+            f"{turn:.4g} deg, moved by ({shift}) {unit}; with it errors are "
+            f"{self.rotation_deg:.4g} deg and {self.translation:.4g} {unit} RMS: {asked[self.of]}"
+        )
+
+
+def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | None:
+    """The transform that explains most of the errors of poses with their truths, where one does.
+
+    Bodies that hardly move tell nothing.
+    """
+    if len(pairs) < _FEWEST:
+        return None
+    poses, truth = (np.stack(each) for each in zip(*pairs, strict=True))
+    before = _rms(poses, truth)
+    moving = _rms(np.broadcast_to(truth[:1], truth.shape), truth)
+    if (moving < before).all():
+        return None
+    of_object = _mean(rigid.inverse(poses) @ truth)
+    of_world = _mean(truth @ rigid.inverse(poses))
+    found = [
+        ConstantOffset("object", of_object, *_rms(poses @ of_object, truth).tolist()),
+        ConstantOffset("world", of_world, *_rms(of_world @ poses, truth).tolist()),
+    ]
+    good = [each for each in found if _explains(before, each)]
+    return min(good, key=lambda each: each.translation) if good else None
+
+
+def _explains(before: Floats, found: ConstantOffset) -> bool:
+    """Whether one kind of error nearly vanishes, and the other grows no larger."""
+    after = np.array([found.rotation_deg, found.translation])
+    return bool((after < _LEFT * before).any() and (after < 1.1 * before).all())
+
+
+def _mean(motions: Floats) -> Floats:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = motions[:, :3, 3].mean(axis=0)
+    return T
+
+
+def _rms(one: Floats, other: Floats) -> Floats:
+    """Of angles in degrees and of distances (2,)."""
+    twists = rigid.twist_between(one, other).reshape(-1, 2, 3)
+    rms = np.sqrt((twists**2).sum(axis=2).mean(axis=0))[::-1]
+    return np.asarray(rms * [180 / np.pi, 1.0])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
+from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
 from mixpose.records import Estimate
 
 _UPPER = np.triu_indices(6)
@@ -26,40 +26,25 @@ COVARIANCE_COLUMNS = tuple(
 SENSOR_COLUMNS = ("used", "explained", "rms")
 
 
-class CsvWriter:
+class CsvWriter(PoseWriter):
     """Writes one row per frame; what a frame does not have is an empty cell.
 
     Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
     behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
     covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; confidence; score;
-    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor; latency_ms.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-        Its `sensors` give the sensor columns; where there are none, the first frame does.
+    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor, which the header
+    names or else the first frame; latency_ms.
     """
 
     def __init__(self, stream: TextIO, header: Header) -> None:
-        self._stream = stream
+        super().__init__(stream, header)
         self._rows = csv.writer(stream, lineterminator="\n")
-        self._unit = header.unit
         self._numbered = any(count > 1 for count in header.objects.values())
         self._sensors: tuple[str, ...] | None = None
         if header.sensors:
             self._write_columns(header.sensors)
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the row of one frame and flush it.
-
-        Raises
-        ------
-        ValueError
-            If the frame reports on a sensor that has no columns.
-        """
-        require_finite(estimate)
+    def _write(self, estimate: Estimate) -> None:
         if self._sensors is None:
             self._write_columns(tuple(estimate.sensors))
         unknown = set(estimate.sensors) - set(self._sensors or ())
@@ -71,21 +56,20 @@ class CsvWriter:
             estimate.object,
             *([estimate.instance] if self._numbered else []),
             estimate.status,
-            self._unit,
+            self._header.unit,
             *_pose_cells(estimate),
             plain_or_none(estimate.confidence),
-            plain(estimate.score),
+            plain(1.0 if estimate.score is None else estimate.score),
             *self._sensor_cells(estimate),
-            plain(estimate.latency_ms),
+            plain(estimate.latency_ms or 0.0),
         ]
         self._rows.writerow(row)  # csv writes None as an empty cell and floats by repr
-        self._stream.flush()
 
     def close(self) -> None:
-        """Write the column names if no row did, and flush; the stream stays open."""
+        """Write the column names if no row did, and flush."""
         if self._sensors is None:
             self._write_columns(())
-        self._stream.flush()
+        super().close()
 
     def _write_columns(self, sensors: tuple[str, ...]) -> None:
         self._sensors = sensors

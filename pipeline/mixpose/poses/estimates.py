@@ -1,4 +1,4 @@
-"""Pose lines as estimates again, so that every writer can write them."""
+"""Pose lines as estimates again, in other units and axes, so that every writer can write them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mixpose.poses.header import Header
+from mixpose import rigid
+from mixpose.poses.header import Header, length_ratio
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate, Floats, Hypothesis
 
 
 def header_of(poses: PoseFile, unit: str, version: str) -> Header:
@@ -28,35 +29,6 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         objects=objects_of(poses.poses),
         smoothed=found.get("smoothed", {}),
     )
-
-
-def estimate_of(line: PoseLine) -> Estimate:
-    """The estimate of a line; a line without a score, as of a truth file, is certain: 1."""
-    return Estimate(
-        frame=line.frame,
-        time_s=line.time_s,
-        object=line.object,
-        status=line.status,
-        T_world_object=line.T_world_object,
-        covariance=line.covariance,
-        score=1.0 if line.score is None else line.score,
-        sensors=line.sensors,
-        hypotheses=line.hypotheses,
-        latency_ms=0.0 if line.latency_ms is None else line.latency_ms,
-        instance=line.instance,
-        confidence=line.confidence,
-        points=line.points,
-        tip_object=tip_in_object(line),
-        filled=line.filled,
-    )
-
-
-def tip_in_object(line: PoseLine) -> Floats | None:
-    """The tip of a line's body in the coordinates of the body, (3,); None where it tells none."""
-    T = line.T_world_object
-    if T is None or line.tip is None:
-        return None
-    return np.asarray(T[:3, :3].T @ (line.tip - T[:3, 3]))
 
 
 def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
@@ -92,3 +64,32 @@ def first_answers(lines: Iterable[PoseLine]) -> list[PoseLine]:
     for line in lines:
         first.setdefault((line.frame, line.label), line)
     return list(first.values())
+
+
+def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
+    """The same motions with their lengths in another unit, if the file states its own."""
+    if unit is None or file.unit is None or file.unit == unit:
+        return file
+    ratio = length_ratio(file.unit, unit)
+
+    def scaled(T: Floats) -> Floats:
+        return rigid.from_parts(T[..., :3, :3], T[..., :3, 3] * ratio)
+
+    twist_scale = np.array([ratio] * 3 + [1.0] * 3)
+    lines = tuple(
+        replace(
+            line,
+            T_world_object=None if line.T_world_object is None else scaled(line.T_world_object),
+            covariance=(
+                None
+                if line.covariance is None
+                else line.covariance * twist_scale[:, None] * twist_scale
+            ),
+            hypotheses=tuple(
+                Hypothesis(scaled(rival.T_world_object), rival.weight) for rival in line.hypotheses
+            ),
+        )
+        for line in file.poses
+    )
+    symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}
+    return replace(file, poses=lines, unit=unit, symmetries=symmetries)

@@ -28,12 +28,17 @@ import numpy as np
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.consistency import Consistency, consistency, normalised_error_squared
-from mixpose.poses.constant_offset import ConstantOffset, constant_offset
+from mixpose.poses.consistency import (
+    Consistency,
+    ConstantOffset,
+    consistency,
+    constant_offset,
+    normalised_error_squared,
+)
+from mixpose.poses.estimates import in_unit
 from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.units import in_unit
 from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5
@@ -43,32 +48,20 @@ FrameKey: TypeAlias = tuple[int, str]
 
 @dataclass(frozen=True)
 class FrameError:
-    """What one frame's pose of one body is worth; `object` numbers identical ones.
-
-    Attributes
-    ----------
-    status : {"ok", "ambiguous", "lost", "missing"}
-        "missing" where the poses file has no line for a frame of the truth file.
-    twist : (6,) float64 or None
-        From the right answer to the pose, ``(x, y, z, rx, ry, rz)``, lengths and radians.
-    best_twist : (6,) float64 or None
-        The same for the best of an ambiguous frame's hypotheses; the pose is one of them.
-    nees : float or None
-        Normalised estimation error squared; None without a covariance.
-    dimensions : int
-        Directions in which the covariance lets the pose err; what `nees` is expected to be.
-    pair : pair of (4, 4) float64, or None
-        Pose and right answer.
-    """
+    """What one frame's pose of one body is worth; `object` numbers identical ones."""
 
     frame: int
     object: str
+    # "missing" where the poses file has no line for a frame of the truth file
     status: Status | Literal["missing"]
+    # (6,), from the right answer to the pose, ``(x, y, z, rx, ry, rz)``, lengths and radians
     twist: Floats | None = None
+    # (6,), the same for the best of an ambiguous frame's hypotheses; the pose is one of them
     best_twist: Floats | None = None
-    nees: float | None = None
+    nees: float | None = None  # normalised estimation error squared; None without a covariance
+    # directions in which the covariance lets the pose err; what `nees` is expected to be
     dimensions: int = 0
-    pair: tuple[Floats, Floats] | None = field(default=None, compare=False)
+    pair: tuple[Floats, Floats] | None = field(default=None, compare=False)  # pose and right answer
 
 
 @dataclass(frozen=True)
@@ -84,57 +77,35 @@ class Spread:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The outcome of an evaluation.
+    """The outcome of an evaluation."""
 
-    Attributes
-    ----------
-    unit : str or None
-        Unit of lengths; None where neither file says it.
-    frames : int
-        Frames of the truth file: the sum of the four counts that follow.
-    ok, ambiguous, lost, missing : int
-        By status; "missing" frames have no line in the poses file.
-    without_truth : int
-        Pose lines that the truth file says nothing about; they count nowhere else.
-    rotation_deg, translation : Spread or None
-        Over frames with a pose, "ambiguous" ones included; None without such a frame.
-    per_axis_rms : mapping or None
-        RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`;
-        lengths and degrees.
-    ok_rotation_deg, ok_translation : Spread or None
-        Over "ok" frames alone; None without such a frame.
-    best_rotation_deg, best_translation : Spread or None
-        Over ambiguous frames: the error of the best hypothesis.
-    nees : Consistency or None
-        None where no "ok" frame has a covariance.
-    bodies : mapping of str to Evaluation
-        Each body by itself, where there are several.
-    swaps : Swaps or None
-        None where no bodies are identical.
-    offset : ConstantOffset or None
-        The one transform that explains most of the errors of "ok" frames, if there is one.
-    exchanged : bool
-        Whether the truth has covariances, as estimates do, and the poses have none.
-    """
-
-    unit: str | None
-    frames: int
+    unit: str | None  # unit of lengths; None where neither file says it
+    frames: int  # frames of the truth file: the sum of the four counts that follow
+    # by status; "missing" frames have no line in the poses file
     ok: int
     ambiguous: int
     lost: int
     missing: int
-    without_truth: int
+    without_truth: int  # pose lines that the truth file says nothing about; they count nowhere else
+    # over frames with a pose, "ambiguous" ones included; None without such a frame
     rotation_deg: Spread | None
     translation: Spread | None
+    # RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`; lengths and
+    # degrees
     per_axis_rms: Mapping[str, float] | None
+    # over "ok" frames alone; None without such a frame
     ok_rotation_deg: Spread | None
     ok_translation: Spread | None
+    # over ambiguous frames: the error of the best hypothesis
     best_rotation_deg: Spread | None
     best_translation: Spread | None
-    nees: Consistency | None
+    nees: Consistency | None  # None where no "ok" frame has a covariance
+    # each body by itself, where there are several
     bodies: Mapping[str, Evaluation] = field(default_factory=dict)
-    swaps: Swaps | None = None
+    swaps: Swaps | None = None  # None where no bodies are identical
+    # the one transform that explains most of the errors of "ok" frames, if there is one
     offset: ConstantOffset | None = None
+    # whether the truth has covariances, as estimates do, and the poses have none
     exchanged: bool = False
 
 
@@ -148,14 +119,9 @@ def evaluate(poses: PoseFile, truth: PoseFile, *, numbered: bool = False) -> Eva
 
     `numbered` says that identical bodies have the numbers of the truth already.
 
-    Errors are given in the unit of the poses; a file that states no unit is taken to be in
-    that of the other.
-
-    Raises
-    ------
-    RecordingError
-        If the truth holds no pose, the files have no object in common, or a frame stands twice
-        in the poses.
+    Errors are given in the unit of the poses; a file that states no unit is taken to be in that of
+    the other. Raises RecordingError if the truth holds no pose, the files have no object in
+    common, or a frame stands twice in the poses.
     """
     swaps = None
     if not numbered:
@@ -220,21 +186,12 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
 
 
 def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
-    """Compare poses with the truth frame by frame.
+    """Compare poses with the truth, one by one: per frame and body of the truth, in its order.
 
-    Truth lines without a pose say nothing and are passed over.  Symmetries of an object are those
-    that the truth's header names; if it names none, those of the poses' header.
-
-    Returns
-    -------
-    tuple of FrameError
-        One per frame and body of the truth, in its order, in the unit of the poses.  Identical
-        bodies are taken by their numbers.
-
-    Raises
-    ------
-    RecordingError
-        As `evaluate`.
+    They are in the unit of the poses; identical bodies are taken by their numbers. Truth lines
+    without a pose say nothing and are passed over. Symmetries of an object are those that the
+    truth's header names; if it names none, those of the poses' header. Raises RecordingError as
+    `evaluate`.
     """
     unit = poses.unit or truth.unit
     truth = in_unit(truth, unit)

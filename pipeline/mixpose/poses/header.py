@@ -18,43 +18,25 @@ UNITS_PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "um
 
 @dataclass(frozen=True)
 class Header:
-    """The facts that hold for every pose of a run.
+    """The facts that hold for every pose of a run."""
 
-    Attributes
-    ----------
-    unit : str
-        "m", "cm", "mm" or "um": the unit of every length in the file.
-    session : str or None
-        Path of the session file; None where there is none.
-    session_sha256 : str or None
-        SHA-256 of the session file, in hexadecimal.
-    mixpose : str
-        Version of mixpose that made the poses.
-    seed : int
-    symmetries : mapping of object name to (n, 4, 4) array
-        Motions T_object_object that map the object's features onto themselves, identity included.
-    sources : mapping of str to str
-        Recordings given in place of the session's, by sensor name; the line has them only where
-        there are any.
-    objects : mapping of str to int
-        Names of all bodies with how many there are of each, in the order of their pose lines;
-        the line has them only where there are several.  Empty: not known.
-    sensors : tuple of str
-        Names of all sensors of the session, in its order.  Only the CSV table needs them, for
-        its columns; they are not written into JSON lines.
-    smoothed : mapping of str to mapping
-        By which model the poses of each body were smoothed; empty where they were not.
-    """
-
-    unit: str
-    session: str | None
-    session_sha256: str | None
-    mixpose: str
+    unit: str  # "m", "cm", "mm" or "um": the unit of every length in the file
+    session: str | None  # path of the session file; None where there is none
+    session_sha256: str | None  # SHA-256 of the session file, in hexadecimal
+    mixpose: str  # version of mixpose that made the poses
     seed: int
+    # motions T_object_object that map the object's features onto themselves, identity included
     symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
+    # recordings given in place of the session's, by sensor name; the line has them only where there
+    # are any
     sources: Mapping[str, str] = field(default_factory=dict)
+    # Names of all sensors of the session, in its order.  Only the CSV table needs them, for its
+    # columns; they are not written into JSON lines.
     sensors: tuple[str, ...] = ()
+    # Names of all bodies with how many there are of each, in the order of their pose lines; the
+    # line has them only where there are several.  Empty: not known.
     objects: Mapping[str, int] = field(default_factory=dict)
+    # by which model the poses of each body were smoothed; empty where they were not
     smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property

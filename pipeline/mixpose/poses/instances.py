@@ -26,18 +26,11 @@ Pairs: TypeAlias = list[tuple[int, int, float]]
 
 @dataclass(frozen=True)
 class Swaps:
-    """How often identical bodies changed places.
+    """How often identical bodies changed places."""
 
-    Attributes
-    ----------
-    count : int
-        Bodies that are followed where another one of the truth is, at each change.
-    announced : int
-        Of these, those where the body was not ok in the frame itself or in one since it last was
-        nearest to the one before.
-    """
-
-    count: int = 0
+    count: int = 0  # bodies that are followed where another one of the truth is, at each change
+    # of these, those where the body was not ok in the frame itself or in one since it last was
+    # nearest to the one before
     announced: int = 0
 
 
@@ -46,12 +39,7 @@ def renumbered(
 ) -> tuple[tuple[PoseLine, ...], Swaps]:
     """Poses whose identical bodies have the numbers of the truth, and how often they swap.
 
-    Parameters
-    ----------
-    poses, truth : sequence of PoseLine
-        In one unit.
-    symmetries : mapping of str to (n, 4, 4) array
-        By name of object.
+    Poses and truth are in one unit; symmetries (n, 4, 4) are by the name of the object.
     """
     swaps, numbers = Swaps(), dict[tuple[str, int | None], int | None]()
     for name in dict.fromkeys(line.object for line in truth if line.instance is not None):

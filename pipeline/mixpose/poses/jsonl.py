@@ -15,51 +15,31 @@ from mixpose import rigid
 from mixpose.errors import RecordingError, SessionError
 from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
-from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
+from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
 from mixpose.records import Estimate, Floats, Label, MeasuredPoint
 
 _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
 
 
-class JsonlWriter:
-    """Writes a header line and a line per frame.
+class JsonlWriter(PoseWriter):
+    """Writes a header line, unless a run goes on in a file that has it, and a line per frame.
 
     Lines are ASCII (other characters are escaped), so that the bytes depend on no locale.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-    resume : bool
-        Go on in a file that has its header already.
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
-        self._stream = stream
+        super().__init__(stream, header)
         if not resume:
             self._write_line(header_line(header))
+            self._stream.flush()
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the line of one frame and flush it.
-
-        Raises
-        ------
-        ValueError
-            If the estimate holds a value that is not finite.
-        """
-        require_finite(estimate)
+    def _write(self, estimate: Estimate) -> None:
         self._write_line(pose_line(estimate))
-
-    def close(self) -> None:
-        """Flush; the stream stays open."""
-        self._stream.flush()
 
     def _write_line(self, line: Mapping[str, Any]) -> None:
         # One call for the whole line: an interruption rarely leaves half of it.
         self._stream.write(json.dumps(line, allow_nan=False) + "\n")
-        self._stream.flush()
 
 
 def header_line(header: Header) -> dict[str, Any]:
@@ -101,7 +81,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         "quaternion_xyzw": plain_or_none(turn),
         "covariance": plain_or_none(covariance),
         "confidence": plain_or_none(estimate.confidence),
-        "score": plain(estimate.score),
+        "score": plain(1.0 if estimate.score is None else estimate.score),
         "sensors": {
             name: {
                 "used": bool(report.used),
@@ -121,7 +101,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
             }
             for rival in estimate.hypotheses
         ],
-        "latency_ms": plain(estimate.latency_ms),
+        "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
         **({"filled": True} if estimate.filled else {}),
     }
@@ -161,39 +141,22 @@ def _points(points: Mapping[str, MeasuredPoint]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PoseFile:
-    """A poses or truth file.
-
-    Attributes
-    ----------
-    path : Path
-    header : mapping
-        The header line as it stands; empty where the file has none.
-    poses : tuple of PoseLine
-        In the order of the file.
-    unit : str or None
-        Unit of all lengths; None where no header says it.
-    symmetries : mapping of object name to (n, 4, 4) array
-        In the unit of the file.
-    """
+    """A poses or truth file."""
 
     path: Path
-    header: Mapping[str, Any]
-    poses: tuple[PoseLine, ...]
-    unit: str | None = None
-    symmetries: Mapping[str, Floats] = field(default_factory=dict)
+    header: Mapping[str, Any]  # the header line as it stands; empty where the file has none
+    poses: tuple[PoseLine, ...]  # in the order of the file
+    unit: str | None = None  # unit of all lengths; None where no header says it
+    symmetries: Mapping[str, Floats] = field(default_factory=dict)  # in the unit of the file
 
 
 def read_poses(path: str | Path) -> PoseFile:
     """Read a poses or truth file.
 
-    A line needs `frame`, `object` and `T_world_object`; everything else, the header included,
-    may be left out, and unknown keys are passed over.
-
-    Raises
-    ------
-    RecordingError
-        With file and line, if the file or a line of it is not as the format says, a last line
-        cut off by an interruption included.
+    A line needs `frame`, `object` and `T_world_object`; everything else, the header included, may
+    be left out, and unknown keys are passed over. Raises RecordingError with file and line, if the
+    file or a line of it is not as the format says, a last line cut off by an interruption
+    included.
     """
     path = Path(path)
     return _parse(path, _read_bytes(path))
@@ -202,17 +165,8 @@ def read_poses(path: str | Path) -> PoseFile:
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
     """Read a poses file that a run may still be writing, or was interrupted in.
 
-    Returns
-    -------
-    poses : PoseFile
-        Without a last line that was cut off.
-    cut : bool
-        Whether there was one.
-
-    Raises
-    ------
-    RecordingError
-        As `read_poses`, for every line but a last one that was cut off.
+    A last line that was cut off is left out; whether there was one is said beside the poses. Raises
+    RecordingError as `read_poses`, for every other line.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -231,46 +185,22 @@ def _is_json(line: bytes) -> bool:
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """The last whole line of an interrupted run.
+    """The last whole line of an interrupted run."""
 
-    Attributes
-    ----------
-    frame : int
-        Its frame.
-    lines : int
-        Lines of this frame.
-    size, checksum : int
-        Of the file up to its end: bytes and CRC-32.
-    """
-
-    frame: int
-    lines: int
+    frame: int  # its frame
+    lines: int  # lines of this frame
+    # of the file up to its end: bytes and CRC-32
     size: int
     checksum: int
 
 
 def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
-    """Find the frame that an interrupted run wrote last.
+    """Find the frame that an interrupted run wrote last, for a run with this header to go on.
 
-    Parameters
-    ----------
-    path : path
-        What the interrupted run wrote; it is left as it is.
-    header : Header
-        Header of the run that is to go on.
-
-    Returns
-    -------
-    ResumePoint or None
-        What follows it is a half-written line, to be cut off.  None where no frame is whole or no
-        file is there: the caller writes the file afresh.
-
-    Raises
-    ------
-    SessionError
-        If the file is of another session, seed, unit, recording or version of mixpose.
-    RecordingError
-        If the file is not a poses file.
+    What follows it is a half-written line, to be cut off. None where no frame is whole or no file
+    is there: the caller writes the file afresh. Raises SessionError if the file is of another
+    session, seed, unit, recording or version of mixpose, and RecordingError if it is not a poses
+    file.
     """
     path = Path(path)
     if not path.exists():

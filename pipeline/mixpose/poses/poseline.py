@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -12,15 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import FORMAT, UNITS_PER_METRE, VERSION
-from mixpose.records import (
-    Floats,
-    Hypothesis,
-    Label,
-    MeasuredPoint,
-    SensorReport,
-    Status,
-    label_of,
-)
+from mixpose.records import Estimate, Floats, Hypothesis, Label, MeasuredPoint, SensorReport, Status
 
 # Files by other people round their rotations to a few digits.
 RIGID_TOLERANCE = 1e-3
@@ -28,42 +20,10 @@ _LARGEST = 1e100  # squares of larger lengths would overflow
 
 
 @dataclass(frozen=True)
-class PoseLine:
-    """A pose line as read; the fields are those of `mixpose.records.Estimate`.
+class PoseLine(Estimate):
+    """A pose line as read; one without a score, as of a truth file, counts as certain."""
 
-    Attributes
-    ----------
-    line : int
-        Where it stands in the file, from 1.
-    score : float or None
-        None where the line has none.
-    tip : (3,) float64 or None
-        Where the body's tip is in the world.
-    filled : bool
-        Whether nothing was measured in this frame.
-    """
-
-    line: int
-    frame: int
-    time_s: float | None
-    object: str
-    status: Status
-    T_world_object: Floats | None
-    covariance: Floats | None
-    score: float | None
-    sensors: Mapping[str, SensorReport]
-    hypotheses: tuple[Hypothesis, ...]
-    latency_ms: float | None
-    instance: int | None = None
-    confidence: float | None = None
-    points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
-    tip: Floats | None = None
-    filled: bool = False
-
-    @property
-    def label(self) -> str:
-        """The body in one word."""
-        return label_of(self.object, self.instance)
+    line: int = 0  # where it stands in the file, from 1
 
 
 _Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -130,19 +90,9 @@ _Checked = TypeVar("_Checked", bound=_Line)
 
 
 def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
-    """Check the JSON object of a pose line.
+    """Check the JSON object of a pose line, `where` being ``file:line`` for messages.
 
-    Parameters
-    ----------
-    values : mapping
-    where : str
-        ``file:line``, for messages.
-    line : int
-        Number of the line, from 1.
-
-    Raises
-    ------
-    RecordingError
+    Raises RecordingError.
     """
     pose = _checked(_Pose, values, where)
     matrix = pose.T_world_object
@@ -174,9 +124,14 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             name: MeasuredPoint(np.array(point.at), point.residual)
             for name, point in pose.points.items()
         },
-        tip=None if pose.tip is None else np.array(pose.tip, dtype=np.float64),
+        tip_object=_in_object(T, pose.tip),
         filled=pose.filled,
     )
+
+
+def _in_object(T: Floats | None, tip: list[float] | None) -> Floats | None:
+    """The tip in the coordinates of the body, (3,)."""
+    return None if T is None or tip is None else np.asarray(T[:3, :3].T @ (tip - T[:3, 3]))
 
 
 def _report(sensor: _Sensor) -> SensorReport:
@@ -193,9 +148,7 @@ def _report(sensor: _Sensor) -> SensorReport:
 def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:
     """Check the JSON object of a header line and return its unit and symmetries.
 
-    Raises
-    ------
-    RecordingError
+    Raises RecordingError.
     """
     header = _checked(_Header, values, where)
     if header.format != FORMAT:

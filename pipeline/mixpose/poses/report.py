@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from mixpose import rigid
 from mixpose.poses.evaluate import Evaluation, Spread
 
+_COUNTED = ("unit", "frames", "ok", "ambiguous", "lost", "missing", "without_truth")
 _STATISTICS = ("rms", "median", "p95", "max")
 
 
@@ -17,33 +19,17 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
     the world's axes; ``ok_frames`` the errors of frames that are ok alone; ``best_hypothesis``
     those of the best hypothesis of ambiguous frames.
     """
-    nees = evaluation.nees
+    nees, unit = evaluation.nees, evaluation.unit
     per_axis = evaluation.per_axis_rms
-    has_hypotheses = evaluation.best_rotation_deg is not None
+    ok_rotation, best_rotation = evaluation.ok_rotation_deg, evaluation.best_rotation_deg
+    ok = _errors(ok_rotation, evaluation.ok_translation, unit)
+    best = _errors(best_rotation, evaluation.best_translation, unit)
     return {
-        "unit": evaluation.unit,
-        "frames": evaluation.frames,
-        "ok": evaluation.ok,
-        "ambiguous": evaluation.ambiguous,
-        "lost": evaluation.lost,
-        "missing": evaluation.missing,
-        "without_truth": evaluation.without_truth,
-        "rotation_deg": _spread_dict(evaluation.rotation_deg),
-        "translation": _length_dict(evaluation.translation, evaluation.unit),
+        **{key: getattr(evaluation, key) for key in _COUNTED},
+        **_errors(evaluation.rotation_deg, evaluation.translation, unit),
         "per_axis": None if per_axis is None else dict(per_axis),
-        "ok_frames": None
-        if evaluation.ok_rotation_deg is None
-        else {
-            "rotation_deg": _spread_dict(evaluation.ok_rotation_deg),
-            "translation": _length_dict(evaluation.ok_translation, evaluation.unit),
-        },
-        "best_hypothesis": {
-            "frames": evaluation.ambiguous,
-            "rotation_deg": _spread_dict(evaluation.best_rotation_deg),
-            "translation": _length_dict(evaluation.best_translation, evaluation.unit),
-        }
-        if has_hypotheses
-        else None,
+        "ok_frames": None if ok_rotation is None else ok,
+        "best_hypothesis": {"frames": evaluation.ambiguous, **best} if best_rotation else None,
         "nees": None
         if nees is None
         else {
@@ -70,8 +56,7 @@ def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
     if evaluation.bodies:
         found["bodies"] = {label: as_dict(one) for label, one in evaluation.bodies.items()}
     if evaluation.swaps is not None:
-        swaps = evaluation.swaps
-        found["swaps"] = {"count": swaps.count, "announced": swaps.announced}
+        found["swaps"] = asdict(evaluation.swaps)
     return found
 
 
@@ -184,18 +169,10 @@ def _row(name: str, cells: list[str]) -> str:
     return name.ljust(24) + "".join(cell.rjust(11) for cell in cells)
 
 
-def _spread_dict(spread: Spread | None) -> dict[str, Any] | None:
-    if spread is None:
-        return None
+def _errors(
+    rotation: Spread | None, translation: Spread | None, unit: str | None
+) -> dict[str, Any]:
     return {
-        "rms": spread.rms,
-        "median": spread.median,
-        "p95": spread.p95,
-        "max": spread.max,
-        "worst_frame": spread.worst_frame,
+        "rotation_deg": None if rotation is None else asdict(rotation),
+        "translation": None if translation is None else {**asdict(translation), "unit": unit},
     }
-
-
-def _length_dict(spread: Spread | None, unit: str | None) -> dict[str, Any] | None:
-    values = _spread_dict(spread)
-    return None if values is None else {**values, "unit": unit}

@@ -15,48 +15,30 @@ import numpy as np
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import UNITS_PER_METRE, Header
-from mixpose.poses.plain import plain, pose_of, require_finite
-from mixpose.poses.stamps import Stamps
+from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate, Floats
 
 _LARGEST_SECOND = 2**31 - 1  # builtin_interfaces/Time counts them in an int32
 
 
-class RosWriter:
+class RosWriter(PoseWriter):
     """Writes a YAML document per frame that has a pose; lost frames are left out.
 
-    Metres and radians.  The covariance is that of mixpose, which has the order and the axes of
-    the message, row by row in m², m·rad and rad²; 36 zeros, which say "unknown", where there is
-    none.  A comment in front of each message names its frame and status.
-
-    Parameters
-    ----------
-    stream : text stream
-        Stays open; it belongs to the caller.
-    header : Header
-    frame_id : str
-        What the poses are relative to.
+    Metres and radians, relative to `frame_id`. The covariance is that of mixpose, which has the
+    order and the axes of the message, row by row in m², m·rad and rad²; 36 zeros, which say
+    "unknown", where there is none. A comment in front of each message names its frame and status.
     """
 
     def __init__(self, stream: TextIO, header: Header, *, frame_id: str = "world") -> None:
-        self._stream = stream
-        self._unit = header.unit
+        super().__init__(stream, header)
         self._stamps = Stamps(stream, "ros")
         self._frame_id = frame_id
 
-    def write(self, estimate: Estimate) -> None:
-        """Write the message of one frame and flush it.
-
-        Raises
-        ------
-        RecordingError
-            If some frames have a time and others have none, or a time is beyond the message's.
-        """
-        require_finite(estimate)
+    def _write(self, estimate: Estimate) -> None:
         if pose_of(estimate) is None:
             return
         seconds = self._stamps.time_of(estimate)
-        message = pose_message(estimate, self._unit, seconds, self._frame_id)
+        message = pose_message(estimate, self._header.unit, seconds, self._frame_id)
         header, posed = message["header"], message["pose"]
         self._stream.write(
             f"# frame {estimate.frame}, {estimate.status}\n"
@@ -75,11 +57,6 @@ class RosWriter:
             + "".join(f"  - {_number(value)}\n" for value in posed["covariance"])
             + "---\n"
         )
-        self._stream.flush()
-
-    def close(self) -> None:
-        """Flush; the stream stays open."""
-        self._stream.flush()
 
 
 def pose_message(
@@ -87,21 +64,8 @@ def pose_message(
 ) -> dict[str, Any]:
     """A geometry_msgs/msg/PoseWithCovarianceStamped, its fields by name, in metres and radians.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Which has a pose.
-    unit : str
-        Of its lengths.
-    seconds : float
-        The stamp.
-    frame_id : str
-        What the pose is relative to.
-
-    Raises
-    ------
-    RecordingError
-        If the stamp is beyond what a message can say.
+    The estimate has a pose, in `unit`, relative to `frame_id`. Raises RecordingError if the stamp
+    is beyond what a message can say.
     """
     T, per_metre = estimate.T_world_object, UNITS_PER_METRE[unit]
     assert T is not None, "lost frames have no message"

@@ -1,46 +1,49 @@
-"""Trajectories of labelled markers, as files for programs that study movement have them."""
+"""Trajectories of labelled markers, as files for programs that study movement have them.
+
+TRC: tables, as OpenSim and Cortex read them,
+https://opensimconfluence.atlassian.net/wiki/spaces/OpenSim/pages/53089972
+C3D: in binary, as most programs for movement read them (c3d.org); needs the package `ezc3d`.
+"""
 
 from __future__ import annotations
 
+import re
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from mixpose.errors import RecordingError
+from mixpose.poses.header import length_ratio
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Mask
+
+TRC_MARK = "by mixpose"
+"""In the first line of files that mixpose wrote."""
+
+LAST_FRAME = 2**16 - 2
+"""Frames are numbered from 1, in 16 bits; some readers count one beyond the last."""
+
+_SENSORS = 7  # that a bit each says of whether they measured a point
+_STEPS = 127  # of a residual, which is a signed byte for some readers
+_SCALE_AT = 12  # byte of the header where the scale stands
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """N markers over F frames of successive numbers.
+    """N markers over F frames of successive numbers."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        N, all different.
-    places : (F, N, 3) float64
-        In the world; NaN where a marker is not known.
-    residuals : (F, N) float64
-        Of places that sensors measured, a length; NaN of those that are not, or by the pose.
-    by_sensor : (F, N, L) bool
-        Which sensors measured it.
-    first : int
-        Number of the first frame.
-    rate : float
-        Frames per second.
-    unit : str
-        Of lengths.
-    """
-
-    names: tuple[str, ...]
-    places: Floats
+    names: tuple[str, ...]  # N, all different
+    places: Floats  # (F, N, 3), in the world; NaN where a marker is not known
+    # (F, N), of places that sensors measured, a length; NaN of those that are not, or by the pose
     residuals: Floats
-    by_sensor: Mask
-    first: int
-    rate: float
-    unit: str
+    by_sensor: Mask  # (F, N, L), which sensors measured it
+    first: int  # number of the first frame
+    rate: float  # frames per second
+    unit: str  # of lengths
 
     @property
     def is_known(self) -> Mask:
@@ -56,12 +59,8 @@ class Trajectories:
 def rate_of(lines: Sequence[PoseLine]) -> tuple[float, float] | None:
     """Frames per second by the times of pose lines, and how far off the times are, in frames.
 
-    None where lines have no times, or all are of one frame.
-
-    Raises
-    ------
-    RecordingError
-        If times do not ascend with the frames.
+    None where lines have no times, or all are of one frame. Raises RecordingError if times do not
+    ascend with the frames.
     """
     times = {line.frame: line.time_s for line in lines if line.time_s is not None}
     if len(times) < 2:
@@ -78,3 +77,82 @@ def rate_of(lines: Sequence[PoseLine]) -> tuple[float, float] | None:
     rate = (frames[-1] - frames[0]) / (seconds[-1] - seconds[0])
     off = np.abs((seconds - seconds[0]) * rate - (frames - frames[0])).max()
     return float(rate), float(off)
+
+
+def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
+    """Write trajectories in mm; the format cannot say which places sensors measured.
+
+    What is not known is NaN: an empty cell would shift the row where readers split at any space.
+    The name `called` of the file stands in its first line.
+    """
+    frames, markers = trajectories.places.shape[:2]
+    # columns are told apart by tabs, and by some readers at any white space
+    names = [re.sub(r"\s", "_", name) for name in trajectories.names]
+    rate, first = repr(trajectories.rate), trajectories.first
+    axes = [f"{axis}{k + 1}" for k in range(markers) for axis in "XYZ"]
+    keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
+    facts = (rate, rate, frames, markers, "mm", rate, first, frames)
+    rows = [
+        ("PathFileType", "4", "(X/Y/Z)", f"{called} {TRC_MARK}"),
+        (*keys.split(), "OrigNumFrames"),
+        facts,
+        ("Frame#", "Time", *(cell for name in names for cell in (name, "", ""))),
+        ("", "", *axes),
+        (),
+    ]
+    for row in rows:
+        stream.write("\t".join(map(str, row)) + "\n")
+    places = trajectories.places * length_ratio(trajectories.unit, "mm")
+    for k, flat in enumerate(places.reshape(frames, -1).tolist()):
+        cells = ("NaN" if np.isnan(value) else f"{value:.6f}" for value in flat)
+        time = (first + k) / trajectories.rate
+        stream.write("\t".join([str(first + k), f"{time:.9g}", *cells]) + "\n")
+    stream.flush()
+
+
+def write_c3d(path: Path, trajectories: Trajectories) -> bool:
+    """Write trajectories in mm, and tell whether frame n of mixpose is frame n + 1 there.
+
+    Where numbers are too large for that, frames begin at 1. A measured point has its residual, and
+    the bits of the sensors that measured it, of the first seven; one by the pose has the residual 0
+    and no bit, as C3D has it for points that are computed; one that is not known the residual -1.
+    Raises RecordingError if there are more frames than a file can number.
+    """
+    import ezc3d  # noqa: PLC0415 - not everybody has it
+
+    ratio = length_ratio(trajectories.unit, "mm")
+    frames = len(trajectories.places)
+    if frames > LAST_FRAME:
+        raise RecordingError(
+            f"found frames {trajectories.first} to {trajectories.first + frames - 1}, and .c3d "
+            f"has room for {LAST_FRAME}; write .trc, or run a part with --start and --stop"
+        )
+    measured = trajectories.is_measured
+    residuals = np.where(measured, trajectories.residuals * ratio, 0.0)
+    scale = np.float32(max(float(residuals.max()), 1e-3) / _STEPS)
+    # no measured one may be rounded to 0, which means computed
+    residuals = np.where(measured, np.maximum(residuals, 1.5 * scale), 0.0)
+    residuals[~trajectories.is_known] = -1.0
+    is_numbered = 0 <= trajectories.first <= LAST_FRAME - frames
+    file = ezc3d.c3d()
+    file.add_parameter("MANUFACTURER", "SOFTWARE", ["mixpose"])
+    point = file["parameters"]["POINT"]
+    point["RATE"]["value"] = [trajectories.rate]
+    point["UNITS"]["value"] = ["mm"]
+    point["LABELS"]["value"] = list(trajectories.names)
+    point["SCALE"]["value"] = [-float(scale)]
+    file["header"]["points"]["first_frame"] = trajectories.first if is_numbered else 0
+    points = np.ones((4, *trajectories.places.shape[1::-1]))
+    points[:3] = ratio * trajectories.places.transpose(2, 1, 0)
+    file["data"]["points"] = points
+    sensors = trajectories.by_sensor[..., :_SENSORS].transpose(2, 1, 0)
+    masks = np.zeros((_SENSORS, *points.shape[1:]), dtype=np.bool_)
+    masks[: len(sensors)] = sensors
+    file["data"]["meta_points"]["residuals"] = residuals.T[None]
+    file["data"]["meta_points"]["camera_masks"] = masks
+    file.write(str(path))
+    # ezc3d keeps -1 in the header whatever the scale, and readers refuse files of two scales
+    with path.open("r+b") as stream:
+        stream.seek(_SCALE_AT)
+        stream.write(struct.pack("<f", -scale))
+    return is_numbered

@@ -12,7 +12,7 @@ import numpy as np
 
 from mixpose.constants import constant
 from mixpose.poses.header import Header
-from mixpose.poses.plain import require_finite
+from mixpose.poses.writing import require_finite
 from mixpose.publishing.address import Address, parse
 from mixpose.publishing.message import SENDERS, Message, Sender, sender_for
 from mixpose.records import Estimate, FrameSet

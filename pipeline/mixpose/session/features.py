@@ -11,13 +11,11 @@ from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.body.features import SEGMENT_NODES
 from mixpose.limits import MOST_FEATURES
 from mixpose.records import Floats
-from mixpose.session.arrays import is_number, numbers
-from mixpose.session.marker_files import read_marker_file
-from mixpose.session.markers import Markers
+from mixpose.session.marker_files import Markers, read_marker_file
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, is_number, numbers
 
 FEWEST_FEATURES = 3
 
@@ -27,39 +25,26 @@ _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
-    Parameters
-    ----------
-    table : ObjectTable
-    folder : Path
-        What the marker file's path is relative to.
-    unit : {"m", "cm", "mm", "um"}
-        Of the session, into which lengths of other programs' files are converted.
-
-    Raises
-    ------
-    BadKeyError
-        If there are fewer than three features, some are repeated, or spread or normals do not fit
-        them.
+    The marker file's path is relative to `folder`; lengths of other programs' files are converted
+    into `unit`. There must be three features or more, none repeated, that spread and normals fit.
     """
     markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
     nodes = len(points) + SEGMENT_NODES * len(segments)
+    given = "file" if table.file is not None else "points"
     if nodes > MOST_FEATURES:
         raise BadKeyError(
             f"found {len(points)} points and {len(segments)} segments; allowed: {MOST_FEATURES} "
             f"together, a segment counting as {SEGMENT_NODES}",
-            "file" if table.file is not None else "points",
+            given,
         )
     if count < FEWEST_FEATURES:
-        key = "file" if table.file is not None else "points"
-        if table.segments is not None:
-            key = "segments"
         raise BadKeyError(
             f"found {count} feature{'s' * (count != 1)}; allowed: at least three points and "
             "segments together",
-            key,
+            given if table.segments is None else "segments",
         )
     for i, (start, end) in enumerate(segments):
         if np.array_equal(start, end):
@@ -71,15 +56,15 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
         raise BadKeyError(
             f"found {count} features at {places} place{'s' * (places != 1)}; allowed: at least "
             "three features at places of their own",
-            "file" if table.file is not None else "points",
+            given,
         )
     spreads = _spreads(table, markers, count)
     kind = table.spread
     features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
-    normals = _normals(_stated_normals(table, markers, count), count)
-    _refuse_repeated(points, spreads, normals, "file" if table.file is not None else "points")
+    normals = _normals(table, markers, count)
+    _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
     gravity, names = _gravity(table), _names(markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
@@ -171,25 +156,11 @@ def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
 
 
 def covariances(sigma: Any, count: int) -> Floats:
-    """Read the key ``sigma`` as one covariance per feature.
+    """Read the key ``sigma`` as one covariance per feature, (N, 3, 3).
 
-    Where three features leave it open, a list of three numbers is [sx, sy, sz] for all of them,
-    and three lists of three numbers are a covariance for all of them.
-
-    Parameters
-    ----------
-    sigma : object
-        A number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature.
-    count : int
-        N.
-
-    Returns
-    -------
-    (N, 3, 3) float64 array
-
-    Raises
-    ------
-    BadKeyError
+    It is a number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature. Where
+    three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and three
+    lists of three numbers are a covariance for all of them.
     """
     if _is_single(sigma):
         _check_ambiguous(sigma, count)
@@ -263,15 +234,11 @@ def _positive(covariance: Floats) -> Floats:
     return covariance
 
 
-def _stated_normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
-    """Those of the session, else those of the marker file where it has all features."""
-    if table.normals is not None or markers is None or markers.normals is None:
-        return table.normals
-    return markers.normals if len(markers.normals) == count else None
-
-
-def _normals(normals: Floats | None, count: int) -> Floats | None:
-    """Unit normals (N, 3)."""
+def _normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+    """Unit normals (N, 3), else those of the marker file where it has all features."""
+    normals = table.normals
+    if normals is None and markers is not None and markers.normals is not None:
+        normals = markers.normals if len(markers.normals) == count else None
     if normals is None:
         return None
     if len(normals) != count:

@@ -8,8 +8,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.arrays import numbers
 from mixpose.session.messages import BadKeyError, found
+from mixpose.session.values import numbers
 
 CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 
@@ -22,32 +22,17 @@ SHORTEST_FOCAL_PX, LONGEST_FOCAL_PX = 1e-3, 1e9
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What a calibration says about a camera.
+    """What a calibration says about a camera."""
 
-    Attributes
-    ----------
-    camera_matrix : (3, 3) float64
-    distortion : (k,) float64
-        OpenCV's order; empty for none.
-    resolution : (int, int) or None
-        Width and height in px; None where the calibration does not say.
-    model : {"pinhole", "fisheye"} or None
-        The kind of camera; None where the calibration does not say.
-    """
-
-    camera_matrix: Floats
-    distortion: Floats
+    camera_matrix: Floats  # (3, 3)
+    distortion: Floats  # (k,), OpenCV's order; empty for none
+    # width and height in px; None where the calibration does not say
     resolution: tuple[int, int] | None = None
-    model: CameraModel | None = None
+    model: CameraModel | None = None  # the kind of camera; None where the calibration does not say
 
 
 def camera_matrix(value: Any) -> Floats:
-    """Read a camera matrix, three rows or nine numbers, and see that it can be one.
-
-    Raises
-    ------
-    BadKeyError
-    """
+    """Read a camera matrix, three rows or nine numbers, and see that it can be one."""
     if isinstance(value, list) and len(value) == 9:
         K = numbers(value, (9,), f"nine numbers, {MATRIX_FORM} row by row").reshape(3, 3)
     else:
@@ -70,10 +55,7 @@ def camera_matrix(value: Any) -> Floats:
 def distortion(value: Any, model: str) -> Floats:
     """Read distortion coefficients, as a list or as a matrix of one row or column.
 
-    Raises
-    ------
-    BadKeyError
-        If a camera of this model cannot have that many.
+    Raises BadKeyError if a camera of this model cannot have that many.
     """
     flat = _flatten(value) if isinstance(value, list) else value
     if flat is None or flat == []:

@@ -15,16 +15,12 @@ Key = tuple[str | int, ...]
 
 
 class BadKeyError(ValueError):
-    """What is wrong with one key, before the file it stands in is known.
+    """What is wrong with one key, before the file it stands in is known: all that readers raise
+    here.
 
-    A ValueError, so that pydantic collects it with its own findings.
-
-    Parameters
-    ----------
-    text : str
-        What was found and what is allowed.
-    *key : str or int
-        Path to the value from where the problem was noticed; list items by number, from 0.
+    A ValueError, so that pydantic collects it with its own findings. `text` says what was found and
+    what is allowed; `key` leads to the value from where the problem was noticed, list items by
+    number, from 0.
     """
 
     def __init__(self, text: str, *key: str | int) -> None:
@@ -83,13 +79,8 @@ def _toml(value: object) -> str:
 def dotted(key: Key, named: Iterable[object] = ()) -> str:
     """Write a key as ``sensor["left"].T_sensor_world[2]``.
 
-    Parameters
-    ----------
-    key : tuple
-        Path to the value.
-    named : iterable
-        What the session gives as names of its sensors, or of its bodies, whichever the key is of;
-        one that is unique text stands in place of the number.
+    `named` are the names that the session gives its sensors, or its bodies, whichever the key is
+    of; one that is unique text stands in place of the number.
     """
     names = list(named)
     parts: list[str] = []
@@ -124,18 +115,9 @@ def did_you_mean(value: object, words: Iterable[str]) -> str:
 
 
 def one_line(file: object, key: Key, text: str, session: Any = None) -> str:
-    """Put a message together and see that it is a single line.
+    """Put a message about a key of a file together, on a single line.
 
-    Parameters
-    ----------
-    file : path or str
-        The session file.
-    key : tuple
-        Path to the value in the file; empty where no key is to blame.
-    text : str
-        What was found and what is allowed.
-    session : dict, optional
-        The file as parsed, to call sensors and bodies by their names.
+    `session` is the file as parsed, to call sensors and bodies by their names.
     """
     first = key[0] if key else None
     found = session.get(first) if isinstance(session, dict) else None

@@ -19,22 +19,11 @@ _ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
 
 
 def read_motion(table: Placement, matrix_key: str) -> Floats | None:
-    """Read the one form of a rigid motion that a table holds.
+    """Read the one form of a rigid motion that a table holds, made exactly rigid; None if it holds
+    none.
 
-    Parameters
-    ----------
-    table : Placement
-    matrix_key : str
-        Key of the 4x4 form: "T_world_object" or "T_sensor_world".
-
-    Returns
-    -------
-    (4, 4) float64 array, exactly rigid, or None if the table holds no form at all
-
-    Raises
-    ------
-    BadKeyError
-        If there are two forms, half a form, or a matrix that is no rigid motion.
+    `matrix_key` is that of the 4x4 form: "T_world_object" or "T_sensor_world". Two forms, half a
+    form, and a matrix that is no rigid motion are refused.
     """
     known = [key for key in _ROTATIONS if key in type(table).model_fields]
     rotations = [key for key in known if getattr(table, key) is not None]

@@ -19,8 +19,7 @@ from mixpose.session.motion import read_motion
 from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
 from mixpose.session.setup import ObjectSetup, Session, Start
-from mixpose.session.text_files import as_text, read_bytes
-from mixpose.session.toml_text import parse_toml
+from mixpose.session.text_files import as_text, parse_toml, read_bytes
 from mixpose.session.validation import validate
 
 _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
@@ -29,18 +28,8 @@ _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
 def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read what a session file says of sensors and recordings, whatever it says of bodies.
 
-    Its body is a stand-in: `[object]` may be missing, or name a file that is still to be made.
-
-    Parameters
-    ----------
-    path : str or Path
-    allow_code : bool
-        As for `load_session`.
-
-    Raises
-    ------
-    SessionError
-        As `load_session`, but for `[object]`, `[start]` and `[estimator]`.
+    Its body is a stand-in: `[object]` may be missing, or name a file that is still to be made. The
+    rest is as for `load_session`, but that `[start]` and `[estimator]` do not count.
     """
     return _loaded(Path(path), allow_code=allow_code, bodies=False)
 
@@ -172,13 +161,4 @@ def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> Estimat
             "[start]; add one with the pose they are held at, or leave free out to estimate all",
             "free",
         )
-    return EstimatorOptions(
-        table.objective,
-        table.free,
-        table.samples,
-        table.seed,
-        table.fuse,
-        table.search,
-        table.confidence,
-        table.mirrors,
-    )
+    return EstimatorOptions(**dict(table))

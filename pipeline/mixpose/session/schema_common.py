@@ -10,9 +10,10 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
 from mixpose.records import Floats
-from mixpose.session.arrays import LARGEST, SMALLEST
 from mixpose.session.values import (
+    LARGEST,
     METHOD_ALLOWED,
+    SMALLEST,
     THRESHOLD_ALLOWED,
     ArrayOf,
     read_method,

@@ -10,14 +10,13 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
 from mixpose.records import Floats
-from mixpose.session.arrays import RESOLUTION_FORM
-from mixpose.session.arrays import resolution as resolution_of
 from mixpose.session.intrinsics import MATRIX_FORM
 from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
 from mixpose.session.setup import Unit
 from mixpose.session.values import (
     DELAY_ALLOWED,
+    RESOLUTION_FORM,
     SOURCE_ALLOWED,
     ArrayOf,
     read_calibration_key,
@@ -25,6 +24,7 @@ from mixpose.session.values import (
     read_sensor_name,
     read_source,
 )
+from mixpose.session.values import resolution as resolution_of
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
 

@@ -46,21 +46,9 @@ _NARROWEST = 1000  # of a bin
 def build_sensors(
     tables: list[AnySensorTable], defaults: ExtractTable, folder: Path, unit: Unit
 ) -> tuple[SensorSetup, ...]:
-    """Build all sensors of a session.
+    """Build all sensors of a session, `defaults` being its ``[extract]``.
 
-    Parameters
-    ----------
-    tables : list of sensor tables
-    defaults : ExtractTable
-        ``[extract]``.
-    folder : Path
-        What paths are relative to.
-    unit : {"m", "cm", "mm", "um"}
-        Of the session, into which lengths of calibration files are converted.
-
-    Raises
-    ------
-    BadKeyError
+    Paths are relative to `folder`; lengths of calibration files are converted into `unit`.
     """
     with under("extract"):
         merge_extract(defaults, None)
@@ -88,10 +76,7 @@ def build_sensors(
 def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOptions:
     """Put a sensor's own extraction keys over the defaults of all sensors.
 
-    Raises
-    ------
-    BadKeyError
-        If the largest area is not above the smallest.
+    Raises BadKeyError if the largest area is not above the smallest.
     """
     given = _keys_given(defaults) | ({} if own is None else _keys_given(own))
     options = ExtractOptions(**given)
@@ -134,7 +119,9 @@ def _build_sensor(
                 table.pixel_size, table.principal_point, resolution, _T_sensor_world(table)
             )
         case LaterationTable():
-            _check_profile(table)
+            if (table.range_min is None) != (table.bin_size is None):
+                missing = "range_min" if table.range_min is None else "bin_size"
+                raise BadKeyError("missing; a profile needs range_min and bin_size", missing)
             # the far end of a profile is known only when its bins are counted
             sensor = RangeSensor(table.position, table.range_bias)
         case CloudTable():
@@ -259,9 +246,3 @@ def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
 def _T_sensor_world(table: PlacedTable | CloudTable) -> Floats:
     T = read_motion(table, "T_sensor_world")
     return np.eye(4) if T is None else T
-
-
-def _check_profile(table: LaterationTable) -> None:
-    if (table.range_min is None) != (table.bin_size is None):
-        missing = "range_min" if table.range_min is None else "bin_size"
-        raise BadKeyError("missing; a profile needs range_min and bin_size", missing)

@@ -24,38 +24,21 @@ def scale_between(unit: Unit, other: Unit) -> float:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the object is at first, ``[start]``.
+    """Where the object is at first, ``[start]``."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    rotation_deg : float or None
-        Half-width of the search around it in degrees; None where the file gives none.
-    distance : float or None
-        Half-width in length units; None where the file gives none.
-    """
-
-    T_world_object: Floats
+    T_world_object: Floats  # (4, 4)
+    # half-width of the search around it in degrees; None where the file gives none
     rotation_deg: float | None = None
-    distance: float | None = None
+    distance: float | None = None  # half-width in length units; None where the file gives none
 
 
 @dataclass(frozen=True)
 class ObjectSetup:
-    """One ``[[object]]``.
-
-    Attributes
-    ----------
-    body : Body
-    start : Start or None
-        Of identical ones, where the first is.
-    count : int
-        How many identical ones there are.
-    """
+    """One ``[[object]]``."""
 
     body: Body
-    start: Start | None = None
-    count: int = 1
+    start: Start | None = None  # of identical ones, where the first is
+    count: int = 1  # how many identical ones there are
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -70,49 +53,27 @@ class ObjectSetup:
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """One ``[[sensor]]``: its geometry and where its frames come from.
+    """One ``[[sensor]]``: its geometry and where its frames come from."""
 
-    Attributes
-    ----------
-    name : str
-        Unique in the session.
-    model : {"pinhole", "fisheye", "parallel", "lateration", "cloud"}
-    sensor : Sensor
-        The calibrated geometry.
-    source : str or tuple of str
-        As written in the file: relative to `Session.folder`.  A tuple where the file has a list;
-        the empty tuple where it names no source, as for a system that is only planned.
-    times : Path or None
-        Table of frame times, relative paths resolved.
-    fps : float or None
-        Frames per second.
-    extract : ExtractOptions
-        ``[extract]`` with what ``[sensor.extract]`` overrides.
-    range_min, bin_size : float or None
-        Range of a profile's first bin and from bin to bin, in length units; both or neither.
-    resolution : (int, int) or None
-        Width and height of a camera's images in px.
-    delay : float or "estimate"
-        Seconds by which frames are taken later than their times say; to be estimated.
-    readout, exposure : float
-        Seconds from a camera's first row to its last, and for which a row collects light.
-    calibration_error : CalibrationError or None
-        How far off the geometry may be; None: exact.
-    """
-
-    name: str
+    name: str  # unique in the session
     model: str
-    sensor: Sensor
+    sensor: Sensor  # the calibrated geometry
+    # As written in the file: relative to `Session.folder`.  A tuple where the file has a list; the
+    # empty tuple where it names no source, as for a system that is only planned.
     source: str | tuple[str, ...]
-    times: Path | None
-    fps: float | None
-    extract: ExtractOptions
+    times: Path | None  # table of frame times, relative paths resolved
+    fps: float | None  # frames per second
+    extract: ExtractOptions  # ``[extract]`` with what ``[sensor.extract]`` overrides
+    # range of a profile's first bin and from bin to bin, in length units; both or neither
     range_min: float | None = None
     bin_size: float | None = None
-    resolution: tuple[int, int] | None = None
+    resolution: tuple[int, int] | None = None  # width and height of a camera's images in px
+    # seconds by which frames are taken later than their times say; to be estimated
     delay: float | Literal["estimate"] = 0.0
+    # seconds from a camera's first row to its last, and for which a row collects light
     readout: float = 0.0
     exposure: float = 0.0
+    # how far off the geometry may be; None: exact
     calibration_error: CalibrationError | None = None
 
 
@@ -128,17 +89,10 @@ class Session:
         Of the file's bytes, in hexadecimal.
     unit : {"m", "cm", "mm", "um"}
         Of every length; nothing is converted on reading.
-    body : Body
-        The first one.
-    start : Start or None
-        Of the first body.
-    estimator : EstimatorOptions
-    sensors : tuple of SensorSetup
-        In the order of the file, at least one.
+    body, start, count : Body, Start or None, int
+        The first body, where it is at first, and how many there are of it.
     allow_code : bool
         Whether functions that the file names may be run.
-    count : int
-        How many there are of the first body.
     others : tuple of ObjectSetup
         The bodies after the first, in the order of the file.
     """

@@ -1,11 +1,17 @@
-"""Reading the text files that a session consists of."""
+"""Reading the text files that a session consists of, TOML and YAML among them.
+
+TOML with a hint where a common slip is what it fails at; YAML also with the first line that OpenCV
+writes and YAML does not know.
+"""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
+from typing import Any
 
-from mixpose.limits import MOST_BYTES
+from mixpose.limits import MOST_BYTES, MOST_YAML_CHARACTERS, MOST_YAML_NODES
 from mixpose.session.messages import BadKeyError
 
 _NO_TEXT = tuple(
@@ -19,14 +25,21 @@ _NO_TEXT = tuple(
 )
 """How files begin that are given in place of text by mistake."""
 
+_LINE = re.compile(r"\(at line (\d+), column \d+\)")
+_TABLE = re.compile(r"\[\[?\s*(sensor|object)\s*\]")
+_BARE_WORD = re.compile(r"\s*([\w.-]+)\s*=\s*([^\W\d][^\s\"'\[\]{},#]*)\s*(?:#.*)?")
+_COMMA = re.compile(r"\s*([\w.-]+)\s*=\s*([-+]?\d+),(\d+)\s*(?:#.*)?")
+_COLON = re.compile(r"\s*([\w.-]+)\s*:\s*(.+)")
+_OTHER_QUOTES = re.compile("[“”„‘’«»]")
+
+_OPENCV_HEAD = re.compile(r"\A\s*%YAML:?[ \d.]*[^\n]*\n(---[^\n]*\n)?")
+
 
 def read_bytes(path: Path) -> bytes:
     """Read a file.
 
-    Raises
-    ------
-    BadKeyError
-        If there is no such file, it is larger than any session needs, or it cannot be read.
+    Raises BadKeyError if there is no such file, it is larger than any session needs, or it cannot
+    be read.
     """
     try:
         is_other = path.exists() and not path.is_file()
@@ -48,10 +61,7 @@ def read_bytes(path: Path) -> bytes:
 def as_text(content: bytes) -> str:
     """Decode UTF-8, with or without the mark that some editors put in front.
 
-    Raises
-    ------
-    BadKeyError
-        Naming what it is in place of text, or the line that is not UTF-8.
+    Raises BadKeyError naming what it is in place of text, or the line that is not UTF-8.
     """
     kind = next((name for start, name in _NO_TEXT if start.match(content)), None)
     if kind is not None:
@@ -61,3 +71,86 @@ def as_text(content: bytes) -> str:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise BadKeyError(f"not UTF-8 text at line {line}; save the file as UTF-8") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML. Raises BadKeyError in one line, with what is most likely meant."""
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # of TOML, or a number of thousands of digits
+        raise BadKeyError(f"not TOML: {error}{_hint(text, str(error))}") from error
+
+
+def _hint(text: str, reason: str) -> str:
+    """What is most likely meant; empty where nothing is."""
+    at = _LINE.search(reason)
+    lines = text.splitlines()
+    line = lines[int(at[1]) - 1] if at is not None and 0 < int(at[1]) <= len(lines) else ""
+    table = _TABLE.match(line.strip())
+    if table is not None and ("twice" in reason or "overwrite" in reason):
+        return f"; allowed for each of several: [[{table[1]}]] in two brackets, the first too"
+    if _OTHER_QUOTES.search(line):
+        return '; allowed: straight quotes, "..."'
+    if "\\" in line and "in a string" in reason:
+        return "; allowed: paths with / , or in single quotes, '...'"
+    return _meant(line)
+
+
+def _meant(line: str) -> str:
+    """A line as it would be TOML."""
+    word = _BARE_WORD.fullmatch(line)
+    if word is not None and word[2] not in ("true", "false"):
+        return f'; allowed: text in quotes, {word[1]} = "{word[2]}"'
+    comma = _COMMA.fullmatch(line)
+    if comma is not None:
+        return f"; allowed: a decimal point, {comma[1]} = {comma[2]}.{comma[3]}"
+    colon = _COLON.fullmatch(line)
+    if colon is not None:
+        return f"; allowed: an equals sign, {colon[1]} = {colon[2].strip()}"
+    return ""
+
+
+def parse_yaml(text: str) -> Any:
+    """Parse the first document of a YAML text."""
+    import yaml  # noqa: PLC0415  # only sessions with such a calibration need it
+
+    if len(text) > MOST_YAML_CHARACTERS:
+        raise BadKeyError(
+            f"found {len(text)} characters of YAML; allowed: at most {MOST_YAML_CHARACTERS}"
+        )
+    text = _OPENCV_HEAD.sub("", text)
+    try:
+        large = any(map(_is_large, yaml.compose_all(text, yaml.SafeLoader)))
+        documents = () if large else yaml.safe_load_all(text)
+        content = next((part for part in documents if part is not None), None)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f" at line {mark.line + 1}" if mark else ""
+        raise BadKeyError(f"not YAML{line}: {error.problem or error.context}") from error
+    except RecursionError as error:
+        raise BadKeyError("lists or tables in it are nested too deeply") from error
+    except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
+        raise BadKeyError(f"not YAML: {error}") from error
+    if large:
+        raise BadKeyError(
+            f"its aliases (*name) stand for more than {MOST_YAML_NODES} values; write out what is "
+            "meant"
+        )
+    return content
+
+
+def _is_large(root: Any) -> bool:
+    """Whether aliases make a document large: a few bytes may stand for gigabytes."""
+    sizes: dict[int, float] = {}
+
+    def size_of(node: Any) -> float:
+        known = sizes.get(id(node))
+        if known is not None:
+            return known
+        sizes[id(node)] = float("inf")  # met again inside of itself: without end
+        parts = [] if isinstance(node.value, str) else node.value
+        flat = [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
+        sizes[id(node)] = 1 + sum(map(size_of, flat))
+        return sizes[id(node)]
+
+    return root is not None and size_of(root) > MOST_YAML_NODES

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from mixpose.session.arrays import limits
 from mixpose.session.messages import BadKeyError, Key, did_you_mean, found, nearest, one_of
+from mixpose.session.values import limits
 
 _TAG = "model"  # the key that tells the kinds of sensor apart
 _TOP = "the top of the file, before its first [table]"
@@ -29,11 +29,8 @@ class _Place:
 def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
     """Check parsed TOML against the table of the whole file.
 
-    Raises
-    ------
-    BadKeyError
-        The first finding, an unknown key before any other: a misspelt key often is the reason
-        why another is missing.
+    Raises BadKeyError the first finding, an unknown key before any other: a misspelt key often is
+    the reason why another is missing.
     """
     try:
         return root.model_validate(data)

@@ -116,7 +116,7 @@ def unfolded(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseL
 
 def _turned(line: PoseLine, T: Floats, before: Floats, symmetries: Floats) -> PoseLine:
     """A line at T whose poses are turned least against another pose."""
-    S, C = _nearest(T, before, symmetries), line.covariance
+    S, C, tip = _nearest(T, before, symmetries), line.covariance, line.tip_object
     rivals = []
     for each in line.hypotheses:
         rival = each.T_world_object
@@ -126,6 +126,7 @@ def _turned(line: PoseLine, T: Floats, before: Floats, symmetries: Floats) -> Po
         line,
         T_world_object=T @ S,
         covariance=None if C is None else rigid.covariance_at(C, T[:3, :3] @ S[:3, 3]),
+        tip_object=None if tip is None else S[:3, :3].T @ (tip - S[:3, 3]),
         hypotheses=tuple(rivals),
     )
 

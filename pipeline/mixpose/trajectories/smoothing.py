@@ -17,7 +17,6 @@ from scipy.special import chdtri
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.estimates import estimate_of
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
@@ -97,7 +96,7 @@ def smooth_body(
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
-        whole = tuple(estimate_of(line) for line in ordered)
+        whole = tuple(ordered)
         return SmoothedBody(whole, None, 0, 0, 0, (), times is not None)
     model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
     found: dict[int, Estimate] = {}
@@ -106,7 +105,7 @@ def smooth_body(
     met = [ordered[k] for k in posed if ordered[k].frame in found]
     changed = [line for line in met if found[line.frame].status != line.status]
     refused = tuple(line.frame for line in changed if line.status == "ok")
-    done = {line.frame: estimate_of(line) for line in ordered} | found
+    done = {line.frame: line for line in ordered} | found
     return SmoothedBody(
         estimates=tuple(done[frame] for frame in sorted(done)),
         model=model,
@@ -284,7 +283,7 @@ def _estimate(
     rules: SmoothingRules,
 ) -> Estimate:
     """The estimate of a line at its smoothed pose."""
-    one = replace(estimate_of(line), T_world_object=T, covariance=covariance)
+    one = replace(line, T_world_object=T, covariance=covariance)
     if choice is None:
         if is_met:
             return one

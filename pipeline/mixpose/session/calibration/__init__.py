@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mixpose.session.calibration.aniposelib import ANIPOSELIB
-from mixpose.session.calibration.caliscope import CALISCOPE
+from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Rig
 from mixpose.session.calibration.colmap import COLMAP
-from mixpose.session.calibration.content import Content, read_content
+from mixpose.session.calibration.camera import Content, read_content
 from mixpose.session.calibration.kalibr import KALIBR
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
 from mixpose.session.calibration.pycalib import PYCALIB
 from mixpose.session.calibration.ros import ROS
-from mixpose.session.calibration.ros_ini import ROS_INI
+from mixpose.session.calibration.ros import ROS_INI
 from mixpose.session.intrinsics import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
@@ -31,27 +30,11 @@ FORMATS: tuple[Format, ...] = (
 def read_calibration(
     wanted: CalibrationTable, folder: Path, model: CameraModel
 ) -> CalibratedCamera:
-    """Read the camera that a session names.
+    """Read the camera that a session names: its file, relative to `folder`, and what to read in
+    it.
 
-    Parameters
-    ----------
-    wanted : CalibrationTable
-        The file, and the nodes or the camera to read in it.
-    folder : Path
-        What the file's path is relative to.
-    model : {"pinhole", "fisheye"}
-        What the session says the camera is.
-
-    Returns
-    -------
-    CalibratedCamera
-        Of that model.
-
-    Raises
-    ------
-    BadKeyError
-        If the file is missing, is in none of the formats, lacks what was asked for, or holds a
-        camera of the other model.
+    The file may be in none of the formats, lack what was asked for, or hold a camera of another
+    model.
     """
     content = read_content(folder / wanted.file, wanted.file)
     with in_file(wanted.file):
@@ -68,16 +51,7 @@ def read_calibration(
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
     """Read all cameras of several files; files that belong together may be among them.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-    also : str
-        What may be given besides, for the message about a file in no known format.
-
-    Raises
-    ------
-    BadKeyError
-        Naming the file.
+    `also` says what may be given besides, for the message about a file in no known format.
     """
     formats: dict[str, tuple[Format, list[Content]]] = {}
     for path in paths:
@@ -101,13 +75,7 @@ def _names_of(contents: Sequence[Content]) -> str:
 
 
 def format_of(content: Content, also: str = "") -> Format:
-    """The format that a file is in.
-
-    Raises
-    ------
-    BadKeyError
-        If it is in none.
-    """
+    """The format that a file is in. Raises BadKeyError if it is in none."""
     for each in FORMATS:
         if each.recognises(content):
             return each

@@ -13,17 +13,17 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.arrays import LARGEST
 from mixpose.session.calibration.camera import (
     CalibratedCamera,
+    Content,
     Format,
     Group,
     motion_of_quaternion,
+    size_of,
 )
-from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.values import LARGEST
 
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
@@ -79,23 +79,11 @@ def _kind(content: Content) -> str:
     return ""
 
 
-def _recognises(content: Content) -> bool:
-    return bool(_kind(content))
-
-
-def _groups(contents: Group) -> list[Group]:
-    return [contents]
-
-
 def _of_kind(group: Group, kind: str) -> Content | None:
     files = [content for content in group if _kind(content) == kind]
     if len(files) > 1:
         raise BadKeyError(f"found {len(files)} files of COLMAP {kind}; allowed: those of one model")
     return files[0] if files else None
-
-
-def _names(group: Group) -> list[str]:
-    return list(_placed(group))
 
 
 def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
@@ -217,5 +205,10 @@ def _intrinsics(row: list[str]) -> Intrinsics:
 
 
 COLMAP = Format(
-    "a COLMAP file", "COLMAP's text (cameras.txt ...)", _recognises, _names, _read, _groups
+    "a COLMAP file",
+    "COLMAP's text (cameras.txt ...)",
+    recognises=lambda content: bool(_kind(content)),
+    names=lambda group: list(_placed(group)),
+    read=_read,
+    groups=lambda contents: [contents],
 )

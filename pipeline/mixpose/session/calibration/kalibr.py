@@ -12,13 +12,20 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.arrays import numbers
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
-from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import model_of_distortion, plain, present, size_of
+from mixpose.session.calibration.camera import (
+    CalibratedCamera,
+    Content,
+    Format,
+    Group,
+    model_of_distortion,
+    plain,
+    present,
+    size_of,
+)
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid
+from mixpose.session.values import numbers
 
 _MATRIX = "a 4x4 matrix, four rows of four numbers"
 
@@ -29,14 +36,6 @@ def _cameras(content: Content) -> list[str]:
         for name, camera in content.mapping.items()
         if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
     ]
-
-
-def _recognises(content: Content) -> bool:
-    return bool(_cameras(content))
-
-
-def _names(group: Group) -> list[str]:
-    return _cameras(group[0])
 
 
 def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
@@ -106,5 +105,9 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
 
 
 KALIBR = Format(
-    "a Kalibr file", "Kalibr camchain (cam0: intrinsics ...)", _recognises, _names, _read
+    "a Kalibr file",
+    "Kalibr camchain (cam0: intrinsics ...)",
+    recognises=lambda content: bool(_cameras(content)),
+    names=lambda group: _cameras(group[0]),
+    read=_read,
 )

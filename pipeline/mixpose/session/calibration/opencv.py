@@ -20,13 +20,18 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.arrays import numbers
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
-from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import model_of_distortion
+from mixpose.session.calibration.camera import (
+    CalibratedCamera,
+    Content,
+    Format,
+    Group,
+    model_of_distortion,
+    motion_of,
+)
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
+from mixpose.session.values import numbers
 
 # What OpenCV's samples and common calibration programs call their nodes, tried in order.
 MATRIX_NODES = ("camera_matrix", "Camera_Matrix", "K", "M", "cameraMatrix", "mtx")
@@ -160,10 +165,8 @@ def read_nodes(
 ) -> CalibratedCamera:
     """Read the camera whose nodes the user names.
 
-    Raises
-    ------
-    BadKeyError
-        If the text cannot be parsed, or a node is missing or is no camera matrix or distortion.
+    Raises BadKeyError if the text cannot be parsed, or a node is missing or is no camera matrix or
+    distortion.
     """
     intrinsics = _intrinsics(_open([content]), model, matrix, distortion_name)
     return CalibratedCamera(content.stem, intrinsics)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
-from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 
@@ -17,10 +16,6 @@ def _depth(value: Any) -> int:
     while isinstance(value, list) and value:
         value, depth = value[0], depth + 1
     return depth
-
-
-def _recognises(content: Content) -> bool:
-    return _depth(content.mapping.get("K")) == _DEEP
 
 
 def _names(group: Group) -> list[str]:
@@ -57,4 +52,10 @@ def _entry(content: dict[str, Any], key: str, k: int) -> Any:
     return values[k]
 
 
-PYCALIB = Format("a pycalib file", "pycalib (K, d, R, t, lists)", _recognises, _names, _read)
+PYCALIB = Format(
+    "a pycalib file",
+    "pycalib (K, d, R, t, lists)",
+    recognises=lambda content: _depth(content.mapping.get("K")) == _DEEP,
+    names=_names,
+    read=_read,
+)

@@ -1,18 +1,27 @@
-"""ROS's camera_info: a YAML file as camera_calibration saves it, or a message as printed."""
+"""ROS's camera_info: YAML as camera_calibration saves it, a message as printed, or the older INI.
+
+The INI form has headings in words, and numbers in the lines below.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
-from mixpose.session.calibration.content import Content
-from mixpose.session.calibration.plain import MODELS, model_of_distortion, plain, present, size_of
+from mixpose.session.calibration.camera import (
+    MODELS,
+    CalibratedCamera,
+    Content,
+    Format,
+    Group,
+    model_of_distortion,
+    plain,
+    present,
+    size_of,
+)
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, one_of, under
 
-
-def _recognises(content: Content) -> bool:
-    return bool({"camera_matrix", "K", "k"} & set(map(str, content.mapping)))
+_INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")
 
 
 def _names(group: Group) -> list[str]:
@@ -73,11 +82,64 @@ def _matrix_data(value: Any) -> Any:
     return plain(value.get("data") if isinstance(value, dict) else value)
 
 
+def _ini_names(group: Group) -> list[str]:
+    headings = [line[1:-1] for line in group[0].lines if line.startswith("[") and line[-1] == "]"]
+    return [next((name for name in headings if name and name != "image"), group[0].stem)]
+
+
+def _read_ini(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+    values = _ini_values(group[0])
+    with under("camera matrix"):
+        K = camera_matrix(values.get("camera matrix"))
+    with under("distortion"):
+        # five coefficients of the plumb bob, eight of the rational model: both are OpenCV's
+        D = distortion(values.get("distortion", []), "pinhole")
+    with under("[image]"):
+        size = size_of([_integer(values, word) for word in ("width", "height")])
+    return CalibratedCamera(name, Intrinsics(K, D, size, "pinhole"))
+
+
+def _ini_values(content: Content) -> dict[str, list[float]]:
+    """Numbers below each heading."""
+    values: dict[str, list[float]] = {}
+    word = ""
+    for line in content.lines:
+        if not line or line[0] in "#;[":
+            continue
+        if line in _INI_WORDS:
+            word = line
+            values[word] = []
+            continue
+        if word:
+            try:
+                values[word] += [float(cell) for cell in line.split()]
+            except ValueError as error:
+                raise BadKeyError(found(line, "numbers"), word) from error
+    return values
+
+
+def _integer(values: dict[str, list[float]], word: str) -> int | float | None:
+    found_numbers = values.get(word)
+    if not found_numbers:
+        return None
+    number = found_numbers[0]
+    return int(number) if number == int(number) else number
+
+
 ROS = Format(
     "a ROS file",
     "ROS camera_info (camera_matrix ...)",
-    _recognises,
-    _names,
-    _read,
+    recognises=lambda content: bool({"camera_matrix", "K", "k"} & set(map(str, content.mapping))),
+    names=_names,
+    read=_read,
+    holds_several=False,
+)
+
+ROS_INI = Format(
+    "a ROS INI file",
+    "the same as INI ([image] ... camera matrix)",
+    recognises=lambda content: {"[image]", "camera matrix"} <= set(content.lines),
+    names=_ini_names,
+    read=_read_ini,
     holds_several=False,
 )

@@ -7,29 +7,49 @@ map the world to the camera.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
-from mixpose.session.calibration.camera import CalibratedCamera, Group, motion_of
-from mixpose.session.calibration.plain import present, size_of
+from mixpose.session.calibration.camera import (
+    CalibratedCamera,
+    Content,
+    Format,
+    Group,
+    motion_of,
+    present,
+    size_of,
+)
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
-from mixpose.session.messages import BadKeyError, found, under
+from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.session.setup import Unit
 
+Cameras: TypeAlias = dict[str, tuple[Key, dict[str, Any]]]
+"""By a camera's name: where its table is, and the table."""
 
-def is_camera(table: Any) -> bool:
-    """Whether a table is one of a camera."""
+
+def _aniposelib(content: Content) -> Cameras:
+    cameras = [(key, table) for key, table in content.toml.items() if _is_camera(table)]
+    names = [str(table.get("name") or key) for key, table in cameras]
+    # names that are there twice would hide a camera
+    chosen = [name if names.count(name) == 1 else key for name, (key, _) in zip(names, cameras)]
+    return {name: ((key,), table) for name, (key, table) in zip(chosen, cameras)}
+
+
+def _caliscope(content: Content) -> Cameras:
+    cameras = content.toml.get("cameras")
+    return {
+        f"cam{number}": (("cameras", number), table)
+        for number, table in (cameras.items() if isinstance(cameras, dict) else ())
+        if _is_camera(table) and table.get("ignore") is not True
+    }
+
+
+def _is_camera(table: Any) -> bool:
     return isinstance(table, dict) and "matrix" in table and "distortions" in table
 
 
-def read_table(
-    table: dict[str, Any], name: str, group: Group, unit: Unit | None
-) -> CalibratedCamera:
-    """Read the table of a camera.
-
-    Raises
-    ------
-    BadKeyError
-    """
+def _read_table(table: dict[str, Any], name: str, unit: Unit | None) -> CalibratedCamera:
+    """Read the table of a camera."""
     fisheye = table.get("fisheye", False)
     if not isinstance(fisheye, bool):
         raise BadKeyError(found(fisheye, "true or false"), "fisheye")
@@ -44,3 +64,26 @@ def read_table(
     if table.get("rotation") is not None and table.get("translation") is not None:
         pose = motion_of(table["rotation"], table["translation"])
     return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, unit)
+
+
+def _format(
+    name: str, shown: str, cameras_of: Callable[[Content], Cameras], unit: Unit | None
+) -> Format:
+    """A format of such tables, by what finds them in a file, with the unit of its lengths."""
+
+    def read(group: Group, camera: str, model: CameraModel) -> CalibratedCamera:
+        key, table = cameras_of(group[0])[camera]
+        with under(*key):
+            return _read_table(table, camera, unit)
+
+    return Format(
+        name,
+        shown,
+        recognises=lambda content: bool(cameras_of(content)),
+        names=lambda group: list(cameras_of(group[0])),
+        read=read,
+    )
+
+
+ANIPOSELIB = _format("an aniposelib file", "aniposelib ([cam_0])", _aniposelib, None)
+CALISCOPE = _format("a caliscope file", "caliscope ([cameras.0])", _caliscope, "m")

@@ -1,4 +1,7 @@
-"""``mixpose convert -o markers.c3d`` or ``.trc``: trajectories of the labelled markers."""
+"""``mixpose convert`` to formats that need the session of the poses.
+
+Trajectories of the labelled markers (.c3d, .trc), and poses with their recording (.rrd).
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,14 @@ from mixpose.body import Body
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
-from mixpose.poses.c3d_file import write_c3d
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, rate_of
-from mixpose.poses.trc import write_trc
+from mixpose.poses.trajectories import Trajectories, rate_of, write_c3d, write_trc
 from mixpose.rigid import transform
-from mixpose.session import Session
+from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
 
-FORMATS = ("c3d", "trc")
+MARKER_FORMATS = ("c3d", "trc")
 
 MOST_PLACES = 50_000_000
 """Of all markers in all frames: they are held in memory, with 50 bytes each."""
@@ -40,27 +41,10 @@ def write_markers(
 ) -> None:
     """Write where the markers of all bodies were: measured where they were, else by the pose.
 
-    Parameters
-    ----------
-    poses : PoseFile
-    lines : sequence of PoseLine
-        Of these, those to write.
-    session : Session
-        That of the poses: it has the markers.
-    output : Path or None
-        None is standard output, for ``trc``.
-    format_name : {"c3d", "trc"}
-    measured : bool
-        Whether what no sensors measured stays a gap.
-    fps : float or None
-        Frames per second, in place of the times of the poses.
-
-    Raises
-    ------
-    SessionError
-        If a package is missing, or poses and options do not go together.
-    RecordingError
-        If the poses hold what such a file cannot.
+    `lines` are those of the poses to write, `session` has the markers, `measured` leaves a gap
+    where no sensors measured, and `fps` stands in place of the times of the poses. Raises
+    SessionError if a package is missing, or poses and options do not go together, and
+    RecordingError if the poses hold what such a file cannot.
     """
     if format_name == "c3d":
         _require_c3d(output)
@@ -186,3 +170,67 @@ def _say(trajectories: Trajectories, output: Path) -> None:
         f"{measured} places measured, {known - measured} by the pose, "
         f"{trajectories.is_known.size - known} gaps -> {output}"
     )
+
+
+def write_rerun(
+    poses: PoseFile,
+    lines: Sequence[PoseLine],
+    output: Path | None,
+    session_file: Path | None,
+    sources: Sequence[str],
+    *,
+    allow_code: bool = False,
+) -> None:
+    """Write poses and the recording of their session as an ``.rrd`` file.
+
+    Raises SessionError if the viewer's package is missing, or the session is not found or not that
+    of the poses. Raises RecordingError if the recording cannot be read.
+    """
+    if output is None:
+        raise SessionError("--format rerun: needs -o FILE.rrd, it is no text")
+    if find_spec("rerun") is None:
+        raise SessionError(
+            "--format rerun: needs the package rerun-sdk; install it with: "
+            "python -m pip install 'mixpose[rerun]'"
+        )
+    from mixpose.cli.run import named_sources  # noqa: PLC0415 - only where it is written
+    from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415
+    from mixpose.runner import open_sources  # noqa: PLC0415
+
+    session = session_of(poses, session_file, allow_code=allow_code)
+    opened = open_sources(session, named_sources(sources))
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"sensor {name!r} is live, so its frames are gone; name a recording of them "
+                f"with --source {name}=PATH"
+            )
+    with appearing_whole(output) as part:
+        write_rerun_file(part, session, opened, lines)
+
+
+def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False) -> Session:
+    """The session that poses were estimated with: the one `named`, or the one of their header.
+
+    Raises SessionError if it is not there or has another unit.
+    """
+    path = named
+    if path is None:
+        found = poses.header.get("session")
+        if not isinstance(found, str):
+            raise SessionError(f"{poses.path}: names no session; add --session SESSION.toml")
+        path = Path(found)
+        if not path.is_file():
+            path = poses.path.parent / found  # as in truth files, beside their session
+        if not path.is_file():
+            raise SessionError(
+                f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
+            )
+    session = load_session(path, allow_code=allow_code)
+    if poses.unit not in (None, session.unit):
+        raise SessionError(
+            f"--session {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"
+        )
+    if poses.header.get("session_sha256") not in (None, session.sha256):
+        warn(f"{path} is not as it was when {poses.path} was written")
+    return session

@@ -1,0 +1,181 @@
+"""What people type when there are poses: ``mixpose evaluate``, report, convert, smooth and more."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from mixpose.cli.words import AllowCode, ConvertFormat, PosesFile, Recordings, SessionFile, taking
+
+TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
+
+
+def evaluate(
+    poses: PosesFile,
+    truth: Annotated[Path, TRUTH],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Errors of poses against the truth, modulo the object's symmetries."""
+    from json import dumps  # noqa: PLC0415
+
+    from mixpose.poses.evaluate import evaluate_files  # noqa: PLC0415
+    from mixpose.poses.report import as_dict, as_table  # noqa: PLC0415
+
+    found = evaluate_files(poses, truth)
+    text = dumps(as_dict(found), indent=2) if json else as_table(found)
+    sys.stdout.write(text.rstrip("\n") + "\n")
+
+
+def report(
+    poses: PosesFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
+    truth: Annotated[Path | None, TRUTH] = None,
+) -> None:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+    from mixpose.cli.report import write_report  # noqa: PLC0415
+
+    write_report(poses, truth, output)
+
+
+def schema() -> None:
+    """Print the JSON Schema of pose lines."""
+    from mixpose.poses.schema import schema_text  # noqa: PLC0415
+
+    typer.echo(schema_text(), nl=False)
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """What was asked for."""
+
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout (-).")
+    ] = None
+    format: Annotated[
+        ConvertFormat | None,
+        typer.Option(
+            help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
+        ),
+    ] = None
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
+    ] = None
+    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None
+    only_ok: Annotated[bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")] = (
+        False
+    )
+    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None
+    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None
+    relative_to: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
+    ] = None
+    session: Annotated[
+        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
+    ] = None
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
+    ] = None
+    measured: Annotated[
+        bool,
+        typer.Option(
+            "--measured", help="c3d, trc: leave gaps where a marker was not measured by itself."
+        ),
+    ] = False
+    fps: Annotated[
+        float | None,
+        typer.Option(min=1e-6, max=1e6, help="c3d, trc: frames a second, in place of times."),
+    ] = None
+    allow_code: AllowCode = False
+
+
+@taking(ConvertRequest)
+def convert(request: ConvertRequest) -> None:
+    """Write poses in the format of another program."""
+    from mixpose.cli.convert import convert_poses  # noqa: PLC0415
+
+    convert_poses(request)
+
+
+def smooth(
+    poses: PosesFile,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="SMOOTH.jsonl", help="Write here, not to stdout."),
+    ] = None,
+    fill: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="SECONDS", help="Fill gaps of at most so long, marked; else none."
+        ),
+    ] = 0.0,
+    motion: Annotated[
+        Literal["acceleration", "jerk", "snap", "crackle"] | None,
+        typer.Option(help="Which derivative of the motion takes white noise; else the likeliest."),
+    ] = None,
+) -> None:
+    """Smooth the poses of a recording, each by all that came before and after."""
+    from mixpose.cli.smooth import smooth_poses  # noqa: PLC0415
+
+    smooth_poses(poses, output, fill_s=fill, motion=motion)
+
+
+@dataclass(frozen=True)
+class PivotRequest:
+    """What was asked for."""
+
+    poses: PosesFile
+    object: Annotated[
+        str | None, typer.Option(metavar="OBJECT", help="The tool, where there are several bodies.")
+    ] = None
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OBJECT", help="The tip stays at a point of this body; else of the world."
+        ),
+    ] = None
+    into: Annotated[
+        Path | None,
+        typer.Option(metavar="SESSION.toml", help="Write the tip into this session."),
+    ] = None
+
+
+@taking(PivotRequest)
+def pivot(request: PivotRequest) -> None:
+    """The tip of a tool, from poses while it turns about its tip."""
+    from mixpose.cli.pivot import pivot_poses  # noqa: PLC0415
+
+    pivot_poses(request)
+
+
+@dataclass(frozen=True)
+class AlignRequest:
+    """What was asked for."""
+
+    session: SessionFile
+    floor: Annotated[
+        list[str],
+        typer.Option(
+            metavar="POSES.jsonl|OBJECT@FRAME",
+            help="What lies on the floor: poses, or a body in a frame. Repeatable.",
+        ),
+    ]
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="ALIGNED.toml", help="The aligned session.")
+    ]
+    up: Annotated[Literal["x", "y", "z"], typer.Option(help="The axis that points up.")] = "z"
+    source: Recordings = None
+
+
+@taking(AlignRequest)
+def align(request: AlignRequest) -> None:
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
+    from mixpose.cli.align import align_session  # noqa: PLC0415
+
+    align_session(request)

@@ -1,0 +1,76 @@
+"""Poses as benchmarks have them: TUM trajectories and BOP result tables.
+
+TUM: ``time tx ty tz qx qy qz qw``, metres; `evo` opens them,
+https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+BOP: ``scene_id,im_id,obj_id,score,R,t,time``; the BOP toolkit opens them,
+https://bop.felk.cvut.cz/challenges/bop-challenge-2020/#howtoparticipate
+"""
+
+from __future__ import annotations
+
+from typing import TextIO
+
+from mixpose import rigid
+from mixpose.poses.header import UNITS_PER_METRE, Header
+from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
+from mixpose.records import Estimate
+
+BOP_COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
+
+
+class TumWriter(PoseWriter):
+    """Writes one line per frame that has a pose; lost frames are left out."""
+
+    def __init__(self, stream: TextIO, header: Header) -> None:
+        super().__init__(stream, header)
+        self._stamps = Stamps(stream, "tum")
+
+    def _write(self, estimate: Estimate) -> None:
+        T = pose_of(estimate)
+        if T is None:
+            return
+        time = self._stamps.time_of(estimate)
+        position = plain(T[:3, 3] / UNITS_PER_METRE[self._header.unit])
+        turn = plain(rigid.quaternion_xyzw(T))
+        self._stream.write(" ".join(repr(value) for value in [time, *position, *turn]) + "\n")
+
+
+class BopWriter(PoseWriter):
+    """Writes one row per frame that has a pose; lost frames are left out.
+
+    R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
+    camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
+    the estimate took in seconds, as BOP has it, or -1 where that was not measured. BOP numbers its
+    objects: the first name that occurs is `obj_id`, the next one more.
+    """
+
+    def __init__(
+        self, stream: TextIO, header: Header, *, scene_id: int = 0, obj_id: int = 1
+    ) -> None:
+        super().__init__(stream, header)
+        self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
+        self._scene_id = scene_id
+        self._first_obj_id = obj_id
+        self._obj_ids: dict[str, int] = {}
+        self._stream.write(BOP_COLUMNS + "\n")
+        self._stream.flush()
+
+    def _write(self, estimate: Estimate) -> None:
+        obj_id = self._obj_ids.setdefault(estimate.object, self._first_obj_id + len(self._obj_ids))
+        T = pose_of(estimate)
+        if T is None:
+            return
+        R = plain(T[:3, :3].ravel())
+        t_mm = plain(T[:3, 3] * self._mm_per_unit)
+        latency_ms = estimate.latency_ms or 0.0
+        seconds = latency_ms / 1000.0 if latency_ms > 0 else -1.0
+        cells = (
+            str(self._scene_id),
+            str(estimate.frame),
+            str(obj_id),
+            repr(plain(1.0 if estimate.score is None else estimate.score)),
+            " ".join(map(repr, R)),
+            " ".join(map(repr, t_mm)),
+            repr(plain(seconds)),
+        )
+        self._stream.write(",".join(cells) + "\n")

@@ -1,0 +1,109 @@
+"""What writers of poses share: plain, finite numbers, and times for formats that need one."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mixpose.errors import RecordingError
+from mixpose.poses.header import Header
+from mixpose.records import Estimate, Floats
+
+
+class PoseWriter(ABC):
+    """Writes estimates to a text stream, each as soon as it is given; the stream stays open."""
+
+    def __init__(self, stream: TextIO, header: Header) -> None:
+        self._stream, self._header = stream, header
+
+    def write(self, estimate: Estimate) -> None:
+        """Write one frame and flush it. Raises ValueError if it holds what is not finite."""
+        require_finite(estimate)
+        self._write(estimate)
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Write what is still due and flush."""
+        self._stream.flush()
+
+    @abstractmethod
+    def _write(self, estimate: Estimate) -> None:
+        """Write one frame."""
+
+
+def plain(values: ArrayLike) -> Any:
+    """Nested lists of floats (or one float) without negative zeros; any shape."""
+    # -0.0 + 0.0 is 0.0: equal poses are equal bytes.
+    return (np.asarray(values, dtype=np.float64) + 0.0).tolist()
+
+
+def plain_or_none(values: ArrayLike | None) -> Any:
+    """`plain`, with None left as None."""
+    return None if values is None else plain(values)
+
+
+def pose_of(estimate: Estimate) -> Floats | None:
+    """T_world_object (4, 4) of an estimate; None for a lost frame."""
+    return None if estimate.status == "lost" else estimate.T_world_object
+
+
+def require_finite(estimate: Estimate) -> None:
+    """Refuse an estimate that holds a NaN or an infinity.
+
+    Raises ValueError naming frame and field.  No format has a place for such values, and an
+    estimate that holds one is a fault of the program, not of its user.
+    """
+    values: dict[str, Floats | float | None] = {
+        "time_s": estimate.time_s,
+        "T_world_object": estimate.T_world_object,
+        "covariance": estimate.covariance,
+        "score": estimate.score,
+        "confidence": estimate.confidence,
+        "latency_ms": estimate.latency_ms,
+    }
+    for name, report in estimate.sensors.items():
+        values[f"sensors.{name}.explained"] = report.explained
+        values[f"sensors.{name}.rms"] = report.rms
+    for rank, rival in enumerate(estimate.hypotheses):
+        values[f"hypotheses.{rank}.T_world_object"] = rival.T_world_object
+        values[f"hypotheses.{rank}.weight"] = rival.weight
+    for field, value in values.items():
+        if value is not None and not _is_finite(value):
+            raise ValueError(f"frame {estimate.frame}: {field} is not finite")
+
+
+def _is_finite(value: Floats | float) -> bool:
+    if not isinstance(value, np.ndarray):
+        return math.isfinite(value)  # ten times as fast as NumPy on one number
+    return bool(np.isfinite(value).all())
+
+
+class Stamps:
+    """The time of each pose; where the recording has none the frame number, as a comment says."""
+
+    def __init__(self, stream: TextIO, format_name: str) -> None:
+        self._stream, self._format = stream, format_name
+        self._has_times: bool | None = None  # the first frame decides
+
+    def time_of(self, estimate: Estimate) -> float:
+        """Time in s, or the frame number.
+
+        Raises RecordingError if some frames have a time and others have none.
+        """
+        has_time = estimate.time_s is not None
+        if self._has_times is None:
+            self._has_times = has_time
+            if not has_time:
+                self._stream.write("# time is the frame number: the recording has no times\n")
+        if has_time != self._has_times:
+            found = "a time" if has_time else "no time"
+            raise RecordingError(
+                f"frame {estimate.frame} has {found}, unlike the frames before it: format "
+                f"{self._format!r} needs times for all frames or for none; give the sensors "
+                "times, or write jsonl"
+            )
+        return float(plain(estimate.frame if estimate.time_s is None else estimate.time_s))

@@ -1,0 +1,285 @@
+"""Marker tables, ``name,x,y,z`` and optionally the spread of each marker; bodies of other systems.
+
+NDI's .rom (SROM): a binary file of 752 bytes with up to 20 markers, in mm. Little-endian: "NDI", a
+checksum at byte 4 (the sum of all bytes after it), the number of markers at byte 28, positions as
+three float32 each from byte 72.
+
+Vicon's .vsk: XML in which positions of markers name parameters, in mm. A file may describe a
+skeleton of several segments; a rigid body has one.
+
+AsterTrack's .obj: a mesh in metres, in which each face of a marker group is a flat marker. A marker
+is at the middle of its face and looks along the face's normal. Groups are those whose name has
+"marker" in it; a file without groups has nothing but markers.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import struct
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose.records import Floats
+from mixpose.session.messages import BadKeyError, found, in_file, under
+from mixpose.session.setup import Unit, scale_between
+from mixpose.session.text_files import as_text, read_bytes
+from mixpose.session.values import is_number
+
+_ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterTrack's .obj"
+
+NDI_MARK = b"NDI\0"
+_CHECKSUM, _SUMMED_FROM, _COUNT, _POSITIONS = 4, 6, 28, 72
+_MOST_NDI = 20
+
+_VICON_TARGET = "TargetLocalPointToWorldPoint"
+
+_HEADER = ["name", "x", "y", "z"]
+_SIGMA_COLUMNS = (0, 1, 3, 9)
+
+LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
+"""Columns of a table that `mixpose learn` wrote: how well markers are known, for people."""
+
+
+def read_marker_file(path: Path, unit: Unit) -> Markers:
+    """Read a table of markers, whose lengths are in `unit`, or the body of another program."""
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml", ".json", ".xml", ".stl"):
+        raise BadKeyError(found(path.name, _ALLOWED))
+    content = read_bytes(path)
+    if suffix not in READERS:
+        with in_file(path.name):
+            if content.startswith(NDI_MARK):
+                raise BadKeyError("is an NDI body: rename it, to end in .rom")
+        return read_markers(path)
+    read, stated = READERS[suffix]
+    with in_file(path.name):
+        markers = read(content)
+        for number in markers.points.ravel().tolist():
+            if not is_number(number):
+                raise BadKeyError(found(number, "finite coordinates of markers"))
+    return replace(markers, points=markers.points * scale_between(stated, unit))
+
+
+def read_rom(content: bytes) -> Markers:
+    """Read the markers of an NDI tool.
+
+    Raises BadKeyError if the file is none, is cut short, or has changed since it was written.
+    """
+    if not content.startswith(NDI_MARK):
+        raise BadKeyError('not an NDI .rom file, which begins with "NDI"')
+    if len(content) < _POSITIONS + 12 * _MOST_NDI:
+        raise BadKeyError(f"found {len(content)} bytes; an NDI .rom file has 752: it is cut short")
+    (stated,) = struct.unpack_from("<H", content, _CHECKSUM)
+    if sum(content[_SUMMED_FROM:]) & 0xFFFF != stated:
+        raise BadKeyError("its checksum is wrong: the file is damaged; export it again")
+    (count,) = struct.unpack_from("<I", content, _COUNT)
+    if not 1 <= count <= _MOST_NDI:
+        raise BadKeyError(f"found {count} markers; allowed: 1 to {_MOST_NDI}")
+    positions = np.frombuffer(content, "<f4", 3 * count, _POSITIONS).reshape(count, 3)
+    return Markers(positions.astype(np.float64), None, tuple("ABCDEFGHIJKLMNOPQRST"[:count]))
+
+
+def read_vsk(content: bytes) -> Markers:
+    """Read the markers of a Vicon subject that is one rigid body.
+
+    Raises BadKeyError if the file is no such XML, is a skeleton, or lacks a parameter.
+    """
+    text = as_text(content)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise BadKeyError("found a DOCTYPE or ENTITY, which a .vsk file does not have")
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise BadKeyError(f"not XML: {error}") from error
+    if root.tag != "KinematicModel":
+        raise BadKeyError(found(f"<{root.tag}>", "<KinematicModel>, as a Vicon .vsk begins"))
+    parameters = {each.get("NAME", ""): each.get("VALUE", "") for each in root.iter("Parameter")}
+    targets = list(root.iter(_VICON_TARGET))
+    segments = {target.get("SEGMENT") for target in targets}
+    if len(segments) > 1:
+        raise BadKeyError(
+            f"found markers on {len(segments)} segments; allowed: a rigid body, which is one"
+        )
+    if not targets:
+        raise BadKeyError(f"found no markers ({_VICON_TARGET}) in it")
+    names = tuple(target.get("MARKER", f"{k + 1}") for k, target in enumerate(targets))
+    points = []
+    for target, name in zip(targets, names, strict=True):
+        with under("marker", name):
+            points.append(_position(target.get("POSITION", ""), parameters))
+    return Markers(np.array(points), None, names)
+
+
+def _position(text: str, parameters: dict[str, str]) -> list[float]:
+    """Three numbers, or three names of parameters in quotes."""
+    values = []
+    for word in text.split():
+        name = word.strip("'\"")
+        if name != word and name not in parameters:
+            raise BadKeyError(f'found no parameter "{name}"')
+        try:
+            values.append(float(parameters.get(name, name)))
+        except ValueError as error:
+            raise BadKeyError(found(parameters.get(name, name), "a number")) from error
+    if len(values) != 3:
+        raise BadKeyError(found(text, "POSITION with three coordinates"))
+    return values
+
+
+def read_astertrack(content: bytes) -> Markers:
+    """Read the flat markers of an AsterTrack target. Raises BadKeyError naming the line."""
+    vertices: list[list[float]] = []
+    faces: list[tuple[str, int, list[int]]] = []
+    group = ""
+    for number, line in enumerate(as_text(content).splitlines(), start=1):
+        word, *cells = line.split() or [""]
+        if word == "v":
+            vertices.append(_coordinates(cells, number))
+        elif word in ("g", "o"):
+            group = " ".join(cells)
+        elif word == "f":
+            faces.append((group, number, _corners(cells, number)))
+    if not vertices or not faces:
+        raise BadKeyError("found no vertices (v) and faces (f), as a Wavefront .obj has them")
+    groups = list(dict.fromkeys(group for group, _, _ in faces))
+    of_markers = [name for name in groups if "marker" in name.lower()]
+    if not of_markers and groups != [""]:
+        raise BadKeyError(
+            f"found the groups {', '.join(groups)[:60]}; allowed: markers in groups whose name "
+            'has "Marker" in it'
+        )
+    found_faces = [face for face in faces if not of_markers or face[0] in of_markers]
+    placed = [_centre_and_normal(np.array(vertices), *face[1:]) for face in found_faces]
+    points, normals = (np.array(part) for part in zip(*placed, strict=True))
+    names = tuple(str(k + 1) for k in range(len(points)))
+    return Markers(points, None, names, normals)
+
+
+def _coordinates(cells: list[str], line: int) -> list[float]:
+    try:
+        values = [float(cell) for cell in cells[:3]]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(map(is_number, values)):
+        raise BadKeyError(f"line {line}: {found(' '.join(cells), 'v x y z')}")
+    return values
+
+
+def _corners(cells: list[str], line: int) -> list[int]:
+    try:
+        corners = [int(cell.partition("/")[0]) for cell in cells]
+    except ValueError:
+        corners = []
+    if len(corners) < 3:
+        raise BadKeyError(f"line {line}: {found(' '.join(cells), 'f and three corners or more')}")
+    return corners
+
+
+def _centre_and_normal(vertices: Floats, line: int, corners: list[int]) -> tuple[Floats, Floats]:
+    count = len(vertices)
+    places = [corner - 1 if corner > 0 else count + corner for corner in corners]
+    if not all(0 <= place < count for place in places):
+        raise BadKeyError(f"line {line}: names a vertex that is not there; the file has {count}")
+    ring = vertices[places]
+    # twice the area of the face along its normal, by the corners' order
+    across = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
+    length = np.linalg.norm(across)
+    if not length > 0:
+        raise BadKeyError(f"line {line}: found a face without area")
+    return ring.mean(axis=0), np.asarray(across / length)
+
+
+READERS: dict[str, tuple[Callable[[bytes], Markers], Unit]] = {
+    ".rom": (read_rom, "mm"),
+    ".vsk": (read_vsk, "mm"),
+    ".obj": (read_astertrack, "m"),
+}
+"""By ending: what reads a file, and the unit that its format fixes."""
+
+
+@dataclass(frozen=True)
+class Markers:
+    """What a marker table holds."""
+
+    points: Floats  # (N, 3)
+    # per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them; None
+    # where the table has no such columns
+    sigma: list[Any] | None
+    names: tuple[str, ...] = ()  # of the markers, where the file has names
+    # (N, 3), outward directions of flat markers, where the file has them
+    normals: Floats | None = None
+
+
+def read_markers(path: Path) -> Markers:
+    """Read a marker table; problems name line and column.
+
+    It is a CSV file with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along
+    x, y and z) or nine (the covariance, row by row). The columns in which ``mixpose learn`` says
+    how well markers are known may stand there, too.
+    """
+    content = read_bytes(path)
+    with in_file(path.name):
+        reader = csv.reader(io.StringIO(as_text(content), newline=""), skipinitialspace=True)
+        try:
+            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        except csv.Error as error:
+            raise BadKeyError(f"line {reader.line_num}: {error}") from error
+        if not rows:
+            raise BadKeyError("the file is empty; allowed: a header name,x,y,z and a row per point")
+        header = [cell.strip() for cell in rows[0][1]]
+        _check_header(header)
+        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
+        values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
+    if not len(values):
+        raise BadKeyError(f"{path.name}: found no markers below the header")
+    names = tuple(row[0].strip() for _, row in rows[1:])
+    return Markers(values[:, :3], _sigma_of(values[:, 3:]), names)
+
+
+def _check_header(header: list[str]) -> None:
+    names = [name.lower() for name in header]
+    if names[:4] != _HEADER or len(names) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
+        raise BadKeyError(
+            f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
+            "columns of sigma"
+        )
+
+
+def _learnt(header: list[str]) -> int:
+    """How many columns at the end are those of a body that was learnt."""
+    return len(LEARNT_COLUMNS) if tuple(header[-len(LEARNT_COLUMNS) :]) == LEARNT_COLUMNS else 0
+
+
+def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:
+    if len(row) != len(header):
+        raise BadKeyError(f"line {line}: found {len(row)} cells; allowed: {len(header)} as above")
+    values = []
+    for cell, column in zip(row[1:], header[1:], strict=True):
+        try:
+            value = float(cell)
+        except ValueError:
+            value = float("nan")
+        if not is_number(value):
+            raise BadKeyError(
+                f"line {line}, column {column}: {found(cell.strip(), 'a finite number')}"
+            )
+        values.append(value)
+    return values
+
+
+def _sigma_of(columns: Floats) -> list[Any] | None:
+    match columns.shape[1]:
+        case 0:
+            return None
+        case 1:
+            return [row[0] for row in columns.tolist()]
+        case 3:
+            return list(columns.tolist())
+        case _:
+            return list(columns.reshape(-1, 3, 3).tolist())
