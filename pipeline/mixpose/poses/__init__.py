@@ -1,5 +1,5 @@
 """Poses on their way out, back in, and against the truth.
 
-`formats` names the writers (`jsonl`, `csvtable`, `tum`, `bop`), `jsonl` also reads, `evaluate`
-compares a poses file with a truth file and `report` shows the outcome.
+`formats` names the writers (`jsonl`, `csvtable`, `ros`, `benchmarks`), `jsonl` also reads,
+`evaluate` compares a poses file with a truth file and `report` shows the outcome.
 """
