@@ -33,6 +33,8 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     assert (
         "weights   sigma in proportion to what features err by (left 0.025, right 1)" in done.stdout
     )
+    (tip,) = [row for row in done.stdout.splitlines() if row.startswith("tip, mm ")]
+    assert len(tip.split()) == 4  # its name, the unit, and a number for each system
     assert "sigma     features err by much of sigma: right 0.8 of it" in done.stdout
     assert "moving mark" in done.stdout
     assert "7 markers of tracker (mark0, mark1" in done.stdout

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import lines_of
+from command_line import lines_of, wait_until
 
 from mixpose.cli import main
 from mixpose.errors import SessionError
@@ -22,6 +22,7 @@ from mixpose.publishing.backlog import Backlog
 from mixpose.publishing.message import Message
 from mixpose.publishing.ros_messages import ros_messages, topics
 from mixpose.publishing.ros_node import RosNodeSender
+from mixpose.publishing.ws import WebSocketSender
 from mixpose.records import Estimate, Hypothesis, Moment
 from mixpose.rigid import from_rotation_vector, perturb, twist_between
 from mixpose.session import load_session
@@ -233,6 +234,21 @@ def test_too_much_that_waits_loses_its_oldest() -> None:
     assert backlog.dropped == 4
     backlog.end()
     assert [backlog.take() for _ in range(4)] == [*messages[1:4], None]
+
+
+def test_pages_count_as_receivers_from_when_one_is_there() -> None:
+    client = pytest.importorskip("websockets.sync.client")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        url = f"ws://127.0.0.1:{free.getsockname()[1]}/poses"
+    sender = WebSocketSender(parse(url, SENDERS), HEADER)
+    try:
+        assert not sender.send(Message(ESTIMATE))  # nobody has got it, so it is not counted
+        with client.connect(url) as page:
+            assert json.loads(page.recv())["unit"] == "mm"
+            wait_until(lambda: sender.send(Message(ESTIMATE)))
+            assert json.loads(page.recv())["frame"] == 7
+    finally:
+        sender.close()
 
 
 def test_stamp_of_a_pose_ahead_is_of_the_moment_that_it_is_for() -> None:
