@@ -315,7 +315,7 @@ def test_turns_favour_no_direction() -> None:
     poses = spread_poses(session, 256, volume=np.ones(3), turn_deg=15)
     R = poses[1:, :3, :3] @ poses[0, :3, :3].T
     turns = Rotation.from_matrix(R).as_rotvec() / np.radians(15)
-    # evenly in a ball of radius 1: <v> = 0, <v v^T> = 1/5; 256 points of a sequence that fills space
+    # evenly in a ball of radius 1: <v> = 0, <v v^T> = 1/5; 256 points of a sequence that fills it
     # evenly do so to 0.01 (measured 0.007 and 0.009)
     np.testing.assert_allclose(turns.mean(axis=0), 0, atol=0.02)
     np.testing.assert_allclose(turns.T @ turns / len(turns), np.eye(3) / 5, atol=0.02)
