@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from mixpose.poses.header import Header
 from mixpose.publishing import SENDERS, Publishing, address
 from mixpose.publishing.address import parse
 from mixpose.publishing.backlog import Backlog
+from mixpose.publishing.lsl import LslSender
 from mixpose.publishing.message import Message
 from mixpose.publishing.ros_messages import ros_messages, topics
 from mixpose.publishing.ros_node import RosNodeSender
@@ -271,6 +274,25 @@ def test_several_bodies_have_topics_of_their_own() -> None:
     ]
     lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)
     assert ros_messages(Message(lost), found) == []
+
+
+def test_the_stream_of_a_lost_frame_has_no_numbers_for_a_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pylsl = MagicMock()
+    pylsl.local_clock.return_value = 50.0
+    monkeypatch.setitem(sys.modules, "pylsl", pylsl)
+    monkeypatch.setattr(address, "find_spec", lambda _: True)
+    sender = LslSender(parse("lsl://rig", SENDERS), HEADER)
+    _, _, channels, *_ = pylsl.StreamInfo.call_args.args
+    lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)
+    for estimate, status in ((lost, 0.0), (ESTIMATE, 2.0)):
+        sender.send(Message(estimate))
+        sample, stamp = pylsl.StreamOutlet.return_value.push_sample.call_args.args
+        assert len(sample) == channels == 9
+        assert sample[7:] == [status, 7.0]
+        assert np.isnan(sample[:7]).all() == (status == 0.0)
+        assert stamp == 50.0  # nothing is known of when the frame was taken
 
 
 def test_only_ok_leaves_out_the_others() -> None:
