@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_line import command
 
@@ -43,6 +44,12 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     equal = result["systems"][1]["equals_first_with"]
     assert equal["noise"]["left"] == pytest.approx(0.1 * equal["factor"])
     assert len(result["systems"][0]["deviations"]) == 6
+    # what is printed are root mean squares of what is written, in degrees, with three digits
+    (turns,) = [row for row in done.stdout.splitlines() if row.startswith("rotation, deg ")]
+    for printed, system in zip(turns.split()[2:], result["systems"], strict=True):
+        squares = (np.array(system["deviations"])[:, 3:] ** 2).sum(axis=1)
+        error = np.degrees(np.sqrt(squares.mean()))
+        assert float(printed) == pytest.approx(error, rel=2e-3)
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
 
 
