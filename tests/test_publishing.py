@@ -23,6 +23,8 @@ from mixpose.publishing.address import parse
 from mixpose.publishing.backlog import Backlog
 from mixpose.publishing.lsl import LslSender
 from mixpose.publishing.message import Message
+from mixpose.publishing.mqtt import MqttSender
+from mixpose.publishing.osc import OscSender
 from mixpose.publishing.ros_messages import ros_messages, topics
 from mixpose.publishing.ros_node import RosNodeSender
 from mixpose.publishing.ws import WebSocketSender
@@ -252,6 +254,49 @@ def test_pages_count_as_receivers_from_when_one_is_there() -> None:
             assert json.loads(page.recv())["frame"] == 7
     finally:
         sender.close()
+
+
+def test_a_message_of_open_sound_control_counts_as_sent_and_names_its_body() -> None:
+    parsing = pytest.importorskip("pythonosc.osc_message")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:
+        receiving.bind(("127.0.0.1", 0))
+        url = f"osc://127.0.0.1:{receiving.getsockname()[1]}/rig"
+        sender = OscSender(parse(url, SENDERS), HEADER)
+        sender.connect()
+        assert sender.send(Message(ESTIMATE))
+        sender.close()
+        message = parsing.OscMessage(receiving.recv(65536))
+    assert message.address == "/rig/tool"
+    frame, time_s, status, *pose = message.params
+    assert (frame, time_s, status) == (7, 0.25, "ok")
+    np.testing.assert_allclose(pose[:3], [10, 20, 30], rtol=1e-6)  # single precision
+    assert len(pose) == 7
+
+
+def test_a_broker_is_looked_for_at_the_port_of_its_protocol(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client_of = MagicMock()
+    monkeypatch.setitem(sys.modules, "paho.mqtt.client", client_of)
+    monkeypatch.setitem(sys.modules, "paho.mqtt.enums", MagicMock())
+    monkeypatch.setattr(address, "find_spec", lambda _: True)
+    client = client_of.Client.return_value
+
+    def answer() -> None:
+        client.on_connect(None, None, None, MagicMock(is_failure=False), None)
+
+    client.loop_start.side_effect = answer
+    client.publish.return_value = MagicMock(rc=0)
+    sender = MqttSender(parse("mqtt://there/rig", SENDERS), HEADER)
+    sender.connect()
+    client.connect.assert_called_once_with("there", 1883)
+    assert sender.send(Message(ESTIMATE))
+    assert [call.args[0] for call in client.publish.call_args_list] == ["rig/header", "rig/tool"]
+    # gone while the message was on its way
+    client.publish.return_value.is_published.return_value = False
+    client.is_connected.return_value = False
+    with pytest.raises(ConnectionError, match="the broker has gone"):
+        sender.send(Message(ESTIMATE))
 
 
 def test_stamp_of_a_pose_ahead_is_of_the_moment_that_it_is_for() -> None:
