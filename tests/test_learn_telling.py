@@ -88,7 +88,8 @@ def test_the_table_has_a_line_for_each_marker_and_the_largest_turn() -> None:
 def test_bodies_that_share_three_markers_are_named_with_them() -> None:
     turned = from_rotation_vector([0.3, -0.7, 1.1], [100.0, 20.0, 5.0])
     shared = POINTS[[3, 0, 2]] @ turned[:3, :3].T + turned[:3, 3]
-    other = np.concatenate([shared, shared.mean(axis=0, keepdims=True) + [90.0, 10.0, 33.0]])
+    fourth = shared.mean(axis=0) + np.array([90.0, 10.0, 33.0])
+    other = np.vstack([shared, fourth])
     bodies = [learnt(turning(40.0, 20.0)), learnt(turning(40.0, 20.0), other)]
     (told,) = look_alikes(bodies, ["first", "second"])
     _, names = told.split("markers ", 1)
