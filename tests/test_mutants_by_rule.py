@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import subprocess
 import sys
 from argparse import Namespace
@@ -15,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 import mutants as tool
 from mutation.drawn import ROOMS, candidates, chosen_tests, drawn, reason_why_harmless
-from mutation.executed import Executed, context_name, digest, read
+from mutation.executed import Executed, context_name, digest, read, record
 from mutation.harmless import HARMLESS, Harmless
 from mutation.mutant import MutationError
 from mutation.rules import changes
@@ -186,6 +187,24 @@ def test_lines_of_a_module_that_has_changed_since_are_not_trusted(tree: Path) ->
     (tree / tool.PACKAGE / "runner.py").write_text("\n" + ROOM, encoding="utf-8")
     executed = read(folder, tree, tool.PACKAGE)
     assert executed.tests("runner.py", [(3, 3)]) == ["tests/test_runner_small.py::test_small"]
+
+
+def test_lines_are_recorded_by_test_also_in_processes_that_a_test_starts(tree: Path) -> None:
+    pytest.importorskip("coverage")
+    script = "from mixpose.runner import small; small(4)"
+    test = tree / "tests" / "test_runner_small.py"
+    started = f"subprocess.run([sys.executable, '-c', {script!r}], check=True)"
+    test.write_text(f"import subprocess, sys\n{TEST.replace('pass', started)}", encoding="utf-8")
+    folder, environment = tree / "build", {**os.environ, "PYTHONPATH": str(tree / "pipeline")}
+    record(tree, tool.PACKAGE, folder, environment, 120.0)
+    executed = read(folder, tree, tool.PACKAGE)
+    small, nothing = (f"tests/test_runner_small.py::test_{name}" for name in ("small", "nothing"))
+    assert set(executed.seconds) == {small, nothing}
+    assert executed.tests("runner.py", [(9, 9)]) == [small]
+    assert set(executed.tests("runner.py", [(10, 10)])) == {small, nothing}
+    assert not (tree / "seconds.jsonl").exists()
+    # what has not changed is not recorded again
+    record(tree, tool.PACKAGE, folder, {}, 0.0)
 
 
 def test_mutants_by_rule_are_tried_and_the_harmless_counted_apart(

@@ -7,6 +7,7 @@ look at what they made.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,11 @@ from coverage import Coverage
 def _name(context: str) -> None:
     measured: Any = Coverage.current()
     measured.switch_context(context)
+
+
+def pytest_configure() -> None:
+    """Have processes that tests start measured, this one being measured already."""
+    os.environ["COVERAGE_PROCESS_START"] = os.environ["TO_MEASURE"]
 
 
 @pytest.hookimpl(wrapper=True)

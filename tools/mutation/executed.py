@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -23,12 +24,19 @@ SETTINGS = """[run]
 source = {package}
 data_file = {folder}/data
 parallel = true
-patch = subprocess
 sigterm = true
 context = ${{PYTEST_CURRENT_TEST-}}
 disable_warnings = module-not-imported,no-data-collected,module-not-measured
 """
 
+# Processes that tests start read the settings by themselves, and with them the name of the test.
+STARTED = """import os
+
+if "COVERAGE_PROCESS_START" in os.environ:
+    import coverage
+
+    coverage.process_startup()
+"""
 _PHASE = re.compile(r"(.+) \((call|setup|teardown)\)")
 
 
@@ -141,8 +149,10 @@ def _recorded(
     folder.mkdir()
     settings = folder / "settings"
     settings.write_text(SETTINGS.format(package=tree / package, folder=folder), encoding="utf-8")
-    path = f"{environment['PYTHONPATH']}:{Path(__file__).resolve().parents[1]}"
-    measured = {**environment, "PYTHONPATH": path}
+    (folder / "sitecustomize.py").write_text(STARTED, encoding="utf-8")
+    path = (environment["PYTHONPATH"], str(Path(__file__).resolve().parents[1]), str(folder))
+    measured = {**environment, "PYTHONPATH": os.pathsep.join(path), "TO_MEASURE": str(settings)}
+    measured.pop("PYTEST_CURRENT_TEST", None)  # of a test that calls this
     command = [sys.executable, "-m", "coverage"]
     run = ["-m", "pytest", "-p", "mutation.contexts", "-p", "no:cacheprovider", "-q", str(tests)]
     try:
