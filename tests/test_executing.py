@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from mixpose import executing
+from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_processes, in_threads
 
 
@@ -56,3 +58,9 @@ def test_processes_drop_what_has_not_begun_too(tmp_path: Path) -> None:
     with pytest.raises(GoneError), in_processes(1) as executor:
         leave_after_one(executor, subprocess.call, tasks)
     assert len(list(tmp_path.iterdir())) < 40
+
+
+def test_a_cluster_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executing, "find_spec", lambda _: None)
+    with pytest.raises(SessionError, match=r"--scheduler there: needs .* 'mixpose\[dask\]'"):
+        executing.on_cluster("there").__enter__()
