@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import digits_of, doubts_of, lines_of, look_alikes
@@ -96,3 +97,11 @@ def test_bodies_that_share_three_markers_are_named_with_them() -> None:
     these, those = names.split(": where")[0].split(" of second lie like ")
     pairs = dict(zip(these.split(", "), those.removesuffix(" of first").split(", "), strict=True))
     assert pairs == {"m0": "m3", "m1": "m0", "m2": "m2"}
+
+
+def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it() -> None:
+    older = POINTS + np.array([5.0, 6.0, 7.0])
+    found = like(learnt(turning(40.0, 20.0)), older[:4], ("1", "2", "3", "5"))
+    assert found is not None
+    assert (found.learnt.names, found.shared) == (("1", "2", "3", "5", "6"), 4)
+    np.testing.assert_allclose(found.learnt.points, older, atol=1e-9)
