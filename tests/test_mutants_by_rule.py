@@ -113,6 +113,20 @@ def test_a_line_changes_where_its_operators_stand(
     assert [(before, after) for _, before, after in texts(line)] == expected
 
 
+def test_a_change_is_reached_where_its_statement_is_executed() -> None:
+    text = """A = 1
+def f(x=2):
+    "3"
+    with g(4):
+        if x > 5:
+            return h(
+                6,
+            )
+"""
+    reached = {one.line: one.reach for one in changes(text)}
+    assert reached == {1: None, 2: (4, 8), 4: (4, 4), 5: (5, 5), 6: (6, 8), 7: (6, 8)}
+
+
 def test_every_mutant_of_every_room_can_be_compiled_and_differs() -> None:
     package = ROOT / tool.PACKAGE
     some = drawn(package, 10 * len(ROOMS), seed=1)

@@ -116,7 +116,8 @@ class _Finder:
                 if isinstance(child, ast.keyword) and child.arg in LAYOUT:
                     continue
                 if isinstance(child, ast.AST):
-                    below = _lines(child) if inside and isinstance(child, ast.expr) else None
+                    head = child.context_expr if isinstance(child, ast.withitem) else child
+                    below = _lines(head) if inside and isinstance(head, ast.expr) else None
                     simple = not isinstance(node, ast.stmt) or not hasattr(node, "body")
                     yield from self.of(child, reach if simple else below, inside)
 
