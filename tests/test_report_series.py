@@ -114,6 +114,17 @@ def test_errors_are_those_of_the_right_answer(tmp_path: Path) -> None:
     assert errors.turn_deg[0] == pytest.approx([0, -0.1, 0], abs=1e-6)
 
 
+def test_turns_add_nothing_to_the_distance_of_an_error(tmp_path: Path) -> None:
+    truth = read_poses(RECORDING / "truth.jsonl")
+    off = np.array([3.0, 0.0, -4.0, 0.3, 0.2, -0.1])
+    poses = [(line.frame, line.T_world_object) for line in truth.poses]
+    estimates = [estimate(frame, rigid.perturb(T, off)) for frame, T in poses if T is not None]
+    found = read_poses(write(tmp_path / "poses.jsonl", estimates, None))
+    errors = errors_of(series_of(found), found, truth)
+    assert errors.distance == pytest.approx(5.0, abs=1e-9)
+    assert errors.rotation_deg == pytest.approx(np.degrees(np.linalg.norm(off[3:])), abs=1e-9)
+
+
 def test_frames_to_look_at_are_spaced_and_the_extremes(tmp_path: Path) -> None:
     series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", {**STATUSES, 39: "lost"})))
     chosen = chosen_frames(series, None)
