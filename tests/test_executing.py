@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -64,3 +67,66 @@ def test_a_cluster_without_its_package_names_the_extra(monkeypatch: pytest.Monke
     monkeypatch.setattr(executing, "find_spec", lambda _: None)
     with pytest.raises(SessionError, match=r"--scheduler there: needs .* 'mixpose\[dask\]'"):
         executing.on_cluster("there").__enter__()
+
+
+class Future:
+    """A task that is done, as a scheduler has it."""
+
+    def __init__(self, key: str, function: Callable[[Any], Any], task: Any) -> None:
+        self.key, self._error, self._result = key, None, None
+        try:
+            self._result = function(task)
+        except ValueError as error:
+            self._error = error
+
+    def exception(self) -> Exception | None:
+        return self._error
+
+    def result(self) -> Any:
+        return self._result
+
+
+class Client:
+    """Stands for a client of a scheduler: takes equal tasks for one where these are pure."""
+
+    def __init__(self, cluster: Any, **_: Any) -> None:
+        self.cluster = cluster
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def map(self, function: Callable[[Any], Any], tasks: list[Any], *, pure: bool) -> list[Future]:
+        keys = map(str, tasks if pure else range(len(tasks)))
+        return [Future(key, function, task) for key, task in zip(keys, tasks, strict=True)]
+
+
+@pytest.fixture
+def distributed(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Stands for the package."""
+    package = MagicMock(Client=Client, as_completed=reversed)
+    monkeypatch.setitem(sys.modules, "distributed", package)
+    monkeypatch.setattr(executing, "find_spec", lambda _: True)
+    return package
+
+
+@pytest.mark.parametrize(("workers", "expected"), [(3, 3), (None, 5)])
+def test_a_local_cluster_has_a_worker_of_one_thread_for_each_processor(
+    workers: int | None,
+    expected: int,
+    distributed: MagicMock,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 5)
+    with executing.on_cluster(executing.LOCAL, workers):
+        ((), options) = distributed.LocalCluster.call_args
+    assert (options["n_workers"], options["threads_per_worker"]) == (expected, 1)
+
+
+@pytest.mark.usefixtures("distributed")
+def test_equal_tasks_have_a_result_each_also_on_a_cluster() -> None:
+    with executing.on_cluster(executing.LOCAL) as executor:
+        results = dict(executor.run(int, ["7", "x", "7"]))
+    assert (results[0], results[2]) == (7, 7)
+    assert isinstance(results[1], ValueError)
