@@ -20,7 +20,7 @@ from mixpose.errors import SessionError
 from mixpose.poses.header import Header
 from mixpose.publishing import SENDERS, Publishing, address
 from mixpose.publishing.address import parse
-from mixpose.publishing.backlog import Backlog
+from mixpose.publishing.backlog import Backlog, PublishingRules
 from mixpose.publishing.lsl import LslSender
 from mixpose.publishing.message import Message
 from mixpose.publishing.mqtt import MqttSender
@@ -273,30 +273,47 @@ def test_a_message_of_open_sound_control_counts_as_sent_and_names_its_body() -> 
     assert len(pose) == 7
 
 
-def test_a_broker_is_looked_for_at_the_port_of_its_protocol(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    client_of = MagicMock()
-    monkeypatch.setitem(sys.modules, "paho.mqtt.client", client_of)
+@pytest.fixture
+def broker(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Stands for the client of a broker that takes what comes."""
+    module = MagicMock()
+    monkeypatch.setitem(sys.modules, "paho.mqtt.client", module)
     monkeypatch.setitem(sys.modules, "paho.mqtt.enums", MagicMock())
     monkeypatch.setattr(address, "find_spec", lambda _: True)
-    client = client_of.Client.return_value
-
-    def answer() -> None:
-        client.on_connect(None, None, None, MagicMock(is_failure=False), None)
-
-    client.loop_start.side_effect = answer
+    client: MagicMock = module.Client.return_value
     client.publish.return_value = MagicMock(rc=0)
+    client.loop_start.side_effect = lambda: client.on_connect(
+        None, None, None, MagicMock(is_failure=False), None
+    )
+    return client
+
+
+def test_a_broker_is_looked_for_at_the_port_of_its_protocol(broker: MagicMock) -> None:
     sender = MqttSender(parse("mqtt://there/rig", SENDERS), HEADER)
     sender.connect()
-    client.connect.assert_called_once_with("there", 1883)
+    broker.connect.assert_called_once_with("there", 1883)
     assert sender.send(Message(ESTIMATE))
-    assert [call.args[0] for call in client.publish.call_args_list] == ["rig/header", "rig/tool"]
+    assert [call.args[0] for call in broker.publish.call_args_list] == ["rig/header", "rig/tool"]
     # gone while the message was on its way
-    client.publish.return_value.is_published.return_value = False
-    client.is_connected.return_value = False
+    broker.publish.return_value.is_published.return_value = False
+    broker.is_connected.return_value = False
     with pytest.raises(ConnectionError, match="the broker has gone"):
         sender.send(Message(ESTIMATE))
+
+
+def test_a_broker_that_refuses_or_is_silent_is_away(
+    broker: MagicMock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sender = MqttSender(parse("mqtt://there:9/rig", SENDERS), HEADER)
+    refusal = MagicMock(is_failure=True, __str__=lambda _: "Not authorized")
+    broker.loop_start.side_effect = lambda: broker.on_connect(None, None, None, refusal, None)
+    with pytest.raises(ConnectionError, match="Not authorized"):
+        sender.connect()
+    broker.loop_start.side_effect = None
+    monkeypatch.setattr(PublishingRules, "connect_s", 0.01)
+    with pytest.raises(TimeoutError, match="the broker does not answer"):
+        sender.connect()
+    broker.publish.assert_not_called()
 
 
 def test_stamp_of_a_pose_ahead_is_of_the_moment_that_it_is_for() -> None:
