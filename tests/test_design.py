@@ -253,6 +253,22 @@ def test_no_noise_equals_a_system_whose_markers_err_less() -> None:
     assert noise_to_equal(poor, 0.5 * error_of(scaled(poor, 1e-6)), error_of) is None
 
 
+def test_nothing_equals_a_system_that_determines_nothing_and_none_errs_without_end() -> None:
+    plan = point_sets(POINTS, 0.1)
+
+    def error_of(plan: Plan) -> float:
+        return float(np.sqrt(np.trace(predict(plan, POSE[None]).covariances[0, :3, :3])))
+
+    own = error_of(plan)
+    assert noise_to_equal(plan, np.inf, error_of) is None
+    assert noise_to_equal(plan, own, lambda _: np.inf) is None
+    # errors grow as the noise does, and ten thousand times of it is the most that is looked at
+    assert noise_to_equal(plan, 9e3 * own, error_of) == pytest.approx(9e3, rel=1e-6)
+    assert noise_to_equal(plan, 1.1e4 * own, error_of) is None
+    assert noise_to_equal(plan, own / 9e3, error_of) == pytest.approx(1 / 9e3, rel=1e-6)
+    assert noise_to_equal(plan, own / 1.1e4, error_of) is None
+
+
 def test_advice_gains_what_it_says() -> None:
     session = load_session(TWO_CAMERAS)
     plan, poses = plan_of(session), spread_poses(session, 6)
