@@ -59,6 +59,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "errors that are equal to the last bit",
     ),
     Harmless(
+        "pictures/plots.py",
+        "places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)",
+        "places = np.stack([ranges, np.zeros_like(ranges)], axis=+1)",
+        "equivalent: of two arrays of one axis",
+    ),
+    Harmless(
         "poses/trajectories.py",
         "@dataclass(frozen=True, eq=False)",
         "@dataclass(frozen=False, eq=False)",
