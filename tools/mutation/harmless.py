@@ -103,6 +103,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "a face is exactly edge-on only by rounding",
     ),
     Harmless(
+        "simulation/writers.py",
+        "return any(cv2.pointPolygonTest(one, (u, v), False) >= 0 for one in corners)",
+        "return any(cv2.pointPolygonTest(one, (u, v), True) >= 0 for one in corners)",
+        "equivalent: the sign of a distance",
+    ),
+    Harmless(
         "trajectories/pivot.py",
         "information = np.eye(6)",
         "information = np.eye(12)",
