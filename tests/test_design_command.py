@@ -113,3 +113,21 @@ def test_wrong_options_are_told_in_one_line(
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1
     assert words in said
+
+
+def test_frames_are_simulated_where_a_system_determines_anything(tmp_path: Path) -> None:
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    before, right = (
+        text[: text.index("[[sensor]]")],
+        text[text.index('[[sensor]]\nname = "right"') :],
+    )
+    sonar = '[[sensor]]\nname = "sonar"\nmodel = "lateration"\nposition = [0, 0, 0]\n'
+    (tmp_path / "range.toml").write_text(before + sonar, encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(before + right, encoding="utf-8")
+    done = command(
+        "design", "range.toml", "camera.toml", "--count", "2", "--monte-carlo", "2", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    alone, beside = done.stdout.split("\ncamera: ")
+    assert "simulated" not in alone.split("\n\n")[-1]
+    assert "simulated" in beside

@@ -7,6 +7,7 @@ import pytest
 
 from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt
+from mixpose.learning.growing import least_met
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
@@ -105,3 +106,7 @@ def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it(
     assert found is not None
     assert (found.learnt.names, found.shared) == (("1", "2", "3", "5", "6"), 4)
     np.testing.assert_allclose(found.learnt.points, older, atol=1e-9)
+
+
+def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> None:
+    assert [least_met(points) for points in (3, 4, 5, 9)] == [3, 3, 4, 4]
