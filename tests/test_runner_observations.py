@@ -10,6 +10,7 @@ import pytest
 
 import mixpose
 from mixpose import runner
+from mixpose.errors import SessionError
 from mixpose.records import FrameSet, GridPattern, PointPattern, RawFrame
 from mixpose.rigid import from_rotation_vector
 from mixpose.selection import Selection
@@ -73,6 +74,15 @@ def test_a_source_of_the_session_is_beside_it_and_one_given_instead_is_not(
     assert (given.base, given.source) == (Path(), "other/left*.png")
     kinds = [runner.source_spec(ranges, setup, None).kind for setup in ranges.sensors]
     assert (own.kind, kinds) == ("camera", ["lateration"] * 3)
+
+
+def test_a_sensor_without_a_source_needs_one_instead(session: Session) -> None:
+    planned = replace(session.sensors[0], source="")
+    with pytest.raises(SessionError, match=r"'left': source: found none, name the recording here"):
+        runner.source_spec(session, planned, None)
+    assert runner.source_spec(session, planned, "left*.png").source == "left*.png"
+    with pytest.raises(SessionError, match="--source top=.*no such sensor, allowed: left, right"):
+        runner.open_sources(session, {"top": "top*.png"})
 
 
 def test_a_run_that_goes_on_begins_at_its_own_pose_and_not_at_start(session: Session) -> None:
