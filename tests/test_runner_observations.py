@@ -81,7 +81,7 @@ def test_a_sensor_without_a_source_needs_one_instead(session: Session) -> None:
     with pytest.raises(SessionError, match=r"'left': source: found none, name the recording here"):
         runner.source_spec(session, planned, None)
     assert runner.source_spec(session, planned, "left*.png").source == "left*.png"
-    with pytest.raises(SessionError, match="--source top=.*no such sensor, allowed: left, right"):
+    with pytest.raises(SessionError, match=r"--source top=.*no such sensor, allowed: left, right"):
         runner.open_sources(session, {"top": "top*.png"})
 
 
