@@ -72,6 +72,18 @@ def test_lost_frames_are_gaps_in_every_line(tmp_path: Path) -> None:
     assert frame_ranges(series, "ambiguous") == [(20, 20)]
 
 
+def test_lost_frames_are_shaded_half_a_frame_to_either_side(tmp_path: Path) -> None:
+    series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", STATUSES)))
+    _, axes = blank()
+    TimeAxes(axes, series).mark_lost()
+    lost = np.flatnonzero(series.status == "lost")
+    assert lost.tolist() == [5, 6, 7]
+    half = 0.5 * (series.x[1] - series.x[0])
+    (stretch,) = axes.collections[-1].get_paths()
+    assert stretch.get_extents().x0 == pytest.approx(series.x[5] - half)
+    assert stretch.get_extents().x1 == pytest.approx(series.x[7] + half)
+
+
 def test_a_line_breaks_where_frames_are_left_out_and_where_a_turn_wraps(tmp_path: Path) -> None:
     T = np.eye(4)
     frames = [10, 12, 14, 20, 22]
