@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -60,6 +61,8 @@ def test_processes_drop_what_has_not_begun_too(tmp_path: Path) -> None:
     tasks = [["sh", "-c", f"sleep 0.05; : > {tmp_path / str(k)}"] for k in range(40)]
     with pytest.raises(GoneError), in_processes(1) as executor:
         leave_after_one(executor, subprocess.call, tasks)
+    for process in multiprocessing.active_children():
+        process.join()
     assert len(list(tmp_path.iterdir())) < 40
 
 
