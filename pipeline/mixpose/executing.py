@@ -96,12 +96,14 @@ def in_processes(workers: int | None = None) -> Iterator[Executor]:
     The linear algebra of each has one thread.
     """
     context = multiprocessing.get_context("spawn")
-    with futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread) as pool:
-        try:
-            yield _Pool(pool)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pool = futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread)
+    try:
+        yield _Pool(pool)
+    except BaseException:
+        # once: to shut it down again, as `with` does, would take back that the rest is cancelled
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 @contextmanager
