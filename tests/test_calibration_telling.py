@@ -75,13 +75,13 @@ def test_residuals_of_frames_and_features_on_the_page_are_root_mean_squares(
     late: Calibration,
 ) -> None:
     # of frame 3 one detection is left, which is the farthest off of all
-    sights = dict(late.sights)
+    cut = dict(late.sights)
     for index, one in late.sights.items():
         kept = one.frame != 3
         kept[np.flatnonzero(~kept)[: 1 - index]] = True
         far = np.where(one.frame == 3, 50.0, 1.0)[:, None] * one.offset
-        sights[index] = Sights(one.y[kept], far[kept], one.frame[kept], one.feature[kept])
-    late = replace(late, sights=sights)
+        cut[index] = Sights(one.y[kept], far[kept], one.frame[kept], one.feature[kept])
+    late = replace(late, sights=cut)
     page = render_calibration(late, "two", "mm", "0")
     assert "worst: frame 3, " in page
     for word, kind, first in (("frame", "frame", 0), ("feature", "feature", 1)):
