@@ -104,3 +104,20 @@ def test_what_was_searched_before_does_not_count_in_the_time_to_expect(
             progress("searching in left", done, 40)
     said = capsys.readouterr().err
     assert said == "mixpose: 16 frames of cameras left to search, about 24 s\n"
+
+
+@pytest.mark.parametrize(("step_s", "text"), [(9.0, "90 s"), (9.9, "99 s"), (12.0, "2 min")])
+def test_long_searches_are_told_in_minutes(
+    step_s: float, text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    with watched() as progress:
+        for done in range(12):
+            progress("searching in left", done, 14)  # too few to be worth a word
+        for done in range(21):
+            progress("searching in right", done + 10, 34)
+            now[0] += 1e-4 if done < 10 else step_s
+    assert (
+        capsys.readouterr().err == f"mixpose: 10 frames of cameras left to search, about {text}\n"
+    )

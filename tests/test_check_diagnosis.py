@@ -330,6 +330,24 @@ def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
     assert promise(size, given_to(right, few)) == 0.0
 
 
+@pytest.mark.parametrize(("more", "says"), [(2, False), (3, True)])
+def test_values_are_asked_for_from_four_coordinates_beyond_what_is_sought(
+    more: int, says: bool, right: Session
+) -> None:
+    """Three features a frame tell poses alone; a size and the four beyond it are five."""
+    size = next(iter(unknowns(right)))
+    middle = right.body.means.mean(axis=0)
+    frames = exact(right, middle + 1.03 * (right.body.means - middle))
+    some = []
+    for k, (first, second) in enumerate(frames):
+        counts = [(first, slice(0, 3)), (second, slice(0, more if k == 0 else 0))]
+        some.append(
+            [Seen(s.name, s.features[n], s.observed[n], s.noise[n]) for s, n in counts if n.stop]
+        )
+    assert given_to(right, some).count == 6 * len(some) + 2 * more
+    assert (promise(size, given_to(right, some)) > 0.0) == says
+
+
 def on_a_slow_machine(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[int]:
     """Numbers of the frames that are searched, where a search takes so long."""
     searched: list[int] = []

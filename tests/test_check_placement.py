@@ -126,6 +126,14 @@ def test_lengths_in_two_units_are_suspicious(session: Session) -> None:
     assert any("px wide: are points" in w and "all in mm?" in w for w in warnings)
 
 
+def test_cameras_that_look_apart_are_told_with_two_lengths_to_compare(session: Session) -> None:
+    back = from_rotation_vector([0.0, np.pi, 0.0], [1230.0, 0.0, 0.0])
+    moved = with_poses(replace(session, start=None), np.eye(4), back)
+    (warning,) = placement_warnings(moved)
+    across = float(f"{2 * session.body.radius:.2g}")
+    assert warning.endswith(f"the body is {across:g} mm across, the sensors 1200 mm apart")
+
+
 def test_cameras_in_a_ring_about_the_worlds_origin_are_not_suspicious(session: Session) -> None:
     # each has the origin 900 mm in front of it: one translation, several places
     ring = [from_rotation_vector([0.0, angle, 0.0], [0.0, 0.0, 900.0]) for angle in (0.0, 0.7)]

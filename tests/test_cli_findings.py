@@ -108,3 +108,46 @@ def test_markers_that_are_never_met_are_told_in_one_line() -> None:
     names = [session.body.labels[i] for i in (2, 3, 4, 6)]
     (line,) = findings.causes()
     assert line.startswith(f"markers {', '.join(names)} are each met in none of 20 frames")
+
+
+@pytest.mark.parametrize(
+    ("frames", "noise", "is_told"),
+    [
+        (20, 0.1, True),
+        (20, 0.8, False),  # 20 (1 / 0.8)^2 = 31 is under 100: that may be chance
+        (80, 0.8, True),  # 125
+        (9, 0.1, False),  # too few frames to speak of any marker
+    ],
+)
+def test_a_marker_is_measured_wrong_where_its_offsets_are_no_chance(
+    frames: int, noise: float, is_told: bool
+) -> None:
+    session = load_session(SESSION)
+    findings, features = Findings(session), np.arange(7)
+    is_met, residuals = np.ones(7, np.bool_), np.full((7, 2), 0.01)
+    jacobians = np.tile(np.eye(2, 3), (7, 1, 1))
+    sensors = {name: SensorReport(True, 0.9, 0.1) for name in ("left", "right")}
+    for frame in range(frames):
+        # marker 3 is 1 off along x, and by chance once above and once below
+        residuals = residuals.copy()
+        residuals[3] = [1.0, noise * (-1) ** frame]
+        seen = Offsets(features, is_met, residuals, jacobians, residuals, np.zeros(7, np.bool_))
+        measured = Estimate(
+            frame,
+            None,
+            session.labels[0],
+            "ok",
+            np.eye(4),
+            np.eye(6),
+            1.0,
+            sensors,
+            measured=lambda seen=seen: {"left": seen},  # type: ignore[misc]
+        )
+        findings.add(measured)
+    told = [line for line in findings.causes() if "measured wrong" in line]
+    assert bool(told) == is_told, findings.causes()
+    if is_told:
+        name = session.body.labels[3]
+        assert told[0].startswith(
+            f"marker {name} is met 1 mm off in {frames} of {frames} frames: measured wrong?"
+        )

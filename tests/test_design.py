@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature, congruent_parts
 from mixpose.design import (
@@ -252,6 +253,22 @@ def test_no_noise_equals_a_system_whose_markers_err_less() -> None:
     assert noise_to_equal(poor, 0.5 * error_of(scaled(poor, 1e-6)), error_of) is None
 
 
+def test_nothing_equals_a_system_that_determines_nothing_and_none_errs_without_end() -> None:
+    plan = point_sets(POINTS, 0.1)
+
+    def error_of(plan: Plan) -> float:
+        return float(np.sqrt(np.trace(predict(plan, POSE[None]).covariances[0, :3, :3])))
+
+    own = error_of(plan)
+    assert noise_to_equal(plan, np.inf, error_of) is None
+    assert noise_to_equal(plan, own, lambda _: np.inf) is None
+    # errors grow as the noise does, and ten thousand times of it is the most that is looked at
+    assert noise_to_equal(plan, 9e3 * own, error_of) == pytest.approx(9e3, rel=1e-6)
+    assert noise_to_equal(plan, 1.1e4 * own, error_of) is None
+    assert noise_to_equal(plan, own / 9e3, error_of) == pytest.approx(1 / 9e3, rel=1e-6)
+    assert noise_to_equal(plan, own / 1.1e4, error_of) is None
+
+
 def test_advice_gains_what_it_says() -> None:
     session = load_session(TWO_CAMERAS)
     plan, poses = plan_of(session), spread_poses(session, 6)
@@ -307,6 +324,22 @@ def test_poses_fill_the_volume_and_no_more() -> None:
     assert angles.max() <= 15 + 1e-9
     assert angles.max() > 10
     np.testing.assert_array_equal(poses, spread_poses(session, 64, volume=sides, turn_deg=15))
+
+
+def test_turns_favour_no_direction() -> None:
+    session = load_session(TWO_CAMERAS)
+    poses = spread_poses(session, 256, volume=np.ones(3), turn_deg=15)
+    R = poses[1:, :3, :3] @ poses[0, :3, :3].T
+    turns = Rotation.from_matrix(R).as_rotvec() / np.radians(15)
+    # evenly in a ball of radius 1: <v> = 0, <v v^T> = 1/5; 256 points of a sequence that fills it
+    # evenly do so to 0.01 (measured 0.007 and 0.009)
+    np.testing.assert_allclose(turns.mean(axis=0), 0, atol=0.02)
+    np.testing.assert_allclose(turns.T @ turns / len(turns), np.eye(3) / 5, atol=0.02)
+    # over all rotations, the nine entries are uncorrelated and of variance 1/3
+    wide = spread_poses(session, 512, volume=np.ones(3), turn_deg=180)
+    entries = (wide[1:, :3, :3] @ wide[0, :3, :3].T).reshape(-1, 9)
+    np.testing.assert_allclose(entries.mean(axis=0), 0, atol=0.05)
+    np.testing.assert_allclose(entries.T @ entries / len(entries), np.eye(9) / 3, atol=0.05)
 
 
 def test_markers_that_lie_like_those_of_another_body_are_named() -> None:

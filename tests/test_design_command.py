@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from command_line import command
 
@@ -33,6 +34,8 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     assert (
         "weights   sigma in proportion to what features err by (left 0.025, right 1)" in done.stdout
     )
+    (tip,) = [row for row in done.stdout.splitlines() if row.startswith("tip, mm ")]
+    assert len(tip.split()) == 4  # its name, the unit, and a number for each system
     assert "sigma     features err by much of sigma: right 0.8 of it" in done.stdout
     assert "moving mark" in done.stdout
     assert "7 markers of tracker (mark0, mark1" in done.stdout
@@ -41,6 +44,12 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     equal = result["systems"][1]["equals_first_with"]
     assert equal["noise"]["left"] == pytest.approx(0.1 * equal["factor"])
     assert len(result["systems"][0]["deviations"]) == 6
+    # what is printed are root mean squares of what is written, in degrees, with three digits
+    (turns,) = [row for row in done.stdout.splitlines() if row.startswith("rotation, deg ")]
+    for printed, system in zip(turns.split()[2:], result["systems"], strict=True):
+        squares = (np.array(system["deviations"])[:, 3:] ** 2).sum(axis=1)
+        error = np.degrees(np.sqrt(squares.mean()))
+        assert float(printed) == pytest.approx(error, rel=2e-3)
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -104,3 +113,21 @@ def test_wrong_options_are_told_in_one_line(
     said = capsys.readouterr().err
     assert len(said.splitlines()) == 1
     assert words in said
+
+
+def test_frames_are_simulated_where_a_system_determines_anything(tmp_path: Path) -> None:
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    before, right = (
+        text[: text.index("[[sensor]]")],
+        text[text.index('[[sensor]]\nname = "right"') :],
+    )
+    sonar = '[[sensor]]\nname = "sonar"\nmodel = "lateration"\nposition = [0, 0, 0]\n'
+    (tmp_path / "range.toml").write_text(before + sonar, encoding="utf-8")
+    (tmp_path / "camera.toml").write_text(before + right, encoding="utf-8")
+    done = command(
+        "design", "range.toml", "camera.toml", "--count", "2", "--monte-carlo", "2", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    alone, beside = done.stdout.split("\ncamera: ")
+    assert "simulated" not in alone.split("\n\n")[-1]
+    assert "simulated" in beside

@@ -41,6 +41,21 @@ def test_numbers_go_by_place_where_two_are_alike() -> None:
     assert frame_numbers([Path("x/a5.png"), Path("y/a05.png")]) == [0, 1]
 
 
+def test_one_file_among_numbered_ones_that_takes_their_numbers_is_named(tmp_path: Path) -> None:
+    save(tmp_path, "a5.png", "a6.png", "b.png")
+    assert str(camera(tmp_path, "*.png").caution()) == (
+        "b.png ends in no frame number but 2 others do, so all are numbered by their place; "
+        "leave it out of the source"
+    )
+    # two files are too few to tell which is the odd one
+    assert camera(tmp_path, ("a5.png", "b.png")).caution() is None
+
+
+def test_two_names_of_one_number_are_told(tmp_path: Path) -> None:
+    save(tmp_path, "a5.png", "a6.png", "b05.png")
+    assert "two names end in the frame number 5" in str(camera(tmp_path, "*.png").caution())
+
+
 def test_natural_order_counts_inside_names() -> None:
     paths = [Path(name) for name in ("img10.png", "img9.png", "img1a.png", "Img2.png", "img.png")]
     ordered = [path.name for path in natural_order(paths)]

@@ -103,6 +103,14 @@ def test_array_of_another_form_is_told(tmp_path: Path, array: np.ndarray) -> Non
         profiles(tmp_path, "p.npy")
 
 
+def test_an_array_with_the_long_header_is_read(tmp_path: Path) -> None:
+    with (tmp_path / "p.npy").open("wb") as file:
+        np.lib.format.write_array(file, SIGNAL, version=(2, 0))
+    (first, *_) = profiles(tmp_path, "p.npy").frames()
+    assert isinstance(first.data, GridPattern)
+    np.testing.assert_allclose(first.data.values[0], SIGNAL[0], rtol=1e-6)
+
+
 def test_file_that_is_no_array_is_told(tmp_path: Path) -> None:
     (tmp_path / "p.npy").write_bytes(b"\x93NUMPY\x01")
     with pytest.raises(RecordingError, match=r"p\.npy: not a \.npy file"):

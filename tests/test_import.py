@@ -309,6 +309,52 @@ def test_a_file_that_was_cut_off_is_told_as_what_it_is(
     assert words in str(caught.value)
 
 
+POSE = "1 0 0 0 0 0 0"
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"more.txt": COLMAP_LINE}, "found 2 files of COLMAP cameras; allowed: those of one model"),
+        (
+            {"images.txt": f"1 {POSE} 7 a.png\n\n"},
+            "cameras.txt, which a was taken by",
+        ),
+        (
+            {"images.txt": "1 1 0 0 0 0 0 x 1 a.png\n\n"},
+            'image.1: found "x"; allowed: a finite number',
+        ),
+        (
+            {"images.txt": "1 2 0 0 0 0 0 0 1 a.png\n\n"},
+            "image.1: found a quaternion of length 2; allowed: 1",
+        ),
+        (
+            {"images.txt": "".join(f"{k} {POSE} 1 {k}.png\n\n" for k in range(101))},
+            "found 101 images; allowed: at most 100, one of each camera",
+        ),
+        (
+            {"rigs.txt": 2 * f"1 2 CAMERA 1 CAMERA 2 1 {POSE}\n"},
+            "found 2 rigs of several sensors; allowed: one",
+        ),
+        (
+            {"rigs.txt": "1 2 CAMERA 1 CAMERA 2 1 1 0 0 0\n"},
+            'found "1 0 0 0"; allowed: QW QX QY QZ TX TY TZ',
+        ),
+    ],
+)
+def test_files_of_a_colmap_model_that_do_not_go_together_are_told(
+    tmp_path: Path, files: dict[str, str], words: str
+) -> None:
+    files = {"cameras.txt": COLMAP_LINE} | files
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(SessionError) as caught:
+        gather([tmp_path / name for name in files], "mm", "mm")
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert words in message
+
+
 def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
     (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
     for folder, x in (("a", 5), ("b", 7)):

@@ -28,7 +28,7 @@ from mixpose.pictures.overlay import Part
 from mixpose.pictures.plots import objective_around
 from mixpose.pictures.sheet import fitted_blurs
 from mixpose.pictures.signature import write_png
-from mixpose.pictures.stages import densities_picture, panels_of
+from mixpose.pictures.stages import densities_picture, panels_of, shown_box
 from mixpose.records import Estimate, PointPattern, Status
 from mixpose.rigid import transform
 from mixpose.runner import begin, observe, open_sources, run
@@ -387,6 +387,31 @@ def test_panels_of_one_kind_have_one_scale(parallel_cameras: list[ParallelBeam])
     # below each row its scale
     assert picture.shape[0] > 2 * 200 + 2 * 15
     assert picture.shape[1] == 404
+
+
+def test_a_panel_shows_a_detection_where_it_is(parallel_cameras: list[ParallelBeam]) -> None:
+    camera, body = parallel_cameras[0], Body("dot", (PointFeature(np.zeros(3)),))
+    y = camera.project(body.means)[0] + [0.3, -0.45]
+    view = View("one", camera, Observation(PointPattern(y, np.ones(1)), 2.0))
+    part, size = Part(3.0, (float(y[0, 0]) - 26.0, float(y[0, 1]) - 19.0)), (160, 120)
+    for row in panels_of(view, body, np.eye(4), [2.0], EstimatorOptions(), part, size):
+        (panel,) = row
+        v, u = np.indices(panel.values.shape)
+        middle = [float((panel.values * axis).sum() / panel.values.sum()) for axis in (u, v)]
+        # the grid of g, a quarter of a blur, is half a pixel of the sensor wide
+        np.testing.assert_allclose(middle, part.places(y[0]), atol=0.2)
+
+
+def test_where_nothing_was_found_and_no_pose_is_known_something_is_shown(
+    parallel_cameras: list[ParallelBeam],
+) -> None:
+    body, nothing = (
+        Body("dot", (PointFeature(np.zeros(3)),)),
+        PointPattern(np.zeros((0, 2)), np.zeros(0)),
+    )
+    view = View("one", parallel_cameras[0], Observation(nothing, 2.0))
+    low, high = shown_box(view, body, None, None)
+    assert (high - low >= 100).all()
 
 
 def test_what_was_found_far_from_the_pose_leaves_its_density_black(

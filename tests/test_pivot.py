@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from command_line import mixpose
 from pose_lines import covariance_of, lines_of, measured, write_poses
+from scipy.stats import chi2
 
 import mixpose as package
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
-from mixpose.trajectories.pivot import Pivoting, find_tip, fixed_in, fixed_in_world
+from mixpose.trajectories.pivot import Pivoting, PivotRules, find_tip, fixed_in, fixed_in_world
 
 TIP, POINT = np.array([3.0, -8.0, -150.0]), np.array([40.0, 20.0, 900.0])
 INSIDE_95 = 7.815  # χ² of three
@@ -88,6 +89,21 @@ def test_poses_that_are_wrong_are_left_out_and_a_tip_that_slips_is_told() -> Non
     slid[50:, 0, 3] += 5.0
     tip = find_tip(pivoting._replace(poses=slid))
     assert tip.scale > 4  # by which it is told; of tips that stay it is 1 ± 0.08
+
+
+@pytest.mark.parametrize(("share", "left_out"), [(0.93, 0), (1.07, 1)])
+def test_a_pose_is_left_out_from_the_residual_that_rules_say(share: float, left_out: int) -> None:
+    n, sigma = 100, 0.1
+    poses = about_its_tip(turning(n), np.repeat(POINT[None], n, 0))
+    covariance = np.diag([sigma**2] * 3 + [1e-14] * 3)
+    # a squared residual of three numbers; one pose of a hundred moves the tip by 2 % of it
+    poses[40, 0, 3] += share * sigma * np.sqrt(chi2.isf(PivotRules().foreign, 3))
+    tip = find_tip(fixed_in_world(poses, np.repeat(covariance[None], n, axis=0)))
+    assert tip.left_out == left_out
+    # all others are exact: a covariance is never less than what the poses say of themselves
+    more = find_tip(fixed_in_world(poses, np.repeat(4 * covariance[None], n, axis=0)))
+    assert more.left_out == 0
+    assert np.trace(more.covariance) == pytest.approx(4 * np.trace(tip.covariance), rel=0.05)
 
 
 @pytest.mark.parametrize(

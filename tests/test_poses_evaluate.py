@@ -131,6 +131,18 @@ def test_a_symmetry_axis_through_the_origin_is_told_by_rotation_alone() -> None:
     assert outcome.rotation_deg.max == pytest.approx(1.5)
 
 
+@pytest.mark.parametrize(("deg", "distance"), [(0.4, 0.0), (0.6, 5.0)])
+def test_answers_within_half_a_degree_are_told_apart_by_place(deg: float, distance: float) -> None:
+    T = a_pose()
+    pose = rigid.from_parts(T[:3, :3], T[:3, 3] + [3.0, 0.0, 4.0])
+    # where the pose is, and turned by a little more than the answer that is 5 away
+    S = rigid.inverse(T) @ turned_about_z(pose, deg)
+    poses = file_of(line(0, pose), symmetries={"board": S[None]})
+    (error,) = errors_to_truth(poses, file_of(line(0, T)))
+    assert error.twist is not None
+    assert np.linalg.norm(error.twist[:3]) == pytest.approx(distance, abs=1e-9)
+
+
 def test_symmetries_named_by_the_truth_go_before_those_of_the_poses() -> None:
     T = a_pose()
     S = half_turn_about((0.0, 0.0, 0.0))

@@ -17,6 +17,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.formats import FORMATS
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter, ResumePoint, read_poses, resume_point
+from mixpose.poses.ros import pose_message
 from mixpose.records import Estimate, Hypothesis, SensorReport
 
 HALF_TURN = rigid.from_rotation_vector([0.0, 0.0, np.pi], [0.0, 0.0, 0.0])
@@ -236,3 +237,21 @@ def test_resuming_leaves_a_file_that_holds_no_poses_alone(content: bytes, tmp_pa
     with pytest.raises(RecordingError):
         resume_point(path, HEADER)
     assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("seconds", "stamp"),
+    [(1.5, (1, 500_000_000)), (-0.25, (-1, 750_000_000)), (2**31 - 1, (2**31 - 1, 0))],
+)
+def test_a_stamp_of_ros_counts_nanoseconds_upwards(seconds: float, stamp: tuple[int, int]) -> None:
+    T = rigid.from_rotation_vector([0.0, 0.0, 0.5], [1000.0, -2000.0, 500.0])
+    estimate = Estimate(3, None, "tool", "ok", T, np.diag([4e6] * 3 + [0.1] * 3), 0.9, {})
+    message = pose_message(estimate, "mm", seconds, "lab")
+    assert message["header"] == {
+        "stamp": {"sec": stamp[0], "nanosec": stamp[1]},
+        "frame_id": "lab",
+    }
+    assert message["pose"]["pose"]["position"] == {"x": 1.0, "y": -2.0, "z": 0.5}  # metres
+    assert message["pose"]["covariance"][0] == 4.0  # m²
+    with pytest.raises(RecordingError, match="frame 3: time 2147483648 s is beyond what format"):
+        pose_message(estimate, "mm", 2.0**31)

@@ -72,6 +72,18 @@ def test_lost_frames_are_gaps_in_every_line(tmp_path: Path) -> None:
     assert frame_ranges(series, "ambiguous") == [(20, 20)]
 
 
+def test_lost_frames_are_shaded_half_a_frame_to_either_side(tmp_path: Path) -> None:
+    series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", STATUSES)))
+    _, axes = blank()
+    TimeAxes(axes, series).mark_lost()
+    lost = np.flatnonzero(series.status == "lost")
+    assert lost.tolist() == [5, 6, 7]
+    half = 0.5 * (series.x[1] - series.x[0])
+    (stretch,) = axes.collections[-1].get_paths()
+    assert stretch.get_extents().x0 == pytest.approx(series.x[5] - half)
+    assert stretch.get_extents().x1 == pytest.approx(series.x[7] + half)
+
+
 def test_a_line_breaks_where_frames_are_left_out_and_where_a_turn_wraps(tmp_path: Path) -> None:
     T = np.eye(4)
     frames = [10, 12, 14, 20, 22]
@@ -112,6 +124,17 @@ def test_errors_are_those_of_the_right_answer(tmp_path: Path) -> None:
     assert errors.position[known] == pytest.approx(true_places[known], abs=1e-9)
     # the reference is a pose, and off itself: the true turn there is the error back
     assert errors.turn_deg[0] == pytest.approx([0, -0.1, 0], abs=1e-6)
+
+
+def test_turns_add_nothing_to_the_distance_of_an_error(tmp_path: Path) -> None:
+    truth = read_poses(RECORDING / "truth.jsonl")
+    off = np.array([3.0, 0.0, -4.0, 0.3, 0.2, -0.1])
+    poses = [(line.frame, line.T_world_object) for line in truth.poses]
+    estimates = [estimate(frame, rigid.perturb(T, off)) for frame, T in poses if T is not None]
+    found = read_poses(write(tmp_path / "poses.jsonl", estimates, None))
+    errors = errors_of(series_of(found), found, truth)
+    assert errors.distance == pytest.approx(5.0, abs=1e-9)
+    assert errors.rotation_deg == pytest.approx(np.degrees(np.linalg.norm(off[3:])), abs=1e-9)
 
 
 def test_frames_to_look_at_are_spaced_and_the_extremes(tmp_path: Path) -> None:

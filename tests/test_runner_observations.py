@@ -10,6 +10,7 @@ import pytest
 
 import mixpose
 from mixpose import runner
+from mixpose.errors import SessionError
 from mixpose.records import FrameSet, GridPattern, PointPattern, RawFrame
 from mixpose.rigid import from_rotation_vector
 from mixpose.selection import Selection
@@ -17,6 +18,10 @@ from mixpose.session import Session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 NOTHING = PointPattern(np.empty((0, 2)), np.empty(0))
+
+
+class EndError(Exception):
+    """Ends a run."""
 
 
 @pytest.fixture
@@ -71,11 +76,60 @@ def test_a_source_of_the_session_is_beside_it_and_one_given_instead_is_not(
     assert (own.kind, kinds) == ("camera", ["lateration"] * 3)
 
 
+def test_a_sensor_without_a_source_needs_one_instead(session: Session) -> None:
+    planned = replace(session.sensors[0], source="")
+    with pytest.raises(SessionError, match=r"'left': source: found none, name the recording here"):
+        runner.source_spec(session, planned, None)
+    assert runner.source_spec(session, planned, "left*.png").source == "left*.png"
+    with pytest.raises(SessionError, match=r"--source top=.*no such sensor, allowed: left, right"):
+        runner.open_sources(session, {"top": "top*.png"})
+
+
 def test_a_run_that_goes_on_begins_at_its_own_pose_and_not_at_start(session: Session) -> None:
     assert session.start is not None
     T = from_rotation_vector([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(runner.begin(session, T)[0].T_start, T)
     np.testing.assert_array_equal(runner.begin(session)[0].T_start, session.start.T_world_object)
+
+
+def test_the_start_of_identical_bodies_is_that_of_the_first(session: Session) -> None:
+    assert session.start is not None
+    T = session.start.T_world_object
+    (alone,) = runner.scene_of(session).bodies
+    np.testing.assert_array_equal(alone.T_start, T)
+    pair = replace(session, count=2)
+    first, second = runner.scene_of(pair).bodies
+    np.testing.assert_array_equal(first.T_start, T)
+    assert second.T_start is None  # two bodies are not at one place
+    T_second = from_rotation_vector([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+    first, second = runner.scene_of(pair, {pair.labels[1]: T_second}).bodies
+    np.testing.assert_array_equal(first.T_start, T)
+    np.testing.assert_array_equal(second.T_start, T_second)
+
+
+def test_cameras_have_windows_where_thresholds_are_those_of_the_whole_frame(
+    session: Session, ranges: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def windowed(session: Session) -> set[str]:
+        seen: list[set[str]] = []
+
+        def windowed_scene(_: object, sensors: dict[str, object]) -> None:
+            seen.append(set(sensors))
+            raise EndError
+
+        monkeypatch.setattr(runner, "WindowedScene", windowed_scene)
+        with pytest.raises(EndError):
+            next(runner.run(session))
+        return seen[0]
+
+    def changed(**changes: object) -> Session:
+        extract = replace(session.sensors[0].extract, **changes)  # type: ignore[arg-type]
+        return replace(session, sensors=(replace(session.sensors[0], extract=extract),))
+
+    assert windowed(changed(threshold="auto")) == windowed(changed(threshold=128.0)) == {"left"}
+    assert windowed(changed(threshold="local")) == windowed(changed(threshold="otsu")) == set()
+    assert windowed(changed(method="corners")) == set()
+    assert windowed(ranges) == set()
 
 
 def test_a_sensor_without_frames_is_reported_as_unused_in_the_sessions_order(

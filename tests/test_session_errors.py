@@ -381,6 +381,47 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
 ]
 
 
+MORE_WRONG: list[tuple[dict[str, str], list[str]]] = [
+    (
+        {"points": "points = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0]]"},
+        ["object.points: point 4 is where point 2 is, alike in all", "each point once"],
+    ),
+    (
+        {"normals": "gravity = { direction = [0, 0, 0], sigma = 1 }"},
+        ["object.gravity.direction: found a direction without length"],
+    ),
+    (
+        {"left_more": "calibration_error = { range_bias = 1 }"},
+        [LEFT + "calibration_error.range_bias: stands with", "pinhole", "all but range_bias"],
+    ),
+    (
+        {"sonar_keys": LINES["sonar keys"] + "\ncalibration_error = { focal = 0.1 }"},
+        ["calibration_error.focal: stands with", "lateration", "allowed: position, range_bias"],
+    ),
+    (
+        {"left_more": "resolution = [100000, 100000]"},
+        [LEFT + "resolution: found 100000 x 100000 pixels; allowed: at most"],
+    ),
+    (
+        {"matrix": "camera_matrix = [[800, 0, 0], [0, 800, 0], [640, 512, 1]]"},
+        [LEFT + "camera_matrix: found", "; transpose it"],
+    ),
+    (
+        {"matrix": "camera_matrix = [[800, 0, 640], [5, 800, 512], [0, 0, 1]]"},
+        [LEFT + "camera_matrix: found", "512.0], [0.0, 0.0, 1.0]]; allowed"],
+    ),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), MORE_WRONG)
+def test_what_can_be_read_and_cannot_be_meant_is_told(
+    tmp_path: Path, changed: dict[str, str], words: list[str]
+) -> None:
+    message = message_of(tmp_path, with_lines(**changed))
+    for word in words:
+        assert word in message
+
+
 @pytest.mark.parametrize(("changed", "words"), WRONG, ids=lambda case: str(case)[:70])
 def test_a_wrong_line_is_named(tmp_path: Path, changed: dict[str, str], words: list[str]) -> None:
     message = message_of(tmp_path, with_lines(**changed))

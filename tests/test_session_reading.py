@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import mixpose.session as session_room
 from mixpose.body import PointFeature, SegmentFeature
+from mixpose.errors import SessionError
 from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
 from mixpose.rigid import TWIST_NAMES
@@ -43,6 +44,20 @@ def read(folder: Path, text: str) -> Session:
 
 def read_object(folder: Path, lines: str) -> Session:
     return read(folder, f'unit = "mm"\n[object]\nname = "o"\n{lines}\n{CAMERA}')
+
+
+def test_a_quaternion_of_three_decimals_is_scaled_and_one_further_off_is_told(
+    tmp_path: Path,
+) -> None:
+    # 0.5e-3 in each of four numbers misses the length by 1e-3 at most, here by 1.9e-3 and 2.1e-3
+    start = "[start]\nquaternion_xyzw = [0, 0, 0, {}]\ntranslation = [0, 0, 0]\n"
+    for w in ("1.0019", "0.9981"):
+        session = read(tmp_path, OBJECT + start.format(w) + CAMERA)
+        assert session.start is not None
+        np.testing.assert_array_equal(session.start.T_world_object, np.eye(4))
+    for w in ("1.0021", "0.9979"):
+        with pytest.raises(SessionError, match=f"found a quaternion of length {w}"):
+            read(tmp_path, OBJECT + start.format(w) + CAMERA)
 
 
 def test_the_smallest_session_has_the_defaults(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from mixpose import rigid
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.convert import convert_poses
+from mixpose.cli.output import written_paths
 from mixpose.errors import SessionError
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.formats import FORMATS
@@ -146,6 +147,14 @@ def test_a_trajectory_of_each_body_goes_to_a_file_of_its_own(tmp_path: Path) -> 
     assert last == "1.0 0.2 0.0 0.0 0.0 0.0 0.0 1.0"
     convert_poses(ConvertRequest(file.path, tmp_path / "one.tum", object="rod-0"))
     assert (tmp_path / "one.tum").read_text().splitlines()[1].startswith("0.0 0.1 ")
+
+
+def test_a_file_per_body_is_needed_from_two_bodies_on() -> None:
+    path = Path("out/poses.tum")
+    assert written_paths(path, "tum", ["tool"]) == [path]
+    names = [each.name for each in written_paths(path, "tum", ["tool", "cup/1"])]
+    assert names == ["poses.tool.tum", "poses.cup_1.tum"]
+    assert written_paths(path, "jsonl", ["tool", "cup"]) == [path]
 
 
 def test_numbers_of_identical_bodies_are_assigned_once(tmp_path: Path) -> None:

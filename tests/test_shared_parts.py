@@ -83,6 +83,27 @@ def test_a_session_is_warned_of_bodies_that_could_be_taken_for_each_other(
     assert "0 like 0, 1 like 1" in warning
 
 
+@pytest.mark.parametrize(("scale", "said"), [(1.0, []), (0.1, ["4 markers of 'a' lie like 4"])])
+def test_coarse_images_cannot_tell_bodies_apart_that_fine_ones_can(
+    tmp_path: Path, scale: float, said: list[str]
+) -> None:
+    # markers are 2 mm elsewhere; they err by 0.07 mm in images of 1280 px, and by ten times as much
+    # in images of 128
+    off = 2.0 * np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0]])
+    width, height, focal = (round(scale * length) for length in (1280, 1024, 1000))
+    path = tmp_path / "session.toml"
+    path.write_text(
+        'unit = "mm"\n'
+        f'[[object]]\nname = "a"\npoints = {FIVE.tolist()}\n'
+        f'[[object]]\nname = "b"\npoints = {transform(MOTION, FIVE + off).tolist()}\n'
+        '[[sensor]]\nname = "left"\nmodel = "pinhole"\nsource = "left.csv"\n'
+        f"resolution = [{width}, {height}]\n"
+        f"camera_matrix = [[{focal}, 0, {width / 2}], [0, {focal}, {height / 2}], [0, 0, 1]]\n"
+    )
+    warnings = shared_part_warnings(load_session(path))
+    assert [warning[: len(text)] for warning, text in zip(warnings, said, strict=True)] == said
+
+
 def test_what_is_met_of_a_square_lies_like_it_turned_and_like_every_other_square() -> None:
     square = np.array([[0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0.0]])
     aside = square + np.array([80.0, 30, 0])

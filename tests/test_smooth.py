@@ -28,6 +28,7 @@ from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.trajectories.choices import unfolded
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, foretold
 from mixpose.trajectories.smoothing import smooth_body
@@ -277,6 +278,31 @@ def test_a_symmetric_body_that_is_called_turned_is_followed() -> None:
     smooth = smooth_body(lines, np.stack([np.eye(4), half]), rules=QUICK)
     assert rms_errors(truth, poses_of(smooth.estimates))[0] < 0.08
     assert squared_errors(truth, smooth.estimates).mean() < 1.6
+
+
+def test_poses_that_look_the_same_are_turned_like_the_last_that_was_ok() -> None:
+    half_turn = rigid.from_rotation_vector([0.0, 0.0, np.pi], [6.0, 4.0, 0.0])
+    T, covariance = swinging(1)[0], np.diag([1, 2, 3, 0.1, 0.2, 0.3]) ** 2
+    turned = T @ rigid.inverse(half_turn)
+    lines = [
+        pose_line(0, None, None),
+        pose_line(1, T, covariance),
+        pose_line(2, None, None),
+        pose_line(3, turned, covariance, status="ambiguous"),
+        pose_line(4, turned, covariance),
+        pose_line(5, T, covariance),
+    ]
+    symmetries = np.array([np.eye(4), half_turn])
+    found = unfolded(lines, symmetries)
+    assert [one.T_world_object is None for one in found] == [True, False, True] + 3 * [False]
+    for one in found[3:]:
+        assert one.T_world_object is not None
+        np.testing.assert_allclose(one.T_world_object, T, atol=1e-9)
+    # what is known of another point of the body is known by the same turns
+    assert found[4].covariance is not None
+    np.testing.assert_allclose(found[4].covariance[3:, 3:], covariance[3:, 3:], atol=1e-12)
+    assert np.trace(found[4].covariance[:3, :3]) > np.trace(covariance[:3, :3])
+    assert unfolded(lines, symmetries[:1]) == lines
 
 
 def test_what_cannot_be_smoothed_is_told() -> None:

@@ -195,6 +195,9 @@ def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body()
     np.testing.assert_allclose(tilt.T_world_object, alone.T_world_object, atol=1e-9)
     assert rotation_angle_deg(tilt.T_world_object, T) > 40
     assert tilts(both) == []  # two that meet it fix the tilt
+    # a camera by itself is asked whatever it meets: a wrong tilt may be why it meets little
+    few = view_of("camera", camera, camera.project(transform(T, PLATE.means[:2]))[0])
+    assert len(tilts([few])) == 1
 
 
 SIX = np.array(

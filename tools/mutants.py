@@ -1,11 +1,17 @@
 """Put small bugs into the code, one at a time, and see that a test falls to each.
 
 python tools/mutants.py [NAME ...] [--room ROOM] [--json FILE] [--keep-going]
+python tools/mutants.py --random N [--seed S] [--room ROOM] [--json FILE] [--keep-going] [--record]
 
 Each mutant of `tools/mutation/` goes into a copy of the files that git tracks, and the tests of
 its room run there until the first that fails.  A mutant that no test notices survives: then a test
 is missing.  Where the tests are not done in time, by the mutant or by a busy machine, nothing is
 known.  The exit status is 1 where one survives or runs out of time, 2 where one cannot be tried.
+
+With `--random`, N mutants are made by the rules of `tools/mutation/rules.py`, and the tests that
+execute the changed line run, quick ones first.  Which these are stands in `build/executed`, where
+`--record` puts it by coverage (`.[dev]`): first half an hour, then what has changed.  Those of
+`tools/mutation/harmless.py` need fall to no test; they are not tried and are counted apart.
 """
 
 from __future__ import annotations
@@ -26,6 +32,8 @@ from tempfile import TemporaryDirectory
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from mutation import MUTANTS
+from mutation.drawn import ROOMS, chosen_tests, drawn, reason_why_harmless, shares
+from mutation.executed import read, record
 from mutation.mutant import Mutant, MutationError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,6 +102,8 @@ TESTS: dict[str, tuple[str, ...]] = {
 
 # A mutant may make the code go on for ever; no test has failed then.
 TIME_LIMIT_S = 900.0
+RECORD_LIMIT_S = 300.0  # for a file of tests; those that are not done by then are not known
+EXECUTED = ROOT / "build" / "executed"
 
 _FAILED = re.compile(r"^(?:FAILED|ERROR) (tests/\S+?::.*?)(?: - .*)?$", re.MULTILINE)
 
@@ -115,11 +125,14 @@ class Outcome:
     killed_by: str | None
     seconds: float
     out_of_time: bool = False
+    harmless: str | None = None
 
     @property
     def verdict(self) -> str:
         if self.killed_by is not None:
             return f"killed by {self.killed_by}"
+        if self.harmless is not None:
+            return f"harmless, {self.harmless}"
         return "OUT OF TIME" if self.out_of_time else "SURVIVED"
 
 
@@ -131,22 +144,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--room", action="append", default=[], help=", ".join(TESTS))
     parser.add_argument("--json", type=Path, help="file for the outcomes")
     parser.add_argument("--keep-going", action="store_true", help="go on after a survivor")
+    parser.add_argument("--random", type=int, metavar="N", help=f"by rule; rooms: {ROOMS}")
+    parser.add_argument("--seed", type=int, default=0, help="other mutants by rule; 0 if left out")
+    parser.add_argument("--seconds", type=float, default=90.0, help="of tests for one by rule")
+    parser.add_argument("--record", action="store_true", help="anew what tests execute")
     options = parser.parse_args(arguments)
     try:
-        mutants = chosen(MUTANTS, options.names, options.room)
-        outcomes = tried(ROOT, mutants, keep_going=options.keep_going)
+        if options.random is None:
+            mutants = chosen(MUTANTS, options.names, options.room)
+            outcomes = tried(ROOT, mutants, keep_going=options.keep_going)
+        else:
+            outcomes = tried_at_random(ROOT, EXECUTED, options)
+            print("\n".join(shares(outcomes)))
     except MutationError as error:
         print(error, file=sys.stderr)
         return 2
     if options.json:
         rows = [asdict(outcome) for outcome in outcomes]
         options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    alive = [outcome for outcome in outcomes if outcome.killed_by is None]
+    harmless = sum(outcome.harmless is not None for outcome in outcomes)
+    alive = [each for each in outcomes if each.killed_by is None and each.harmless is None]
     late = sum(outcome.out_of_time for outcome in alive)
     seconds = sum(outcome.seconds for outcome in outcomes)
     print(
         f"{len(outcomes)} mutants, {len(alive) - late} survived, {late} ran out of time, "
-        f"{seconds:.0f} s"
+        f"{seconds:.0f} s" + (f", {harmless} harmless" if harmless else "")
     )
     return 1 if alive else 0
 
@@ -183,6 +205,34 @@ def tried(root: Path, mutants: Sequence[Mutant], *, keep_going: bool) -> list[Ou
             if outcome.killed_by is None:
                 print(f"  {mutant.file}: {mutant.why}", flush=True)
                 if not keep_going:
+                    break
+    return outcomes
+
+
+def tried_at_random(root: Path, folder: Path, options: argparse.Namespace) -> list[Outcome]:
+    """Try mutants by rule on a copy of a repository, by the tests that execute their lines."""
+    outcomes: list[Outcome] = []
+    with TemporaryDirectory() as place:
+        tree = Path(place) / "sound"
+        copy_tracked(root, tree)
+        mutants = drawn(tree / PACKAGE, options.random, options.seed, options.room)
+        if options.record:
+            record(tree, PACKAGE, folder, _environment(tree), RECORD_LIMIT_S)
+        executed = read(folder, tree, PACKAGE)
+        if not executed.seconds:
+            raise MutationError(f"{folder}: found no record of what tests execute; add --record")
+        for mutant in mutants:
+            reason = reason_why_harmless(mutant)
+            tests = [] if reason else chosen_tests(mutant, executed, options.seconds)
+            outcome = Outcome(mutant.name, mutant.room, mutant.why, None, 0.0, harmless=reason)
+            if tests:
+                outcome = trial(tree, Path(place) / "mutated", mutant, tests)
+            outcomes.append(outcome)
+            print(f"{mutant.name}: {outcome.verdict} ({outcome.seconds:.1f} s)", flush=True)
+            if outcome.killed_by is None and outcome.harmless is None:
+                noticed = f"{len(tests)} tests" if tests else "no test comes here"
+                print(f"  {mutant.why} ({noticed})", flush=True)
+                if not options.keep_going:
                     break
     return outcomes
 
@@ -226,8 +276,11 @@ def check_sound(tree: Path, mutants: Sequence[Mutant]) -> None:
         raise MutationError(f"{failed} fails without any mutant; mend this first")
 
 
-def trial(tree: Path, copy: Path, mutant: Mutant) -> Outcome:
-    """Run the tests of a mutant's room on a copy of a tree with the mutant in it."""
+def trial(tree: Path, copy: Path, mutant: Mutant, tests: Sequence[str] = ()) -> Outcome:
+    """Run some tests, or those of a mutant's room, on a copy of a tree with the mutant in it.
+
+    Where some tests are named, a mutant with which these cannot be collected is killed too.
+    """
     began = time.perf_counter()
     killed_by, late = None, False
     shutil.copytree(tree, copy)
@@ -237,11 +290,14 @@ def trial(tree: Path, copy: Path, mutant: Mutant) -> Outcome:
         for compiled in (source.parent / "__pycache__").glob(f"{source.stem}.*.pyc"):
             compiled.unlink()
         try:
-            killed_by = first_failure(copy, tests_of(copy, mutant))
+            killed_by = first_failure(copy, tests or tests_of(copy, mutant))
         except OutOfTimeError:
             late = True
         except MutationError as error:
-            raise MutationError(f"{mutant.name}: {error}") from error
+            if tests and _collected(tree, tests):
+                killed_by = "the import of its module"
+            else:
+                raise MutationError(f"{mutant.name}: {error}") from error
     finally:
         shutil.rmtree(copy)
     seconds = time.perf_counter() - began
@@ -285,6 +341,16 @@ def first_failure(tree: Path, tests: Sequence[str]) -> str | None:
         last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-3:]
         raise MutationError(f"the tests do not run: {' / '.join(last)}")
     return failed[1]
+
+
+def _collected(tree: Path, tests: Sequence[str]) -> bool:
+    """Whether all of some tests are there."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", "--collect-only"]
+    environment = _environment(tree)
+    done = subprocess.run(
+        [*command, *tests], cwd=tree, env=environment, check=False, capture_output=True
+    )
+    return done.returncode == 0
 
 
 def _source(tree: Path, mutant: Mutant) -> Path:

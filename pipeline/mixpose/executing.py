@@ -75,12 +75,13 @@ class _Cluster:
 @contextmanager
 def _pooled(started: futures.Executor) -> Iterator[Executor]:
     """Tasks of a pool; after an error none is begun any more."""
-    with started as pool:
-        try:
-            yield _Pool(pool)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    try:
+        yield _Pool(started)
+    except BaseException:
+        # once: to shut it down again, as `with` does, would take back that the rest is cancelled
+        started.shutdown(wait=False, cancel_futures=True)
+        raise
+    started.shutdown()
 
 
 def in_threads(workers: int) -> AbstractContextManager[Executor]:

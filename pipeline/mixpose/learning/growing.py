@@ -40,6 +40,11 @@ class Found:
         return sum(one.count for _, one in self.places)
 
 
+def least_met(points: int) -> int:
+    """Points of a shape that must be met, so that no other points lie like them by chance."""
+    return FEWEST if points <= FEWEST + 1 else FEWEST + 1
+
+
 def placed(
     shape: Shape,
     clouds: Sequence[Cloud],
@@ -47,13 +52,9 @@ def placed(
     most: int = 1,
     least: int | None = None,
 ) -> list[tuple[int, Placement]]:
-    """Where a shape is in all clouds, at most so many times in each.
-
-    So many of its points must be met that no others lie like them by chance.
-    """
+    """Where a shape is in all clouds, at most so many times in each."""
     bases = wide_triples(shape.points, shape.reach, rules.bases)
-    if least is None:
-        least = FEWEST if len(shape) <= FEWEST + 1 else FEWEST + 1
+    least = least_met(len(shape)) if least is None else least
     return [
         (k, one)
         for k, cloud in enumerate(clouds)

@@ -1,0 +1,31 @@
+"""A sensor that is a frame late is named."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import mixpose
+from mixpose.checking.trials import late_sensor
+from mixpose.frames import pair
+from mixpose.objective import View
+from mixpose.runner import observe, open_sources
+
+SESSION = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
+
+
+def test_a_sensor_whose_frames_belong_to_those_before_is_named() -> None:
+    session = mixpose.load_session(SESSION)
+    frame_sets = pair(open_sources(session, {}), 4, 8)
+    seen: list[list[View]] = [observe(session, one) for one in frame_sets]
+    numbers = range(5, 8)
+    in_step = list(zip(numbers, seen[1:], strict=True))
+    # the left camera's frame beside that which the right one took before
+    late = [[after[0], before[1]] for before, after in pairwise(seen)]
+    assert [view.name for view in late[0]] == ["left", "right"]
+    assert late_sensor(session, in_step) is None
+    told = late_sensor(session, list(zip(numbers, late, strict=True)))
+    assert told == "'right' is a frame late: with each of its frames given to the one before"
+    # of frames with gaps nobody knows
+    assert late_sensor(session, list(zip((5, 7, 8), late, strict=True))) is None
+    assert late_sensor(session, list(zip(numbers, late, strict=True))[:2]) is None

@@ -1,0 +1,112 @@
+"""What is said of a body that was learnt: its table, and what the recording does not tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mixpose.learning import like
+from mixpose.learning.adjusting import Learnt
+from mixpose.learning.growing import least_met
+from mixpose.learning.rules import LearningRules
+from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
+from mixpose.records import Floats
+from mixpose.rigid import from_rotation_vector
+
+POINTS = np.array([[0, 0, 0], [60, 5, 0], [-15, 70, 10], [20, -30, 45], [-40, 10, 80.0]])
+RULES = LearningRules()
+
+
+def learnt(
+    turns_deg: Floats, points: Floats = POINTS, *, deviation: float = 0.01, spread: float = 0.0
+) -> Learnt:
+    poses = [from_rotation_vector(np.radians(turn), [0.0, 0.0, 0.0]) for turn in turns_deg]
+    return Learnt(
+        tuple(f"m{k}" for k in range(len(points))),
+        points,
+        np.tile(deviation**2 * np.eye(3), (len(points), 1, 1)),
+        np.full(len(points), 12),
+        np.array(poses),
+        np.arange(len(poses)),
+        1,
+        0.3,
+        spread,
+    )
+
+
+def turning(along: float, across: float) -> Floats:
+    """Turns by up to so many degrees about z, and about x, independent of each other."""
+    phase = np.arange(24) * 2 * np.pi / 24
+    return np.stack([across * np.sin(2 * phase), 0 * phase, along * np.sin(phase)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("along", "across", "missing"),
+    [
+        (12.0, 12.0, "turned by 14.7 deg at most; missing: turns of 30 deg or more"),
+        (40.0, 6.0, "turned about one axis only, (0.00, 0.00, 1.00) of the world"),
+        (40.0, 12.0, None),  # 0.3 of the turn about the main axis, and 0.2 are asked for
+    ],
+)
+def test_turns_that_are_missing_are_named(along: float, across: float, missing: str | None) -> None:
+    told = doubts_of(learnt(turning(along, across)), "body", "mm", RULES)
+    if missing is None:
+        assert told == []
+    else:
+        (doubt,) = told
+        assert missing in doubt.replace("-0.00", "0.00").replace("-1.00", "1.00")
+
+
+def test_markers_that_move_on_the_body_are_told_with_the_key_to_write() -> None:
+    told = doubts_of(learnt(turning(40.0, 20.0), spread=0.456), "body", "mm", RULES)
+    assert told == ["body: its markers move on it by 0.46 mm: write sigma = 0.46 into its [object]"]
+
+
+@pytest.mark.parametrize(("corners", "ways"), [(3, "2 other ways"), (2, "1 other way:")])
+def test_markers_that_map_onto_themselves_are_counted(corners: int, ways: str) -> None:
+    angles = 2 * np.pi * np.arange(corners) / corners
+    ring = np.stack([30 * np.cos(angles), 30 * np.sin(angles), 0 * angles], axis=1)
+    axis = np.array([[0, 0, 20.0], [0, 0, -55.0]])
+    told = doubts_of(learnt(turning(40.0, 20.0), np.concatenate([ring, axis])), "body", "mm", RULES)
+    assert len(told) == 1
+    assert f"onto themselves in {ways}" in told[0]
+
+
+@pytest.mark.parametrize(("deviation", "digits"), [(0.01, 3), (0.1, 2), (2.0, 1), (20.0, 0)])
+def test_coordinates_have_a_digit_more_than_is_known(deviation: float, digits: int) -> None:
+    # of three axes together it is 1.7 times as large, a tenth of which is the last digit
+    assert _digits_of(learnt(turning(40.0, 20.0), deviation=deviation)) == digits
+
+
+def test_the_table_has_a_line_for_each_marker_and_the_largest_turn() -> None:
+    head, titles, first, *others = lines_of(learnt(turning(40.0, 20.0)), "body", "mm")
+    assert head == ("body: 5 markers, adjusted in 24 frames, turned by up to 40 deg; lengths in mm")
+    assert titles.split() == ["marker", "x", "y", "z", "deviation", "frames"]
+    assert first.split() == ["m0", "0.000", "0.000", "0.000", "0.010", "12"]
+    assert others[0].split()[:4] == ["m1", "60.000", "5.000", "0.000"]
+    assert len(others) == 4
+
+
+def test_bodies_that_share_three_markers_are_named_with_them() -> None:
+    turned = from_rotation_vector([0.3, -0.7, 1.1], [100.0, 20.0, 5.0])
+    shared = POINTS[[3, 0, 2]] @ turned[:3, :3].T + turned[:3, 3]
+    fourth = shared.mean(axis=0) + np.array([90.0, 10.0, 33.0])
+    other = np.vstack([shared, fourth])
+    bodies = [learnt(turning(40.0, 20.0)), learnt(turning(40.0, 20.0), other)]
+    (told,) = look_alikes(bodies, ["first", "second"])
+    _, names = told.split("markers ", 1)
+    these, those = names.split(": where")[0].split(" of second lie like ")
+    pairs = dict(zip(these.split(", "), those.removesuffix(" of first").split(", "), strict=True))
+    assert pairs == {"m0": "m3", "m1": "m0", "m2": "m2"}
+
+
+def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it() -> None:
+    older = POINTS + np.array([5.0, 6.0, 7.0])
+    found = like(learnt(turning(40.0, 20.0)), older[:4], ("1", "2", "3", "5"))
+    assert found is not None
+    assert (found.learnt.names, found.shared) == (("1", "2", "3", "5", "6"), 4)
+    np.testing.assert_allclose(found.learnt.points, older, atol=1e-9)
+
+
+def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> None:
+    assert [least_met(points) for points in (3, 4, 5, 9)] == [3, 3, 4, 4]
