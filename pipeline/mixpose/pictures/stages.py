@@ -8,7 +8,7 @@ states: it is logarithmic, as a peak falls with the square of the blur.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.density import Atlas
 from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, matched_objective, region_of_interest
-from mixpose.objective.paper import sampled_terms
+from mixpose.objective.paper import SampledTerm, sampled_terms
 from mixpose.pictures import canvas, overlay
 from mixpose.pictures.canvas import WHITE, Colour, Picture
 from mixpose.pictures.finding import Finding
@@ -32,6 +33,7 @@ from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
 Size: TypeAlias = tuple[int, int]
+Look: TypeAlias = Callable[[Floats], NDArray[Any]]  # values of a density (...,) at places (..., 2)
 
 ABOVE: Colour = (0, 140, 255)
 _DIMMED = 0.45
@@ -42,6 +44,7 @@ _AROUND = 0.35  # of the body's extent, shown around it
 _LEAST_AROUND_PX = 25.0
 
 _STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
+_AT_ONCE = 2**20  # of these: 16 MB of coordinates
 _SHOWN = 1e-3  # of the lowest peak: what is less is black
 _BAR_LINES = 1.6  # height of a bar, lines of captions
 _MARGIN = 4  # widest blurs around the body
@@ -235,41 +238,51 @@ def panels_of(
     judged = list(sigmas) if is_matched else [view.observation.sigma]
     lower = np.array(part.corner) - 1.0
     shown = lower, lower + np.array(size) / part.zoom + 2.0
-    values: NDArray[Any]
     observed, twice = [], []
+    look: Look
     for sigma in sigmas:
-        places = _places(sigma, part, size)
         if is_matched or T is None:
             # exact sums on a grid
-            word, values = "g", view.observation.density(sigma, shown).sample(places)
+            word, look = "g", view.observation.density(sigma, shown).sample
         else:
             # as the objectives that draw samples have it: around these, and 0 elsewhere
             samples = body.sample(options.samples, seed=options.seed)
             terms = sampled_terms([view], samples, [sigma], T)
-            word, values = "g sampled", np.zeros(places.shape[:-1])
-            if terms:
-                values = terms[0].density.sample(places)[..., 0]
-        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", _largest(values, size)))
+            word, look = "g sampled", _of_samples(terms[0]) if terms else _nothing
+        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", _largest(look, sigma, part, size)))
     for sigma in judged:
-        atlas = matched_objective([view], body, [sigma]).atlas
-        values = atlas.look_up(_places(sigma, part, size)[None])[0, ..., 0]
-        twice.append(Panel(f"C = g ∗ ε, σ = {sigma:.3g} px", _largest(values, size)))
+        look = _of_atlas(matched_objective([view], body, [sigma]).atlas)
+        title = f"C = g ∗ ε, σ = {sigma:.3g} px"
+        twice.append(Panel(title, _largest(look, sigma, part, size)))
     return [observed, twice]
 
 
-def _places(sigma: float, part: Part, size: Size) -> Floats:
-    """Places (fine H, fine W, 2) of a picture at which a density is looked up."""
+def _of_samples(term: SampledTerm) -> Look:
+    return lambda places: term.density.sample(places)[..., 0]
+
+
+def _of_atlas(atlas: Atlas) -> Look:
+    return lambda places: atlas.look_up(places[None])[0, ..., 0]
+
+
+def _nothing(places: Floats) -> Floats:
+    return np.zeros(places.shape[:-1])
+
+
+def _largest(look: Look, sigma: float, part: Part, size: Size) -> Floats:
+    """Of each pixel of a picture (H, W) the largest value of a density, lest peaks be missed."""
+    width, height = size
     fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
-    u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    return np.asarray((pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner)
-
-
-def _largest(values: NDArray[Any], size: Size) -> Floats:
-    """Of each pixel of a picture (H, W) the largest of its values, lest peaks be missed."""
-    fine = len(values) // size[1]
-    blocks = np.asarray(values, dtype=np.float64).reshape(size[1], fine, size[0], fine)
-    return np.asarray(np.maximum(blocks.max(axis=(1, 3)), 0.0))
+    u, v = (
+        (np.arange(fine * n) + 0.5) / (fine * part.zoom) - 0.5 + corner
+        for n, corner in zip(size, part.corner, strict=True)
+    )
+    largest, rows = np.zeros((height, width)), max(_AT_ONCE // (fine * fine * width), 1)
+    for first in range(0, height, rows):
+        places = np.stack(np.meshgrid(u, v[first * fine : (first + rows) * fine]), axis=-1)
+        blocks = np.asarray(look(places), np.float64).reshape(-1, fine, width, fine)
+        largest[first : first + rows] = np.maximum(blocks.max(axis=(1, 3)), 0.0)
+    return largest
 
 
 def _coloured(values: Floats, bottom: float, top: float) -> Picture:
