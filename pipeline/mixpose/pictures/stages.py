@@ -44,6 +44,7 @@ _AROUND = 0.35  # of the body's extent, shown around it
 _LEAST_AROUND_PX = 25.0
 
 _STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
+_FINEST = 4  # of these each way in a pixel
 _AT_ONCE = 2**20  # of these: 16 MB of coordinates
 _SHOWN = 1e-3  # of the lowest peak: what is less is black
 _BAR_LINES = 1.6  # height of a bar, lines of captions
@@ -238,6 +239,8 @@ def panels_of(
     judged = list(sigmas) if is_matched else [view.observation.sigma]
     lower = np.array(part.corner) - 1.0
     shown = lower, lower + np.array(size) / part.zoom + 2.0
+    pattern = view.observation.pattern
+    points = pattern.points if isinstance(pattern, PointPattern) else np.zeros((0, 2))
     observed, twice = [], []
     look: Look
     for sigma in sigmas:
@@ -249,11 +252,12 @@ def panels_of(
             samples = body.sample(options.samples, seed=options.seed)
             terms = sampled_terms([view], samples, [sigma], T)
             word, look = "g sampled", _of_samples(terms[0]) if terms else _nothing
-        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", _largest(look, sigma, part, size)))
+        values = _largest(look, sigma, points, part, size)
+        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
     for sigma in judged:
         look = _of_atlas(matched_objective([view], body, [sigma]).atlas)
         title = f"C = g ∗ ε, σ = {sigma:.3g} px"
-        twice.append(Panel(title, _largest(look, sigma, part, size)))
+        twice.append(Panel(title, _largest(look, sigma, points, part, size)))
     return [observed, twice]
 
 
@@ -269,10 +273,13 @@ def _nothing(places: Floats) -> Floats:
     return np.zeros(places.shape[:-1])
 
 
-def _largest(look: Look, sigma: float, part: Part, size: Size) -> Floats:
-    """Of each pixel of a picture (H, W) the largest value of a density, lest peaks be missed."""
+def _largest(look: Look, sigma: float, points: Floats, part: Part, size: Size) -> Floats:
+    """Of each pixel of a picture (H, W) the largest value of a density, lest peaks be missed.
+
+    Peaks too narrow for that are where the detections (n, 2) are.
+    """
     width, height = size
-    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
+    fine = min(max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1), _FINEST)
     u, v = (
         (np.arange(fine * n) + 0.5) / (fine * part.zoom) - 0.5 + corner
         for n, corner in zip(size, part.corner, strict=True)
@@ -282,6 +289,10 @@ def _largest(look: Look, sigma: float, part: Part, size: Size) -> Floats:
         places = np.stack(np.meshgrid(u, v[first * fine : (first + rows) * fine]), axis=-1)
         blocks = np.asarray(look(places), np.float64).reshape(-1, fine, width, fine)
         largest[first : first + rows] = np.maximum(blocks.max(axis=(1, 3)), 0.0)
+    column, row = np.round(part.places(points)).astype(np.intp).T
+    shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    if shown.any():
+        np.maximum.at(largest, (row[shown], column[shown]), look(points[shown][None])[0])
     return largest
 
 
