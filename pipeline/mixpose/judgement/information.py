@@ -57,3 +57,18 @@ def invert_information(information: Floats, free: Mask) -> Floats:
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     return covariance
+
+
+def log_determinants(information: Floats, least: Floats) -> Floats:
+    """Logarithms (K,) of determinants of matrices (K, k, k) of at least diag `least` (K, k).
+
+    Where data are so exact that this is rounded away, what they leave open is still that.
+    """
+    signs, logs = np.linalg.slogdet(information)
+    for i in np.flatnonzero(~(signs > 0)).tolist():
+        size = information[i].diagonal()
+        values = np.linalg.eigvalsh(information[i] / np.sqrt(np.outer(size, size)))
+        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+        bounded = np.where(values > 1e-14, values, (least[i] / size).min())
+        logs[i] = np.log(size).sum() + np.log(bounded).sum()
+    return np.asarray(logs)
