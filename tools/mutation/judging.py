@@ -250,8 +250,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-volume-of-the-other-sign",
         "judgement/judge.py",
-        "laplace = -0.5 * np",
-        "laplace = 0.5 * np",
+        "laplace = -0.5 * log_determinants",
+        "laplace = 0.5 * log_determinants",
         "poses that are known well count as known badly",
     ),
     Mutant(
