@@ -247,16 +247,20 @@ def _noise_length(session: Session) -> float:
 
 def _text(part: LookAlike, unit: str) -> str:
     one, other = part.body, part.other
-    pairs = ", ".join(f"{i} like {j}" for i, j in zip(part.features, part.partners, strict=True))
+    pairs = ", ".join(
+        f"{one.labels[i]} like {other.labels[j]}"
+        for i, j in zip(part.features, part.partners, strict=True)
+    )
+    off = part.off if part.off > 1e-9 * one.radius else 0.0  # what is rounded
     if len(part.features) == len(one) == len(other):
         return (
-            f"the bodies {one.name!r} and {other.name!r} are congruent to {part.off:.2g} {unit} "
+            f"the bodies {one.name!r} and {other.name!r} are congruent to {off:.2g} {unit} "
             f"(markers {pairs}): nothing tells them apart; give one [[object]] with count, or move "
             "a marker"
         )
     return (
         f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
         f"{other.name!r} to "
-        f"{part.off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
+        f"{off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
         "expect ambiguous frames, or move a marker"
     )
