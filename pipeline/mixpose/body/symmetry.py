@@ -24,20 +24,10 @@ _NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
 
 
 def symmetries(points: Floats, tolerance: float) -> Floats:
-    """Find the proper rigid motions that map a point set onto itself.
+    """Find the proper rigid motions (G, 4, 4) that map points (N, 3) onto themselves.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-        Feature means.
-    tolerance : float
-        Largest distance, in length units, between an image and its feature.
-
-    Returns
-    -------
-    (G, 4, 4) array
-        T_object_object, the identity first.  Points on one line (a continuous symmetry) give
-        only the identity and the half-turn, if any.
+    The tolerance is the largest distance between an image and its feature.  The identity is first;
+    points on one line (a continuous symmetry) give only it and the half-turn, if any.
     """
     points = np.asarray(points, dtype=np.float64)
     distinct = np.unique(points, axis=0)

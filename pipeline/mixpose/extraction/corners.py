@@ -60,12 +60,7 @@ def extract_corners(
     """Saddle points of the grey values in a window of an image, as `points_in` has them.
 
     The threshold of the options is "auto", or the least difference of grey between bright and dark
-    fields; corners have neither polarity nor area.
-
-    Raises
-    ------
-    SessionError
-        If the threshold is neither "auto" nor a number.
+    fields; corners have neither polarity nor area.  Raises `SessionError` for other thresholds.
     """
     check_level(options.threshold, "corners", "the least step from bright to dark")
 

@@ -29,18 +29,9 @@ UserFunction = Callable[[Image, ExtractOptions], Any]
 
 @lru_cache(maxsize=32)
 def load_function(method: str, base: Path | None) -> UserFunction:
-    """Import the function that "module:function" names.
+    """Import the function that "module:function" names, from the folder `base` before `sys.path`.
 
-    Parameters
-    ----------
-    method : str
-    base : Path or None
-        Folder to look in before `sys.path`: that of the session file.
-
-    Raises
-    ------
-    SessionError
-        If there is no such module or function, or the module cannot be imported.
+    Raises `SessionError` if there is none, or the module cannot be imported.
     """
     module_name, _, function_name = method.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), function_name)):
@@ -72,20 +63,8 @@ def extract_custom(
 ) -> Pattern:
     """Feature pattern that the user's function finds in a window of an image.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `method` is "module:function"; all of it is handed on.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    base : Path or None
-        Folder of the session file.
-
-    Raises
-    ------
-    SessionError
-        If the function cannot be imported, fails, or returns something else than a pattern.
+    The method is "module:function", and `base` the folder of the session file.  Raises
+    `SessionError` if it cannot be imported, fails, or returns something else than a pattern.
     """
     function = load_function(options.method, base)
     u0, v0, u1, v1 = window

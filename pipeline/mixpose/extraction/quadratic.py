@@ -22,23 +22,10 @@ Wanted = Callable[[Floats, Floats, Floats], NDArray[np.bool_]]
 def stationary_points(
     grey: Grey, rough: Floats, wanted: Wanted, step: float = 1.0
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Stationary points of quadratics about rough places (n, 2).
+    """Stationary points (m, 2) of quadratics about rough places (n, 2), and which of them have one.
 
-    Parameters
-    ----------
-    grey : (H, W) float32
-    rough : (n, 2) float64
-        Pixel coordinates u, v.
-    wanted : function
-        Tells by the second derivatives which stationary points are looked for.
-    step : float
-        Distance in px of the samples that a quadratic goes through, 5 x 5 of them.
-
-    Returns
-    -------
-    points : (m, 2) float64
-    fitted : (n,) bool
-        True m times: where the point is wanted and the fit stayed close by.
+    `wanted` tells by the second derivatives which are looked for; a quadratic goes through 5 x 5
+    samples, `step` px apart.  Places (n,) have one where it is wanted and the fit stayed close by.
     """
     side = np.arange(-FIT_RADIUS, FIT_RADIUS + 1.0)
     v, u = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
