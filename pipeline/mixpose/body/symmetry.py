@@ -58,8 +58,7 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
     A product errs by as much as both together, so that some are not found by themselves.
     """
     for R in (rotations[:, None] @ rotations[None]).reshape(-1, 3, 3):
-        # of the same turn the trace of the difference is 3
-        if np.einsum("ij,kij->k", R, rotations).max() > 1 + 2 * np.cos(_SAME_TURN):
+        if _known(R, rotations):
             continue
         _, mapped = tree.query(centred @ R.T)
         if len(set(mapped.tolist())) == len(centred):
@@ -149,5 +148,6 @@ def motions(source: Floats, targets: Floats) -> Floats:
     return from_parts(R, b - R @ a)
 
 
-def _known(R: Floats, found: list[Floats]) -> bool:
+def _known(R: Floats, found: list[Floats] | Floats) -> bool:
+    # of the same turn the trace of the difference is 3
     return bool(np.einsum("ij,kij->k", R, np.array(found)).max() > 1 + 2 * np.cos(_SAME_TURN))

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions, check_level
-from mixpose.extraction.point_patterns import points_in
-from mixpose.extraction.quadratic import stationary_points
+from mixpose.extraction.quadratic import points_in, stationary_points
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
 

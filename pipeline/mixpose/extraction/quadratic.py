@@ -1,4 +1,4 @@
-"""Places to parts of a pixel: stationary points of quadratics through grey values."""
+"""Places to parts of a pixel: stationary points of quadratics through grey values, in a window."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mixpose.extraction.background import Grey
 from mixpose.extraction.sampling import sample
-from mixpose.records import Floats
+from mixpose.extraction.threshold import Window
+from mixpose.records import Floats, Image, PointPattern
 
 # Half the side of the square to which the quadratic is fitted, in steps.
 FIT_RADIUS = 2
@@ -17,6 +18,16 @@ FIT_STEPS = 3
 
 # Of the coefficients of u², uv and v²: whether they are those of what is looked for.
 Wanted = Callable[[Floats, Floats, Floats], NDArray[np.bool_]]
+
+
+def points_in(image: Image, window: Window, find: Callable[[Image], Floats]) -> PointPattern:
+    """What `find` finds in a window (u0, v0, u1, v1), in pixels of the whole image, of weight 1.
+
+    It takes the part of the image in the window, not empty, to places (n, 2) in its pixels.
+    """
+    u0, v0, u1, v1 = window
+    found = find(image[v0:v1, u0:u1])
+    return PointPattern(found + np.array([u0, v0]), np.ones(len(found)))
 
 
 def stationary_points(

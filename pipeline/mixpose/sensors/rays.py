@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,14 +36,11 @@ class Rays:
 
     def select(self, chosen: NDArray[Any]) -> Rays:
         """The rays of some detections."""
-        return Rays(
-            self.origins[chosen],
-            self.directions[chosen],
-            self.pixels[chosen],
-            self.central,
-            self.offset,
-            self.slope,
-            self.cloud,
+        return replace(
+            self,
+            origins=self.origins[chosen],
+            directions=self.directions[chosen],
+            pixels=self.pixels[chosen],
         )
 
 
