@@ -10,8 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -139,8 +138,10 @@ def _failed(method: str, what: str, error: Exception) -> str:
 def _load_module(name: str, base: Path | None) -> ModuleType:
     if base is None:
         return importlib.import_module(name)
-    file = base.resolve() / f"{name}.py"
-    with _first_in_path(base.resolve()):
+    folder = base.resolve()
+    file = folder / f"{name}.py"
+    sys.path.insert(0, str(folder))
+    try:
         if not file.is_file():
             return importlib.import_module(name)
         # Not by its bare name, which may be that of an installed module, or of the module of
@@ -152,12 +153,5 @@ def _load_module(name: str, base: Path | None) -> ModuleType:
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
         return module
-
-
-@contextmanager
-def _first_in_path(folder: Path) -> Iterator[None]:
-    sys.path.insert(0, str(folder))
-    try:
-        yield
     finally:
         sys.path.remove(str(folder))
