@@ -20,13 +20,7 @@ _KIND = "is"
 
 
 def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
-    """A record as what `json.dumps` takes.
-
-    Raises
-    ------
-    TypeError
-        If it holds something else than a record may.
-    """
+    """A record as what `json.dumps` takes; `TypeError` if it holds something else than it may."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         held = {each.name: encode(getattr(value, each.name)) for each in dataclasses.fields(value)}
         return {_KIND: type(value).__name__, **held}
@@ -55,19 +49,10 @@ def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
 
 
 def decode(record: type[T], data: Any) -> T:
-    """A record from what `encode` made of it.
+    """A record from what `encode` made of it, as `json.loads` has it.
 
-    Parameters
-    ----------
-    record : type
-        Of the outermost record; only what its annotations name is ever made.
-    data : object
-        As `json.loads` has it.
-
-    Raises
-    ------
-    ValueError
-        If the data are not those of such a record.
+    Only what annotations of the outermost record name is ever made.  Raises `ValueError` if the
+    data are not those of such a record.
     """
     try:
         found = _decoded(data, _records_in(record, {}))

@@ -6,39 +6,23 @@ sensors below 2 GB.
 
 from __future__ import annotations
 
+# of an image: 67 million, more than usual sensors have; up to 20 bytes each are used
 MOST_PIXELS = 2**26
-"""Of an image: 67 million, more than usual sensors have; up to 20 bytes each are used."""
-
-MOST_IMAGE_BYTES = 2**29
-"""Of an image file: eight for each of as many pixels."""
-
-MOST_FEATURES = 2000
-"""Of a body, pieces of segments included: their pairs are compared."""
-
-MOST_DETECTIONS = 5000
-"""Of one sensor in one frame: each is drawn, with 0.2 MB."""
-
+MOST_IMAGE_BYTES = 2**29  # of an image file: eight for each of as many pixels
+MOST_FEATURES = 2000  # of a body, pieces of segments included: their pairs are compared
+MOST_DETECTIONS = 5000  # of one sensor in one frame: each is drawn, with 0.2 MB
+# of all features of a body together, where densities are integrated by sampling
 MOST_SAMPLES = 4_000_000
-"""Of all features of a body together, where densities are integrated by sampling."""
-
-MOST_BINS = 1_000_000
-"""Of a range profile."""
-
+MOST_BINS = 1_000_000  # of a range profile
+# in a range profile: a million squares of it are still a number in single precision
 LARGEST_VALUE = 1e15
-"""In a range profile: a million squares of it are still a number in single precision."""
-
+# of a table whose rows are not in the order of frames: it is read whole
 MOST_UNSORTED_ROWS = 1_000_000
-"""Of a table whose rows are not in the order of frames: it is read whole."""
-
+# of a session file, a list of sessions, a calibration, a table of markers or a line of poses
 MOST_BYTES = 4_000_000
-"""Of a session file, a list of sessions, a calibration, a table of markers or a line of poses."""
-
+# of a calibration in YAML, whose reader is slow: this much takes seconds
 MOST_YAML_CHARACTERS = 500_000
-"""Of a calibration in YAML, whose reader is slow: this much takes seconds."""
-
+# brackets, tags or dashes that open a list in a calibration for OpenCV: its reader calls itself
+# for each that is within another, and some 30,000 end the process
 MOST_OPENED = 10_000
-"""Brackets, tags or dashes that open a list in a calibration for OpenCV: its reader calls itself
-for each that is within another, and some 30,000 end the process."""
-
-MOST_YAML_NODES = 100_000
-"""Of a YAML file once its aliases are written out."""
+MOST_YAML_NODES = 100_000  # of a YAML file once its aliases are written out

@@ -27,29 +27,16 @@ Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 class PointPattern:
     """Feature pattern g0 as a sum of weighted points.
 
-    Attributes
-    ----------
-    points : (M, m) float64
-        Feature positions in sensor coordinates.
-    weights : (M,) float64
-        Positive weight of each point; 1 for a plain detection.
-    deviations : (M,) float64
-        By how much more than others each may err, in sensor units; 0 but for blobs that are cut.
-    radii : (M,) float64
-        Of a disk of as much area as is seen of each, sensor units; 0 where that is not known.
-    is_sized : bool
-        Whether deviations are those of spots that have not the size of a marker.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not match, a value is not finite or a weight is negative.
+    Raises `ValueError` if shapes do not match, a value is not finite or a weight is negative.
     """
 
-    points: Floats
-    weights: Floats
+    points: Floats  # (M, m) in sensor coordinates
+    weights: Floats  # (M,) positive; 1 for a plain detection
+    # (M,) by how much more than others each may err, sensor units; 0 but for blobs that are cut
     deviations: Floats = field(default_factory=lambda: np.zeros(()))
+    # (M,) of a disk of as much area as is seen of each, sensor units; 0 where that is not known
     radii: Floats = field(default_factory=lambda: np.zeros(()))
+    # whether deviations are those of spots that have not the size of a marker
     is_sized: bool = False
 
     is_even: bool = field(init=False, default=True)  # whether none errs by more than others
@@ -120,21 +107,11 @@ class PointPattern:
 
 @dataclass(frozen=True)
 class GridPattern:
-    """Feature pattern g0 as values on a regular grid: grey values or a range profile.
+    """Feature pattern g0 as values on a regular grid: grey values or a range profile."""
 
-    Attributes
-    ----------
-    values : (H, W) float32
-        Non-negative values after extraction; a range profile has H = 1.
-    origin : (m,) float64
-        Sensor coordinates of ``values[0, 0]``, u first.
-    step : float
-        Sensor units from one grid point to the next.
-    """
-
-    values: NDArray[np.float32]
-    origin: Floats
-    step: float
+    values: NDArray[np.float32]  # (H, W) not negative after extraction; a profile has H = 1
+    origin: Floats  # (m,) sensor coordinates of ``values[0, 0]``, u first
+    step: float  # sensor units from one grid point to the next
 
     @property
     def size(self) -> int:
@@ -171,18 +148,10 @@ Pattern: TypeAlias = PointPattern | GridPattern
 
 @dataclass(frozen=True)
 class Moment:
-    """When a frame was taken, by the steady clock of this machine.
+    """When a frame was taken, by the steady clock of this machine."""
 
-    Attributes
-    ----------
-    seconds : float
-        Of `time.monotonic`.
-    of : {"capture", "arrival"}
-        What happened then: "capture" where the source tells, else "arrival".
-    """
-
-    seconds: float
-    of: Literal["capture", "arrival"]
+    seconds: float  # of `time.monotonic`
+    of: Literal["capture", "arrival"]  # what happened then: capture where the source tells
 
 
 @dataclass(frozen=True)
@@ -223,91 +192,49 @@ class DelaySeen:
 
 @dataclass(frozen=True)
 class Label:
-    """What a sensor met a feature by.
+    """What a sensor met a feature by."""
 
-    Attributes
-    ----------
-    at : (m,) float64
-        Its sensor coordinates.
-    detection : int or None
-        Its place among the sensor's detections of the frame, from 0; None where there are no single
-        ones.
-    """
-
-    at: Floats
+    at: Floats  # (m,) its sensor coordinates
+    # its place among the sensor's of the frame, from 0; None without single ones
     detection: int | None = None
 
 
 @dataclass(frozen=True)
 class MeasuredPoint:
-    """Where sensors together put a feature, by what they met it by.
+    """Where sensors together put a feature, by what they met it by."""
 
-    Attributes
-    ----------
-    at : (3,) float64
-        In the world.
-    residual : float
-        Root mean square distance, in length units, from what each of them saw of it.
-    """
-
-    at: Floats
-    residual: float
+    at: Floats  # (3,) in the world
+    residual: float  # root mean square distance from what each saw of it, length units
 
 
 @dataclass(frozen=True)
 class SensorReport:
-    """How one sensor took part in an estimate.
+    """How one sensor took part in an estimate."""
 
-    Attributes
-    ----------
-    used : bool
-        Whether the sensor had a frame with features in it.
-    explained : float or None
-        Share of the sensor's feature density that the pose accounts for, 0 to 1.
-    rms : float or None
-        Residual of the explained features, px or length units.
-    why : str or None
-        Why a sensor with features was not used.
-    residuals : mapping of str to float or None
-        How far off each feature in view was met, px or length units, by what it is called; None
-        where it was not met.
-    labels : mapping of str to Label
-        What each feature was met by, where `mixpose.run` was asked for labels.
-    """
-
-    used: bool
+    used: bool  # whether it had a frame with features in it
+    # share of the sensor's feature density that the pose accounts for, 0 to 1
     explained: float | None = None
-    rms: float | None = None
-    why: str | None = None
+    rms: float | None = None  # residual of the explained features, px or length units
+    why: str | None = None  # why a sensor with features was not used
+    # How far off each feature in view was met, px or length units, by what it is called; None where
+    # it was not met.
     residuals: Mapping[str, float | None] = field(default_factory=dict)
+    # What each feature was met by, where `mixpose.run` was asked for labels.
     labels: Mapping[str, Label] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """By how much a sensor met the features of a pose; n of them are in view.
+    """By how much a sensor met the features of a pose; n of them are in view."""
 
-    Attributes
-    ----------
-    features : (n,) int
-        Their places in the body.
-    met : (n,) bool
-    offsets : (n, m) float64
-        Observed minus predicted place, sensor units; 0 where it was not met.
-    by_shift : (n, m, 3) float64
-        Derivative of the predicted place by a shift of the body in the world.
-    observed : (n, m) float64
-        Place of what met each, sensor units; that of the prediction where it was not met.
-    shared : (n,) bool
-        Whether another feature was met by the same detection.
-    """
-
-    features: NDArray[np.intp]
-    met: NDArray[np.bool_]
-    offsets: Floats
+    features: NDArray[np.intp]  # (n,) their places in the body
+    met: NDArray[np.bool_]  # (n,)
+    offsets: Floats  # (n, m) observed minus predicted place, sensor units; 0 where it was not met
+    # (n, m, 3) derivative of the predicted place by a shift of the body in the world
     by_shift: Floats
+    # (n, m) place of what met each, sensor units; the prediction where it was not met
     observed: Floats
-    shared: Mask
+    shared: Mask  # (n,) whether another feature was met by the same detection
 
 
 @dataclass(frozen=True)
@@ -328,67 +255,47 @@ Status: TypeAlias = Literal["ok", "ambiguous", "lost"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """The pose of one frame; the fields of a pose line.
-
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64 or None
-        None when the status is "lost".
-    covariance : (6, 6) float64 or None
-        In the order and axes of `mixpose.rigid`, squared lengths and radians.
-    confidence : float or None
-        Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
-        lost, None where a file does not say.
-    score : float or None
-        0 to 1: how well the predicted densities meet the observed ones, over all sensors; None
-        where a file does not say, as `latency_ms` is then.
-    instance : int or None
-        Which of identical bodies, from 0; None where the session has one of this name.
-    proposer : str
-        Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
-        part of the pose line.
-    blurs : tuple of mapping of str to float
-        Standard deviations of a feature, by sensor, of the objectives that the pose was fitted by,
-        in their order; empty where it was not fitted to this frame.  No part of the pose line.
-    guesses : tuple of int or None
-        Where the body was searched for: guesses made, tested on everything, and refined.
-    delays : mapping of str to DelaySeen
-        How late sensors are beyond what the session says, as far as the frames so far show it; no
-        part of the pose line.
-    doubt : str
-        Why a frame is ambiguous, other than for its rivals; no part of it either.
-    measured : callable
-        Works out `offsets`.
-    points : mapping of str to MeasuredPoint
-        Features that sensors together put in space without the pose, where `mixpose.run` was asked
-        for labels.
-    tip_object : (3,) float64 or None
-        The tip of the body in its own coordinates; None where it has none.
-    filled : bool
-        Whether nothing was measured in this frame: its pose is what frames around it say.
-    """
+    """The pose of one frame; the fields of a pose line, but for those called no part of it."""
 
     frame: int
     time_s: float | None
     object: str
     status: Status
-    T_world_object: Floats | None
+    T_world_object: Floats | None  # (4, 4); None when the status is "lost"
+    # (6, 6) in the order and axes of `mixpose.rigid`, lengths² and radians²
     covariance: Floats | None
+    # 0 to 1: how well the predicted densities meet the observed ones, over all sensors; None where
+    # a file does not say, as `latency_ms` is then.
     score: float | None
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...] = ()
     latency_ms: float | None = field(default=0.0, compare=False)
+    # of identical bodies, from 0; None where the session has one of this name
     instance: int | None = None
+    # Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
+    # lost, None where a file does not say.
     confidence: float | None = None
+    # Which of `mixpose.tracking.proposers` the pose came from; empty without a pose. No part of the
+    # pose line.
     proposer: str = field(default="", compare=False)
+    # Standard deviations of a feature, by sensor, of the objectives that the pose was fitted by, in
+    # their order; empty where it was not fitted to this frame. No part of the pose line.
     blurs: tuple[Mapping[str, float], ...] = field(default=(), compare=False, repr=False)
+    # Where the body was searched for: guesses made, tested on everything, and refined.
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
+    # How late sensors are beyond what the session says, as far as the frames so far show it; no
+    # part of the pose line.
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
+    # Why a frame is ambiguous, other than for its rivals; no part of it either.
     doubt: str = field(default="", compare=False)
+    # Works out `offsets`.
     measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)
+    # Features that sensors together put in space without the pose, where `mixpose.run` was asked
+    # for labels.
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
+    # (3,) of the body in its own coordinates; None where it has no tip
     tip_object: Floats | None = field(default=None, compare=False)
-    filled: bool = False
+    filled: bool = False  # whether nothing was measured: the pose is what frames around it say
 
     @property
     def offsets(self) -> Mapping[str, Offsets]:

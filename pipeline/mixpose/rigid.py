@@ -28,20 +28,7 @@ _CHI2_95 = 7.815  # of three degrees of freedom
 
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
-    """Map points to another frame.
-
-    Parameters
-    ----------
-    T_a_b : (..., 4, 4) array
-        Rigid motions; leading axes broadcast against those of the points.
-    points_b : (..., n, 3) array
-        Points in frame b.
-
-    Returns
-    -------
-    (..., n, 3) array
-        The points in frame a.
-    """
+    """Map points b (..., n, 3) to frame a by motions (..., 4, 4), broadcast over leading axes."""
     return points_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]
 
 
@@ -63,18 +50,9 @@ def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> 
 
 
 def from_orthonormal(V: ArrayLike, w: ArrayLike) -> Floats:
-    """The paper's rigid affine transformation x = Vᵀ(z + w) as a 4x4 motion.
+    """The paper's rigid affine transformation x = Vᵀ(z + w) of V (3, 3) and w (3,) as a 4x4 motion.
 
-    Parameters
-    ----------
-    V : (3, 3) array
-        Orthonormal columns of a right-handed base.
-    w : (3,) array
-
-    Raises
-    ------
-    ValueError
-        If V is not orthonormal within 1e-6, or mirrors.
+    Raises `ValueError` if V is not orthonormal and right-handed within 1e-6.
     """
     R = np.asarray(V, dtype=np.float64).T
     T = from_parts(R, R @ np.asarray(w, dtype=np.float64))
@@ -97,14 +75,7 @@ def inverse(T_a_b: Floats) -> Floats:
 
 
 def perturb(T_world_object: Floats, twist: Floats) -> Floats:
-    """Move a pose by twists in world axes.
-
-    Parameters
-    ----------
-    T_world_object : (..., 4, 4) array
-    twist : (..., 6) array
-        ``(x, y, z, rx, ry, rz)``, lengths and radians.
-    """
+    """Move poses (..., 4, 4) by twists (..., 6) in world axes, lengths and radians."""
     if twist.size == 6 and T_world_object.size == 16:
         # one pose after the other is what optimisers ask for: no time for broadcasting
         T = T_world_object.copy()
@@ -138,14 +109,7 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
 
 
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:
-    """The covariance of a pose whose origin is another point of the body.
-
-    Parameters
-    ----------
-    covariance : (..., 6, 6) array
-    arm : (..., 3) array
-        From the body's origin to that point, in world axes.
-    """
+    """A pose's covariance (..., 6, 6) at a point an arm (..., 3) in world axes from its origin."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
     J[..., range(6), range(6)] = 1.0
     # a turn w moves the point by w × arm
@@ -162,12 +126,7 @@ def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
 def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
     """The ellipsoid that holds the position with 95 %, of a pose's covariance (6, 6).
 
-    Returns
-    -------
-    half_axes : (3,) float64
-        Lengths, ascending.
-    axes : (3, 3) float64
-        Their directions in world axes as columns: a rotation.
+    Half-axes (3,), ascending, and their directions in world axes as columns (3, 3): a rotation.
     """
     variances, axes = np.linalg.eigh(covariance[:3, :3])
     axes[:, 0] *= np.linalg.det(axes)  # right-handed, as a rotation is

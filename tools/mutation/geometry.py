@@ -174,8 +174,8 @@ _BATCH = (
         "a camera without distortion beside one with it sees 90 degrees only",
     ),
     Mutant(
-        "sensors-batch-hidden-features-pull",
-        "sensors/batch.py",
+        "sensors-hidden-features-pull",
+        "sensors/base.py",
         "J[~visible] = 0.0",
         "J[~visible] *= 1.0",
         "features that a camera does not see pull on the pose",

@@ -1,40 +1,21 @@
 """The object model q: features, their samples, and the body's symmetries."""
 
-from __future__ import annotations
-
-from mixpose.body.features import Feature, PointFeature, SegmentFeature, Spread
-from mixpose.body.look_alikes import (
-    ASIDE,
-    LookAlike,
-    congruent_parts,
-    like_features,
-    mirror_image,
-    other_tilt,
-    thickness,
-    tolerance_of,
+from mixpose.body.features import (
+    Feature as Feature,
+    PointFeature as PointFeature,
+    SegmentFeature as SegmentFeature,
+    Spread as Spread,
 )
-from mixpose.body.model import Body, Gravity, Nodes, Shape
-from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import symmetries
-
-__all__ = [
-    "ASIDE",
-    "Body",
-    "Feature",
-    "Gravity",
-    "LookAlike",
-    "Nodes",
-    "PointFeature",
-    "Sampler",
-    "SegmentFeature",
-    "Shape",
-    "Spread",
-    "congruent_parts",
-    "like_features",
-    "mirror_image",
-    "other_tilt",
-    "symmetries",
-    "thickness",
-    "tolerance_of",
-    "uniforms",
-]
+from mixpose.body.look_alikes import (
+    ASIDE as ASIDE,
+    LookAlike as LookAlike,
+    congruent_parts as congruent_parts,
+    like_features as like_features,
+    mirror_image as mirror_image,
+    other_tilt as other_tilt,
+    thickness as thickness,
+    tolerance_of as tolerance_of,
+)
+from mixpose.body.model import Body as Body, Gravity as Gravity, Nodes as Nodes, Shape as Shape
+from mixpose.body.sampling import Sampler as Sampler, uniforms as uniforms
+from mixpose.body.symmetry import symmetries as symmetries

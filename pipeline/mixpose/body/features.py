@@ -58,20 +58,11 @@ def no_spread() -> Floats:
 
 @dataclass(frozen=True)
 class PointFeature:
-    """A point: exact (delta), Gaussian, q_i = N(z_i, Σ_i), or uniform in a box.
+    """A point: exact (delta), Gaussian, q_i = N(z_i, Σ_i), or uniform in a box."""
 
-    Parameters
-    ----------
-    position : (3,) array
-    covariance : (3, 3) array
-        Σ_i; zero for a delta.
-    spread : {"gaussian", "uniform"}
-        Density with that covariance: a Gaussian, or a box along its principal axes.
-    """
-
-    position: Floats
-    covariance: Floats = field(default_factory=no_spread)
-    spread: Spread = "gaussian"
+    position: Floats  # (3,)
+    covariance: Floats = field(default_factory=no_spread)  # (3, 3) Σ_i; zero for a delta
+    spread: Spread = "gaussian"  # with that covariance; a box is along its principal axes
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))
@@ -93,18 +84,11 @@ class PointFeature:
 
 @dataclass(frozen=True)
 class SegmentFeature:
-    """A straight line, uniform along its length, blurred by its spread.
+    """A straight line, uniform along its length, blurred by its spread."""
 
-    Parameters
-    ----------
-    start, end : (3,) array
-    covariance : (3, 3) array
-        Spread about the line; zero for a sharp line.
-    spread : {"gaussian", "uniform"}
-    """
-
-    start: Floats
-    end: Floats
+    start: Floats  # (3,)
+    end: Floats  # (3,)
+    # (3, 3) about the line; zero for a sharp one
     covariance: Floats = field(default_factory=no_spread)
     spread: Spread = "gaussian"
 

@@ -42,26 +42,16 @@ _TOGETHER = 8  # features that motions are tried with at a time
 
 @dataclass(frozen=True, eq=False)
 class LookAlike:
-    """Features of a body that lie like features of another, or like others of its own.
-
-    Attributes
-    ----------
-    body, other : Body
-    T_body_other : (4, 4) float64
-        The motion that puts the other's features on the body's: with the body at T, the other at
-        T @ T_body_other has them in the same places.
-    features, partners : tuple of int
-        Of the body and of the other, pair by pair, by ascending number of the body's.
-    off : float
-        The largest distance of a pair, length units.
-    """
+    """Features of a body that lie like features of another, or like others of its own."""
 
     body: Body
     other: Body
+    # (4, 4) The motion that puts the other's features on the body's: with the body at T, the other
+    # at T @ T_body_other has them in the same places.
     T_body_other: Floats
-    features: tuple[int, ...]
-    partners: tuple[int, ...]
-    off: float
+    features: tuple[int, ...]  # of the body, ascending
+    partners: tuple[int, ...]  # of the other, pair by pair
+    off: float  # the largest distance of a pair, length units
 
     @property
     def turn_deg(self) -> float:
@@ -103,17 +93,9 @@ def like_features(
 ) -> tuple[LookAlike, ...]:
     """All motions under which features of a body lie like features of another, or of itself.
 
-    All but one or a seventh of the features need a partner, where these are more than fix a motion.
-    The body's own symmetries are left out, and what turns a face away that was seen.
-
-    Parameters
-    ----------
-    body : Body
-    features : frozenset of int
-        Of the body, such as those that are met in a frame.
-    other : Body
-    tolerance : float
-        How far partners may be off, length units.
+    All but one or a seventh of the features, such as those met in a frame, need a partner within
+    the tolerance, where these are more than fix a motion.  The body's own symmetries are left out,
+    and what turns a face away that was seen.
     """
     chosen = np.array(sorted(features), dtype=np.intp)
     points, targets = body.means[chosen], other.means

@@ -24,36 +24,19 @@ mistake: the steps of a chessboard of 6 × 9 corners have 0.8, markers at random
 
 @dataclass(frozen=True)
 class Nodes:
-    """The weighted points that stand for the body where it is not sampled.
+    """The weighted points that stand for the body where it is not sampled."""
 
-    Attributes
-    ----------
-    points : (Q, 3) float64
-    weights : (Q,) float64
-        Each feature's nodes sum to 1, so that all sum to N.
-    feature : (Q,) int
-        The feature that a node belongs to.
-    """
-
-    points: Floats
-    weights: Floats
-    feature: NDArray[np.intp]
+    points: Floats  # (Q, 3)
+    weights: Floats  # (Q,) of each feature 1 together, so that all sum to N
+    feature: NDArray[np.intp]  # (Q,) that a node belongs to
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Displacements of features along a direction of the world, however the body is turned.
+    """Displacements of features along a direction of the world, however the body is turned."""
 
-    Attributes
-    ----------
-    direction : (3,) float64
-        In the world, of any length.
-    sigma : float
-        Standard deviation of the displacement of a feature along it, length units.
-    """
-
-    direction: Floats
-    sigma: float
+    direction: Floats  # (3,) in the world, of any length
+    sigma: float  # standard deviation of a feature along it, length units
 
     @property
     def unit(self) -> Floats:
@@ -69,36 +52,18 @@ class Gravity:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body known by its features.
-
-    Attributes
-    ----------
-    name : str
-    features : tuple of Feature
-        The densities q_i in the object's frame.
-    normals : (N, 3) float64 or None
-        Outward normals: a feature is seen only by sensors it faces.
-    gravity : Gravity or None
-        Spread that stays with the world while the body turns.
-    shape : {"point", "sphere", "disk"}
-        Of the markers, whose images have their centres elsewhere than the marker's own.  Disks
-        lie across their normals.
-    radii : (N,) float64 or None
-        Of spheres or disks, length units; 0 for a point.
-    names : tuple of str
-        What people call the features, those of them that have a name; they come first.
-    tip : (3,) float64 or None
-        A point of the body that is told with each pose; it is no feature.
-    """
+    """A rigid body known by its features."""
 
     name: str
-    features: tuple[Feature, ...]
-    normals: Floats | None = None
-    gravity: Gravity | None = None
+    features: tuple[Feature, ...]  # the densities q_i in the object's frame
+    normals: Floats | None = None  # (N, 3) outward: a feature is seen only by sensors it faces
+    gravity: Gravity | None = None  # spread that stays with the world while the body turns
+    # Of the markers, whose images have their centres elsewhere than the marker's own. Disks lie
+    # across their normals.
     shape: Shape = "point"
-    radii: Floats | None = None
-    names: tuple[str, ...] = ()
-    tip: Floats | None = None
+    radii: Floats | None = None  # (N,) of spheres or disks, length units; 0 for a point
+    names: tuple[str, ...] = ()  # what people call the features that have a name; they come first
+    tip: Floats | None = None  # (3,) that is told with each pose; it is no feature
 
     def __len__(self) -> int:
         return len(self.features)
@@ -207,23 +172,10 @@ class Body:
         common: bool = True,
         seed: int = 0,
     ) -> Floats:
-        """Draw R samples of every feature density.
+        """Draw R = `count` samples (N, R, 3) of every feature density; of an exact body, one.
 
-        Parameters
-        ----------
-        count : int
-            R; an exact body has one sample per feature whatever the count.
-        sampler : {"latin-hypercube", "low-discrepancy"}
-        antithetic : bool
-            Whether samples come in mirrored pairs.
-        common : bool
-            Whether all features use the same point set; fresh sets per feature are for
-            comparison only.
-        seed : int
-
-        Returns
-        -------
-        (N, R, 3) array
+        Antithetic samples come in mirrored pairs.  Features have the point set in common; fresh
+        sets per feature are for comparison only.
         """
         if self.is_exact:
             return self.means[:, None, :].copy()

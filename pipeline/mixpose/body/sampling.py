@@ -24,27 +24,11 @@ def uniforms(
     antithetic: bool = True,
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """Draw points of the open unit cube.
+    """Draw R = `count` points (R, 5) of the open unit cube, strictly between 0 and 1.
 
-    Parameters
-    ----------
-    count : int
-        R, the number of points; with `antithetic` the odd one of an odd count is left out.
-    sampler : {"latin-hypercube", "low-discrepancy"}
-        Latin hypercube (the paper's `lhsnorm`) or a scrambled Sobol sequence.
-    antithetic : bool
-        Whether the second half mirrors the first.
-    seed : int
-
-    Returns
-    -------
-    (R, 5) array
-        Numbers strictly between 0 and 1.
-
-    Raises
-    ------
-    ValueError
-        If the count is below 2 or the sampler is unknown.
+    Latin hypercube is the paper's `lhsnorm`, the other a scrambled Sobol sequence.  Of antithetic
+    points the second half mirrors the first, and the odd one of an odd count is left out.  Raises
+    `ValueError` if the count is below 2 or the sampler is unknown.
     """
     if count < 2:
         raise ValueError(f"{count} samples, at least 2 are needed")

@@ -24,20 +24,10 @@ _NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
 
 
 def symmetries(points: Floats, tolerance: float) -> Floats:
-    """Find the proper rigid motions that map a point set onto itself.
+    """Find the proper rigid motions (G, 4, 4) that map points (N, 3) onto themselves.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-        Feature means.
-    tolerance : float
-        Largest distance, in length units, between an image and its feature.
-
-    Returns
-    -------
-    (G, 4, 4) array
-        T_object_object, the identity first.  Points on one line (a continuous symmetry) give
-        only the identity and the half-turn, if any.
+    The tolerance is the largest distance between an image and its feature.  The identity is first;
+    points on one line (a continuous symmetry) give only it and the half-turn, if any.
     """
     points = np.asarray(points, dtype=np.float64)
     distinct = np.unique(points, axis=0)
@@ -68,8 +58,7 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
     A product errs by as much as both together, so that some are not found by themselves.
     """
     for R in (rotations[:, None] @ rotations[None]).reshape(-1, 3, 3):
-        # of the same turn the trace of the difference is 3
-        if np.einsum("ij,kij->k", R, rotations).max() > 1 + 2 * np.cos(_SAME_TURN):
+        if _known(R, rotations):
             continue
         _, mapped = tree.query(centred @ R.T)
         if len(set(mapped.tolist())) == len(centred):
@@ -159,5 +148,6 @@ def motions(source: Floats, targets: Floats) -> Floats:
     return from_parts(R, b - R @ a)
 
 
-def _known(R: Floats, found: list[Floats]) -> bool:
+def _known(R: Floats, found: list[Floats] | Floats) -> bool:
+    # of the same turn the trace of the difference is 3
     return bool(np.einsum("ij,kij->k", R, np.array(found)).max() > 1 + 2 * np.cos(_SAME_TURN))

@@ -81,18 +81,9 @@ def extract(
 
 
 def check_options(options: ExtractOptions, *, base: Path | None = None) -> None:
-    """Check options before the first image comes.
+    """Check options before the first image comes; with a `base`, import "module:function", too.
 
-    Parameters
-    ----------
-    options : ExtractOptions
-    base : Path, optional
-        With it, a method "module:function" is imported too.
-
-    Raises
-    ------
-    SessionError
-        If an option is wrong: one line with the key, what was found and what is allowed.
+    Raises `SessionError` if one is wrong: a line with the key, what was found and what is allowed.
     """
     if options.method not in METHODS:
         _check_custom(options.method, base)

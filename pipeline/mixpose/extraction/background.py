@@ -43,18 +43,7 @@ class BackgroundRules:
 
 
 def background_tiles(image: Grey, rules: BackgroundRules = BackgroundRules()) -> Grey:
-    """Coarse map of the background.
-
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    rules : BackgroundRules
-
-    Returns
-    -------
-    (rows, columns) array of the type of the image
-        Medians of the tiles into which the image divides.
-    """
+    """Coarse map of the background of an image (H, W): medians of its tiles (rows, columns)."""
     tile = tile_side(image, rules)
     rows, v = _sample_places(image.shape[0], tile)
     columns, u = _sample_places(image.shape[1], tile)

@@ -87,20 +87,9 @@ class Blob:
 def extract_blobs(
     image: Image, options: ExtractOptions, window: Window, rules: BlobRules = BlobRules()
 ) -> PointPattern:
-    """Centres of the blobs in a window.
+    """Centres of the blobs in a window (u0, v0, u1, v1) of an image, not empty and inside of it.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    rules : BlobRules
-
-    Returns
-    -------
-    PointPattern
-        Points in pixels of the whole image, each of weight 1; none where nothing is found.
+    In pixels of the whole image, each of weight 1.
     """
     blobs = find_blobs(foreground(image, options, window, rules.threshold), options, rules)
     points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
@@ -134,47 +123,26 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
 
 @dataclass(eq=False)
 class Part:
-    """What is connected above a level, and what is found of it.
-
-    Attributes
-    ----------
-    contour : (n, 1, 2) int32
-    area : float
-        Number of pixels that it encloses.
-    level : float
-    found : list of Blob
-        The disk that it is, or the spots where it is small.
-    whole : list of Blob
-        Itself, where it is large and no disk: taken where nothing is inside of it.
-    beside : list of Part
-        In its holes: taken beside it.
-    inner : list of list of Part
-        At higher levels: taken instead of it.
-    """
+    """What is connected above a level, and what is found of it."""
 
     contour: Contour
-    area: float
+    area: float  # number of pixels that it encloses
     level: float
+    # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
+    # Itself, where it is large and no disk: taken where nothing is inside of it.
     whole: list[Blob] = field(default_factory=list)
-    beside: list[Part] = field(default_factory=list)
-    inner: list[list[Part]] = field(default_factory=list)
+    beside: list[Part] = field(default_factory=list)  # in its holes: taken beside it
+    inner: list[list[Part]] = field(default_factory=list)  # at higher levels: taken instead of it
 
 
 def find_blobs(
     scene: Foreground, options: ExtractOptions, rules: BlobRules = BlobRules()
 ) -> list[Blob]:
-    """The blobs of a foreground.
+    """The blobs of a foreground; limits of their area are those of the options, holes filled.
 
     What has no shape is taken apart at all higher levels first: then all rims are looked at
     together, and all spots.
-
-    Parameters
-    ----------
-    scene : Foreground
-    options : ExtractOptions
-        `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
-    rules : BlobRules
     """
     parts = _parts(outlines(scene), scene.level, options.min_area)
     shapeless = _without_disks(scene, parts, rules)

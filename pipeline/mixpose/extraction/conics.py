@@ -37,22 +37,12 @@ class Ellipse:
 
 @dataclass(frozen=True)
 class Ellipses:
-    """B ellipses in pixel coordinates.
+    """B ellipses in pixel coordinates."""
 
-    Attributes
-    ----------
-    centre : (B, 2) float64
-    half_axes : (B, 2) float64
-    angle : (B,) float64
-        Radians; turns the first half-axis from u.
-    sound : (B,) bool
-        Which of them are ellipses; the others are unit circles.
-    """
-
-    centre: Floats
-    half_axes: Floats
-    angle: Floats
-    sound: Mask
+    centre: Floats  # (B, 2)
+    half_axes: Floats  # (B, 2)
+    angle: Floats  # (B,) radians; turns the first half-axis from u
+    sound: Mask  # (B,) which of them are ellipses; the others are unit circles
 
     def select(self, chosen: Mask | NDArray[np.intp]) -> Ellipses:
         """Some of them."""
@@ -84,18 +74,11 @@ def together(ellipses: list[Ellipse]) -> Ellipses:
 
 
 def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:
-    """Ellipses through points: of all conics those of least mean square distance.
+    """Ellipses through the chosen (B, n) of points (B, n, 2): conics of least mean square distance.
 
     That is the sum of squares of the equation over that of its gradient (Taubin, IEEE PAMI 13,
-    1991), by `cv2.fitEllipseAMS`; `cv2.fitEllipseDirect` where that conic is no ellipse.
-
-    Parameters
-    ----------
-    points : (B, n, 2) float64
-    chosen : (B, n) bool
-        Which points count.
-    oblique : float
-        Least width by length.
+    1991), by `cv2.fitEllipseAMS`; `cv2.fitEllipseDirect` where that conic is no ellipse.  `oblique`
+    is the least width by length.
     """
     found = np.ones((len(points), 5))
     sound = chosen.sum(axis=1) >= FEWEST

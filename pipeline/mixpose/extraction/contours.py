@@ -97,25 +97,9 @@ def is_solid(contour: Contour, least: float) -> bool:
 def cut_out(
     scene: Foreground, contour: Contour, box: Box, margin: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[int, int]]:
-    """What is about a contour.
+    """Patch, mask and corner of the box of a contour and a margin in px, as far as the window goes.
 
-    Parameters
-    ----------
-    scene : Foreground
-    contour : (n, 1, 2) int32
-    box : (u, v, width, height)
-        That of the contour.
-    margin : int
-        By how many px the patch is larger on each side, as far as the window goes.
-
-    Returns
-    -------
-    patch : (h, w) float32
-        Signal in the box and its margin.
-    inside : (h, w) uint8
-        1 where the contour encloses the patch.
-    corner : (u, v)
-        Where the first pixel of the patch is.
+    The signal (h, w); 1 where the contour encloses it (h, w); where the first pixel is, (u, v).
     """
     patch, corner = signal_about(scene, box, margin)
     return patch, filled(contour, patch.shape, corner), corner

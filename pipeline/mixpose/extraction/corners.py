@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions, check_level
-from mixpose.extraction.point_patterns import points_in
-from mixpose.extraction.quadratic import stationary_points
+from mixpose.extraction.quadratic import points_in, stationary_points
 from mixpose.extraction.sampling import sample
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
@@ -60,12 +59,7 @@ def extract_corners(
     """Saddle points of the grey values in a window of an image, as `points_in` has them.
 
     The threshold of the options is "auto", or the least difference of grey between bright and dark
-    fields; corners have neither polarity nor area.
-
-    Raises
-    ------
-    SessionError
-        If the threshold is neither "auto" nor a number.
+    fields; corners have neither polarity nor area.  Raises `SessionError` for other thresholds.
     """
     check_level(options.threshold, "corners", "the least step from bright to dark")
 

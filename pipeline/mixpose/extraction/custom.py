@@ -10,8 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -29,18 +28,9 @@ UserFunction = Callable[[Image, ExtractOptions], Any]
 
 @lru_cache(maxsize=32)
 def load_function(method: str, base: Path | None) -> UserFunction:
-    """Import the function that "module:function" names.
+    """Import the function that "module:function" names, from the folder `base` before `sys.path`.
 
-    Parameters
-    ----------
-    method : str
-    base : Path or None
-        Folder to look in before `sys.path`: that of the session file.
-
-    Raises
-    ------
-    SessionError
-        If there is no such module or function, or the module cannot be imported.
+    Raises `SessionError` if there is none, or the module cannot be imported.
     """
     module_name, _, function_name = method.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), function_name)):
@@ -72,20 +62,8 @@ def extract_custom(
 ) -> Pattern:
     """Feature pattern that the user's function finds in a window of an image.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `method` is "module:function"; all of it is handed on.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    base : Path or None
-        Folder of the session file.
-
-    Raises
-    ------
-    SessionError
-        If the function cannot be imported, fails, or returns something else than a pattern.
+    The method is "module:function", and `base` the folder of the session file.  Raises
+    `SessionError` if it cannot be imported, fails, or returns something else than a pattern.
     """
     function = load_function(options.method, base)
     u0, v0, u1, v1 = window
@@ -160,8 +138,10 @@ def _failed(method: str, what: str, error: Exception) -> str:
 def _load_module(name: str, base: Path | None) -> ModuleType:
     if base is None:
         return importlib.import_module(name)
-    file = base.resolve() / f"{name}.py"
-    with _first_in_path(base.resolve()):
+    folder = base.resolve()
+    file = folder / f"{name}.py"
+    sys.path.insert(0, str(folder))
+    try:
         if not file.is_file():
             return importlib.import_module(name)
         # Not by its bare name, which may be that of an installed module, or of the module of
@@ -173,12 +153,5 @@ def _load_module(name: str, base: Path | None) -> ModuleType:
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
         return module
-
-
-@contextmanager
-def _first_in_path(folder: Path) -> Iterator[None]:
-    sys.path.insert(0, str(folder))
-    try:
-        yield
     finally:
         sys.path.remove(str(folder))

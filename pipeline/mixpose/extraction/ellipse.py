@@ -75,23 +75,12 @@ class EllipseRules:
 
 @dataclass(frozen=True)
 class Rim:
-    """An ellipse found in an image.
-
-    Attributes
-    ----------
-    ellipse : Ellipse
-    coverage : float
-        Share of the directions in which an edge lies on the ellipse.
-    residual : float
-        RMS distance in px of these edges from it.
-    contrast : float
-        Median step of the signal across the edges.
-    """
+    """An ellipse found in an image."""
 
     ellipse: Ellipse
-    coverage: float
-    residual: float
-    contrast: float
+    coverage: float  # share of the directions in which an edge lies on the ellipse
+    residual: float  # RMS distance in px of these edges from it
+    contrast: float  # median step of the signal across the edges
 
     def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
         """Whether the rim is an ellipse."""
@@ -106,22 +95,9 @@ def find_rims(
     least_contrast: float,
     rules: EllipseRules = EllipseRules(),
 ) -> list[Rim | None]:
-    """The elliptical rims of bright features.
+    """The elliptical rims of bright features, by outlines in pixels of the signal (H, W).
 
-    Parameters
-    ----------
-    signal : (H, W) uint8, uint16 or float32
-        Grey values.
-    outlines : sequence of (n, 1, 2) int32
-        Contours of the features, in pixels of the signal.
-    least_contrast : float
-        An edge is a step of the signal by at least this.
-    rules : EllipseRules
-
-    Returns
-    -------
-    list of Rim or None
-        One for each outline; None where nothing like an ellipse is found.
+    An edge is a step of at least `least_contrast`.  None where nothing like an ellipse is found.
     """
     rims: list[Rim | None] = [None] * len(outlines)
     if not outlines:
@@ -198,20 +174,9 @@ def tolerance(minor: Any, rules: EllipseRules) -> Any:
 
 
 def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules()) -> Ellipses:
-    """Ellipses through points, of which some may lie elsewhere.
+    """Ellipses through those of points (B, n, 2), in order along each, that are there (B, n).
 
-    Parameters
-    ----------
-    points : (B, n, 2) float64
-        Points in order along each ellipse.
-    there : (B, n) bool
-        Which of them count.
-    rules : EllipseRules
-
-    Returns
-    -------
-    Ellipses
-        Sound but for less than six points, or where they are not on an ellipse.
+    Some may lie elsewhere.  Sound but for less than six points, or where they are on no ellipse.
     """
     best = fit_conics(points, there, rules.oblique)
     distance, spread = _spreads(best, points, there)
@@ -247,12 +212,7 @@ def _without_an_arc(
     """Ellipses through all points but those of an arc that may be hidden.
 
     Of several arcs that is the first that leaves an ellipse as near to the points as asked for,
-    else the nearest.
-
-    Returns
-    -------
-    Ellipses, (B,) bool
-        Those that are nearer to the points (B, n, 2) than what is there already, and which.
+    else the nearest.  Those nearer to the points (B, n, 2) than what is there already, and which.
     """
     arcs = rules.hidden_arcs
     counts = there.sum(axis=1)[:, None]
@@ -282,18 +242,10 @@ def _medians(values: Floats, there: Mask) -> Floats:
 def _edges(
     signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
 ) -> tuple[Floats, Mask, Floats, Floats]:
-    """Edges along the normals of ellipses.
+    """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
 
-    Returns
-    -------
-    edges : (B, DIRECTIONS, 2) float64
-        Where the signal falls through half the height of the edge, to parts of a pixel.
-    found : (B, DIRECTIONS) bool
-        Whether it falls by `least_contrast` there, well within reach.
-    steps : (B, DIRECTIONS) float64
-        By how much it falls.
-    lows : (B, DIRECTIONS) float64
-        Down to what.
+    There the signal falls through half the height of the edge; whether by `least_contrast`, well
+    within reach, by how much, and down to what (B, DIRECTIONS).
     """
     axes = ellipses.half_axes[:, None]
     turned = turns(ellipses.angle).swapaxes(1, 2)

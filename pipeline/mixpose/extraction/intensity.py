@@ -10,21 +10,10 @@ from mixpose.records import GridPattern, Image, Pattern, PointPattern
 
 
 def extract_intensity(image: Image, options: ExtractOptions, window: Window) -> Pattern:
-    """Grey values above the threshold, without the background.
+    """Grey values above the threshold, without the background, of a window (u0, v0, u1, v1).
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `polarity` and `threshold` matter here; areas do not.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-
-    Returns
-    -------
-    GridPattern
-        Values (v1 - v0, u1 - u0) from (u0, v0) on, a step of 1 px; zero where no feature is.
-        An empty PointPattern if that is everywhere.
+    A step of 1 px, zero where no feature is; an empty PointPattern if that is everywhere.  Areas
+    do not matter.
     """
     values = feature_values(image, options, window)
     if not values.any():

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions, check_level
-from mixpose.extraction.point_patterns import points_in
-from mixpose.extraction.quadratic import stationary_points
+from mixpose.extraction.quadratic import points_in, stationary_points
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
 
@@ -61,11 +60,7 @@ def extract_log(
 
     Of the options, `spot_sigma` is the width of the spots in px, 0 for 3 px; `threshold` is "auto",
     or the least height of a spot above what surrounds it, in grey values.  Areas do not matter.
-
-    Raises
-    ------
-    SessionError
-        If the threshold is neither "auto" nor a number.
+    Raises `SessionError` if the threshold is neither "auto" nor a number.
     """
     check_level(options.threshold, "log", "the least height of a spot")
     return points_in(image, window, lambda part: _find(part, options, rules))
@@ -74,14 +69,9 @@ def extract_log(
 def spot_strength(
     image: Image, options: ExtractOptions, rules: LaplacianRules = LaplacianRules()
 ) -> Grey:
-    """Height of the Gaussian spot about each pixel that would make the filter's response there.
+    """Height (H, W), in grey values, of the spot about each pixel that would make such a response.
 
-    Parameters are those of `extract_log`.
-
-    Returns
-    -------
-    (H, W) float32
-        In grey values; of spots of the given polarity positive.
+    The spots are Gaussian; those of the given polarity are positive.
     """
     width = options.spot_sigma or rules.width
     grey = image.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Places to parts of a pixel: stationary points of quadratics through grey values."""
+"""Places to parts of a pixel: stationary points of quadratics through grey values, in a window."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mixpose.extraction.background import Grey
 from mixpose.extraction.sampling import sample
-from mixpose.records import Floats
+from mixpose.extraction.threshold import Window
+from mixpose.records import Floats, Image, PointPattern
 
 # Half the side of the square to which the quadratic is fitted, in steps.
 FIT_RADIUS = 2
@@ -19,26 +20,23 @@ FIT_STEPS = 3
 Wanted = Callable[[Floats, Floats, Floats], NDArray[np.bool_]]
 
 
+def points_in(image: Image, window: Window, find: Callable[[Image], Floats]) -> PointPattern:
+    """What `find` finds in a window (u0, v0, u1, v1), in pixels of the whole image, of weight 1.
+
+    It takes the part of the image in the window, not empty, to places (n, 2) in its pixels.
+    """
+    u0, v0, u1, v1 = window
+    found = find(image[v0:v1, u0:u1])
+    return PointPattern(found + np.array([u0, v0]), np.ones(len(found)))
+
+
 def stationary_points(
     grey: Grey, rough: Floats, wanted: Wanted, step: float = 1.0
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Stationary points of quadratics about rough places (n, 2).
+    """Stationary points (m, 2) of quadratics about rough places (n, 2), and which of them have one.
 
-    Parameters
-    ----------
-    grey : (H, W) float32
-    rough : (n, 2) float64
-        Pixel coordinates u, v.
-    wanted : function
-        Tells by the second derivatives which stationary points are looked for.
-    step : float
-        Distance in px of the samples that a quadratic goes through, 5 x 5 of them.
-
-    Returns
-    -------
-    points : (m, 2) float64
-    fitted : (n,) bool
-        True m times: where the point is wanted and the fit stayed close by.
+    `wanted` tells by the second derivatives which are looked for; a quadratic goes through 5 x 5
+    samples, `step` px apart.  Places (n,) have one where it is wanted and the fit stayed close by.
     """
     side = np.arange(-FIT_RADIUS, FIT_RADIUS + 1.0)
     v, u = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))

@@ -16,18 +16,9 @@ MOST_ROWS = 30000
 
 
 def sample(grey: Grey, places: Floats) -> Floats:
-    """Bilinear samples of an image.
+    """Bilinear samples (n, k) of an image (H, W) at pixel coordinates u, v (n, k, 2).
 
-    Parameters
-    ----------
-    grey : (H, W) uint8, uint16 or float32
-    places : (n, k, 2) float64
-        Pixel coordinates u, v.
-
-    Returns
-    -------
-    (n, k) float64
-        Outside of the image, the nearest pixel's value.
+    Outside of the image, the nearest pixel's value.
     """
     if places.size == 0:
         return np.empty(places.shape[:2])
@@ -48,20 +39,9 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
 
 
 def sample_each(grey: Grey, u: Floats, v: Floats) -> NDArray[np.float32]:
-    """Bilinear samples of an image around several features.
+    """As `sample`, at u and v (B, n) of B features, of each near each other.
 
     Only what is around each feature is turned into single precision, not all between them.
-
-    Parameters
-    ----------
-    grey : (H, W) uint8, uint16 or float32
-    u, v : (B, n) float64
-        Pixel coordinates, of each feature near each other.
-
-    Returns
-    -------
-    (B, n) float32
-        Outside of the image, the nearest pixel's value.
     """
     across, left, columns = _part(u, grey.shape[1])
     down, top, rows = _part(v, grey.shape[0])

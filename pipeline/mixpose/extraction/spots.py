@@ -49,22 +49,10 @@ def find_spots(
     level: float,
     rules: SpotRules = SpotRules(),
 ) -> list[tuple[float, float]]:
-    """Centre of a small blob, or the centres of the blobs that touch in it.
+    """Centre (u, v) of a small blob, px of the window, or the centres of blobs that touch in it.
 
-    Parameters
-    ----------
-    scene : Foreground
-    contour : (n, 1, 2) int32
-        What is above the level.
-    area : float
-        Number of pixels that it encloses.
-    level : float
-    rules : SpotRules
-
-    Returns
-    -------
-    list of (u, v)
-        In pixels of the window; none if the blob is cut by its border or does not stand out.
+    The contour encloses `area` px that are above the level.  There is none if the border of the
+    window cuts the blob or it does not stand out.
     """
     box = cv2.boundingRect(contour)
     u, v, width, height = box
@@ -129,30 +117,14 @@ def come_apart(
     level: float,
     rules: SpotRules,
 ) -> list[tuple[NDArray[np.uint8], float]]:
-    """Parts of a long blob that come apart at a higher level.
+    """Masks (h, w) of the parts of a long blob that come apart at a higher level, with that level.
+
+    `patch` (h, w) is the signal about the blob, `inside` 1 within it, or None where nothing else is
+    above its level.  There are no parts where all that is above the level is asked for.
 
     A watershed (`skimage.segmentation`) from peaks as prominent parts no more pairs (6 px apart,
     one 2.5 times brighter: 16 of 30 to 26) in three times the time, and a photograph of 8
     megapixels takes it more than a minute.
-
-    Parameters
-    ----------
-    scene : Foreground
-    contour : (n, 1, 2) int32
-        Outline of the blob.
-    patch : (h, w) float32
-        Signal in a box about the blob.
-    inside : (h, w) uint8 or None
-        1 inside of the blob, else 0; None where nothing else is above the level.
-    level : float
-        Level of the contour.
-    rules : SpotRules
-
-    Returns
-    -------
-    list of (part, level)
-        (h, w) uint8 mask of each part, and the level that sets them apart; none if none does,
-        or if what is above the level is all that is asked for.
     """
     if not (scene.judged and is_long(contour, rules)):
         return []

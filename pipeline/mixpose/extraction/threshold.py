@@ -71,34 +71,17 @@ class Foreground:
     """A window of an image, made ready to look for bright features.
 
     The signal is what is brighter than the background: ``grey - zero``.
-
-    Attributes
-    ----------
-    grey : (H, W) uint8, uint16 or float32
-        Grey values, features bright.
-    zero : float
-        Grey value of the background; 0 where it is taken out of `grey` already, or where the
-        user gave the level.
-    level : float
-        A pixel whose signal is above this level belongs to a feature.
-    noise : float
-        Standard deviation of a background pixel.
-    least_peak : float
-        Signal that a small feature must reach to count.
-    judged : bool
-        Whether features must stand out to count.  False where the level is the user's, or
-        Otsu's: then all that is above it counts.
-    tops : (H,) array of the type of `grey`
-        Highest grey value of each row: most rows of a frame have nothing to look for.
     """
 
-    grey: Grey
-    zero: float
-    level: float
-    noise: float
-    least_peak: float
+    grey: Grey  # (H, W) features bright
+    zero: float  # grey value of the background; 0 where it is out of `grey`, or the level given
+    level: float  # a pixel whose signal is above this level belongs to a feature
+    noise: float  # standard deviation of a background pixel
+    least_peak: float  # signal that a small feature must reach to count
+    # Whether features must stand out to count. False where the level is the user's, or Otsu's: then
+    # all that is above it counts.
     judged: bool
-    tops: Grey
+    tops: Grey  # (H,) highest grey values of rows: most have nothing to look for
 
 
 def above(signal: Grey, level: float) -> NDArray[np.uint8]:
@@ -121,14 +104,7 @@ def foreground(
 ) -> Foreground:
     """Take the background out of a window and choose the level for its features.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `polarity` and `threshold` matter here.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    rules : ThresholdRules
+    The window is within the image, and not empty.
     """
     bright, inner, threshold = _bright(image, options, window, rules)
     noise = noise_of(bright, rules.background)
@@ -160,14 +136,7 @@ def feature_values(
     window: Window,
     rules: ThresholdRules = ThresholdRules(),
 ) -> NDArray[np.float32]:
-    """Grey values of the features in a window without the background; zero elsewhere.
-
-    Parameters are those of `foreground`.
-
-    Returns
-    -------
-    (v1 - v0, u1 - u0) float32
-    """
+    """Grey values (v1 - v0, u1 - u0) of the features in a window without the background, else 0."""
     found = foreground(image, options, window, rules)
     grey, zero = found.grey, found.zero
     if not found.judged:

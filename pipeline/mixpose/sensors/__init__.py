@@ -5,24 +5,35 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 
 from __future__ import annotations
 
-from mixpose.sensors.base import OUTSIDE, AffineSensor, Sensor
-from mixpose.sensors.batch import SensorBatch
+from mixpose.sensors.base import OUTSIDE as OUTSIDE, AffineSensor as AffineSensor, Sensor as Sensor
+from mixpose.sensors.batch import SensorBatch as SensorBatch
 from mixpose.sensors.cloud import (
-    PLANES,
-    CloudPlane,
-    CloudSensor,
-    as_images,
-    clouds_among,
-    from_planes,
+    PLANES as PLANES,
+    CloudPlane as CloudPlane,
+    CloudSensor as CloudSensor,
+    as_images as as_images,
+    clouds_among as clouds_among,
+    from_planes as from_planes,
 )
-from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted, with_another_lens
-from mixpose.sensors.facing import facing
-from mixpose.sensors.fisheye import FisheyeCamera
-from mixpose.sensors.lateration import RangeSensor
-from mixpose.sensors.moving import Motion, RollingSensor, in_motion, moments, side_by_side
-from mixpose.sensors.parallel import ParallelBeam
-from mixpose.sensors.pinhole import PinholeCamera
-from mixpose.sensors.rays import Rays
+from mixpose.sensors.doubted import (
+    CalibrationError as CalibrationError,
+    by_calibration as by_calibration,
+    doubted as doubted,
+    with_another_lens as with_another_lens,
+)
+from mixpose.sensors.facing import facing as facing
+from mixpose.sensors.fisheye import FisheyeCamera as FisheyeCamera
+from mixpose.sensors.lateration import RangeSensor as RangeSensor
+from mixpose.sensors.moving import (
+    Motion as Motion,
+    RollingSensor as RollingSensor,
+    in_motion as in_motion,
+    moments as moments,
+    side_by_side as side_by_side,
+)
+from mixpose.sensors.parallel import ParallelBeam as ParallelBeam
+from mixpose.sensors.pinhole import PinholeCamera as PinholeCamera
+from mixpose.sensors.rays import Rays as Rays
 
 SENSOR_MODELS: dict[str, type[Sensor]] = {
     "pinhole": PinholeCamera,
@@ -31,32 +42,3 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
     "lateration": RangeSensor,
     "cloud": CloudSensor,
 }
-
-__all__ = [
-    "OUTSIDE",
-    "PLANES",
-    "SENSOR_MODELS",
-    "AffineSensor",
-    "CalibrationError",
-    "CloudPlane",
-    "CloudSensor",
-    "FisheyeCamera",
-    "Motion",
-    "ParallelBeam",
-    "PinholeCamera",
-    "RangeSensor",
-    "Rays",
-    "RollingSensor",
-    "Sensor",
-    "SensorBatch",
-    "as_images",
-    "by_calibration",
-    "clouds_among",
-    "doubted",
-    "facing",
-    "from_planes",
-    "in_motion",
-    "moments",
-    "side_by_side",
-    "with_another_lens",
-]

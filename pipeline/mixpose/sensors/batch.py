@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import OUTSIDE, Sensor
+from mixpose.sensors.base import Sensor, hide
 from mixpose.sensors.distortion import LensDistortion
 from mixpose.sensors.lateration import RangeSensor
 from mixpose.sensors.pinhole import NEAREST, PinholeCamera
@@ -76,7 +76,8 @@ class RangeBatch:
         y[..., 0] = distance + self._biases
         J[..., 0, :] = away / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
         visible = (y[..., 0] >= self._lower) & (y[..., 0] <= self._upper)
-        return _hidden(y, J, visible)
+        hide(y, visible, J)
+        return y, J, visible
 
 
 class PinholeBatch:
@@ -122,15 +123,9 @@ class PinholeBatch:
         inside = np.abs(y - self._middle) <= self._half
         if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
             return y, J, in_front
-        return _hidden(np.ascontiguousarray(y), J, in_front & inside.all(axis=2))
-
-
-def _hidden(y: Floats, J: Floats, visible: Mask) -> tuple[Floats, Floats, Mask]:
-    """Overwrite what is not visible, in place."""
-    if not visible.all():
-        y[~visible] = OUTSIDE
-        J[~visible] = 0.0
-    return y, J, visible
+        y, visible = np.ascontiguousarray(y), in_front & inside.all(axis=2)
+        hide(y, visible, J)
+        return y, J, visible
 
 
 def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:

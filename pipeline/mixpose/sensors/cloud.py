@@ -37,14 +37,9 @@ class CloudPlane(ParallelBeam):
 
 @dataclass(frozen=True, eq=False)
 class CloudSensor:
-    """Measures points in space.
+    """Measures points in space."""
 
-    Parameters
-    ----------
-    T_sensor_world : (4, 4) array
-        From the world to the axes that the points are in.
-    """
-
+    # (4, 4) to the axes that the points are in
     T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
 
     dimension = 3
@@ -110,19 +105,8 @@ def as_images(
 ) -> tuple[tuple[Sensor, ...], Floats, list[int]]:
     """Sensors with clouds as their images, which tell as much at as many deviations.
 
-    Parameters
-    ----------
-    sensors : sequence of Sensor
-    deviations : sequence of float
-        Of what each measures along an axis.
-
-    Returns
-    -------
-    sensors : tuple of Sensor
-    deviations : array
-        Of a cloud's images √2 times those of the cloud, as each coordinate is in two of them.
-    first : list of int
-        Where each of the given sensors, or its first image, is among these.
+    Deviations are those along an axis: of a cloud's images √2 times the cloud's, as each coordinate
+    is in two of them.  The last are the places of the sensors given, or of their first images.
     """
     parts = [one.planes if isinstance(one, CloudSensor) else (one,) for one in sensors]
     counts = [len(part) for part in parts]

@@ -20,18 +20,12 @@ _COUNT = 14
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """OpenCV's distortion of a pinhole camera.
+    """OpenCV's distortion of a pinhole camera."""
 
-    Attributes
-    ----------
-    coefficients : (14,) or (14, ...) float64
-        OpenCV's order, missing ones zero; further axes broadcast against those of the points.
-    radius_limit : float or (...) float64
-        Normalised radius up to which the radial polynomial grows.  Beyond it a model fitted to
-        the image folds back and would show points that no lens images.
-    """
-
+    # (14,) or (14, ...) in OpenCV's order; further axes broadcast as points do
     coefficients: Floats
+    # Normalised radius up to which the radial polynomial grows. Beyond it a model fitted to the
+    # image folds back and would show points that no lens images.
     radius_limit: float | Floats
 
     @classmethod

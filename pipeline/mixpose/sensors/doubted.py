@@ -17,27 +17,14 @@ from mixpose.sensors.pinhole import PinholeCamera
 
 @dataclass(frozen=True)
 class CalibrationError:
-    """Standard deviations of what a calibration says of a sensor.
+    """Standard deviations of what a calibration says of a sensor."""
 
-    Attributes
-    ----------
-    focal : float
-        Of the focal length, as a share of it; of the pixel size, with parallel beams.
-    principal_point : float
-        Along each axis, px.
-    rotation_deg : float
-        Of the orientation, about each axis.
-    position : float
-        Along each axis, length units.
-    range_bias : float
-        Length units.
-    """
-
+    # of the focal length, as a share of it; of the pixel size, with parallel beams
     focal: float = 0.0
-    principal_point: float = 0.0
-    rotation_deg: float = 0.0
-    position: float = 0.0
-    range_bias: float = 0.0
+    principal_point: float = 0.0  # along each axis, px
+    rotation_deg: float = 0.0  # of the orientation, about each axis
+    position: float = 0.0  # along each axis, length units
+    range_bias: float = 0.0  # length units
 
 
 def doubted(sensor: Sensor, error: CalibrationError) -> tuple[Sensor, ...]:

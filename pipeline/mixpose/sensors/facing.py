@@ -12,17 +12,10 @@ from mixpose.sensors.cloud import CloudPlane, CloudSensor
 def facing(
     sensor: Sensor, T_world_object: Floats, points_world: Floats, normals: Floats | None
 ) -> Mask:
-    """Which features turn their face to a sensor: (..., n), true where normals are not known.
+    """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
 
-    So they are in a cloud, whose system sees them from several sides.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    T_world_object : (..., 4, 4) array
-    points_world : (..., n, 3) array
-    normals : (n, 3) array or None
-        In the object's frame.
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4).  All features face a cloud, whose
+    system sees them from several sides.
     """
     if normals is None or isinstance(sensor, CloudPlane | CloudSensor):
         return np.ones(points_world.shape[:-1], dtype=np.bool_)

@@ -19,25 +19,13 @@ _WIDEST = np.pi / 2  # as cv2.fisheye, which divides by depth; points beside the
 class FisheyeCamera:
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
 
-    Parameters
-    ----------
-    camera_matrix : (3, 3) array
-    distortion : (4,) array
-        k1 to k4; empty for none.
-    resolution : (int, int) or None
-        Width and height in px; None leaves the image unbounded.
-    T_sensor_world : (4, 4) array
-
-    Raises
-    ------
-    ValueError
-        If `distortion` has neither 0 nor 4 numbers.
+    Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
     """
 
-    camera_matrix: Floats
-    distortion: Floats = field(default_factory=lambda: np.zeros(4))
-    resolution: tuple[int, int] | None = None
-    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    camera_matrix: Floats  # (3, 3) px
+    distortion: Floats = field(default_factory=lambda: np.zeros(4))  # (4,) k1 to k4, or none
+    resolution: tuple[int, int] | None = None  # width and height, px; None: unbounded
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
     lower: Floats = field(init=False, repr=False)
     upper: Floats = field(init=False, repr=False)
     theta_limit: float = field(init=False, repr=False)

@@ -22,20 +22,11 @@ from mixpose.sensors.rays import Rays
 
 @dataclass(frozen=True)
 class Motion:
-    """How the world moves, or a body in it.
+    """How the world moves, or a body in it."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        The pose at the common time; the body turns about its origin.
-    velocity : (6,) float64
-        Twist per second, as of `mixpose.rigid.perturb`.
-    acceleration : (6,) float64
-        Per second more: in 6 ms a hand at 0.3 m/s leaves a straight course by 0.05 mm.
-    """
-
-    T_world_object: Floats
-    velocity: Floats
+    T_world_object: Floats  # (4, 4) at the common time; the body turns about its origin
+    velocity: Floats  # (6,) twist per second, as of `mixpose.rigid.perturb`
+    # (6,) per second more: in 6 ms a hand at 0.3 m/s leaves a straight course by 0.05 mm
     acceleration: Floats = field(default_factory=lambda: np.zeros(6))
 
     def after(self, seconds: float) -> Floats:
@@ -47,14 +38,7 @@ class Motion:
 def in_motion(sensor: Sensor, motion: Motion, delay: float, readout: float) -> Sensor:
     """A sensor that sees what moves, as a map from points at the common time.
 
-    Parameters
-    ----------
-    sensor : Sensor
-    motion : Motion
-    delay : float
-        Seconds after the common time at which the middle row is read.
-    readout : float
-        Seconds from the first row to the last.
+    Its middle row is read `delay` seconds after that, its last `readout` seconds after the first.
     """
     if not motion.velocity.any() or not (delay or readout):
         return sensor

@@ -17,22 +17,13 @@ from mixpose.sensors.rays import Rays
 class ParallelBeam:
     """A camera without perspective: pixel = (x_s, y_s) / pixel_size + principal_point.
 
-    Parameters
-    ----------
-    pixel_size : float
-        Length per px.
-    principal_point : (2,) array
-        Pixel where the sensor's origin projects.
-    resolution : (int, int) or None
-        Width and height in px; None leaves the image unbounded.
-    T_sensor_world : (4, 4) array
-        The paper's rotated projections are ``x_s = cos γ x + sin γ y, y_s = z``.
+    The paper's rotated projections are ``x_s = cos γ x + sin γ y, y_s = z``.
     """
 
-    pixel_size: float
-    principal_point: Floats
-    resolution: tuple[int, int] | None = None
-    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    pixel_size: float  # length per px
+    principal_point: Floats  # (2,) where the sensor's origin projects, px
+    resolution: tuple[int, int] | None = None  # width and height, px; None: unbounded
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
     lower: Floats = field(init=False, repr=False)
     upper: Floats = field(init=False, repr=False)
 

@@ -7,7 +7,6 @@ from typing import Literal, Self
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mixpose.records import Floats, Mask
 from mixpose.sensors.base import hide, image_bounds, within
@@ -49,7 +48,8 @@ class PinholeCamera:
     unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
 
     def __post_init__(self) -> None:
-        _freeze_camera(self, self.camera_matrix, self.distortion, self.T_sensor_world)
+        for name in ("camera_matrix", "distortion", "T_sensor_world"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         lower, upper = image_bounds(self.resolution)
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
@@ -109,12 +109,3 @@ class PinholeCamera:
             # polynomials of huge radii overflow; hidden points are overwritten anyway
             xy = np.where(visible[..., None], xy, 0.0)
         return xy, inverse_depth, np.asarray(visible)
-
-
-def _freeze_camera(camera: object, matrix: ArrayLike, distortion: ArrayLike, T: ArrayLike) -> None:
-    for name, value in (
-        ("camera_matrix", matrix),
-        ("distortion", distortion),
-        ("T_sensor_world", T),
-    ):
-        object.__setattr__(camera, name, np.asarray(value, dtype=np.float64))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,30 +18,17 @@ _WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
 class Rays:
     """Half-lines (lines, for parallel beams) in the world, one per detection.
 
-    Attributes
-    ----------
-    origins : (M, 3) float64
-        Centre of projection, or a point on the sensor's plane.
-    directions : (M, 3) float64
-        Unit vectors away from the sensor.
-    pixels : (M, 2) float64
-        The detections.
-    central : bool
-        Whether all rays start at one centre, in front of which alone the camera sees.
-    offset, slope : float
-        Length that a px covers across the ray at a distance d from its origin:
-        ``offset + slope * d``.
-    cloud : object or None
-        Of lines that images of one cloud of points give: the same for each of its images, in which
-        the lines of one point have the same number.
+    A px covers ``offset + slope * d`` of length across the ray at a distance d from its origin.
     """
 
-    origins: Floats
-    directions: Floats
-    pixels: Floats
-    central: bool
+    origins: Floats  # (M, 3) centre of projection, or a point on the sensor's plane
+    directions: Floats  # (M, 3) unit vectors away from the sensor
+    pixels: Floats  # (M, 2) the detections
+    central: bool  # whether all start at one centre, in front of which alone the camera sees
     offset: float
     slope: float
+    # Of lines that images of one cloud of points give: the same for each of its images, in which
+    # the lines of one point have the same number.
     cloud: object = None
 
     def __len__(self) -> int:
@@ -49,14 +36,11 @@ class Rays:
 
     def select(self, chosen: NDArray[Any]) -> Rays:
         """The rays of some detections."""
-        return Rays(
-            self.origins[chosen],
-            self.directions[chosen],
-            self.pixels[chosen],
-            self.central,
-            self.offset,
-            self.slope,
-            self.cloud,
+        return replace(
+            self,
+            origins=self.origins[chosen],
+            directions=self.directions[chosen],
+            pixels=self.pixels[chosen],
         )
 
 
