@@ -78,8 +78,9 @@ def _pooled(started: futures.Executor) -> Iterator[Executor]:
     try:
         yield _Pool(started)
     except BaseException:
-        # once: to shut it down again, as `with` does, would take back that the rest is cancelled
-        started.shutdown(wait=False, cancel_futures=True)
+        # once: to shut it down again, as `with` does, would take back that the rest is cancelled;
+        # those that run are waited for
+        started.shutdown(cancel_futures=True)
         raise
     started.shutdown()
 

@@ -8,6 +8,8 @@ from scipy.linalg.lapack import dposv
 from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
 
+_SMALLEST = 1e-14  # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+
 
 def inverted(information: Floats) -> Floats:
     """The inverse of an information matrix (k, k).
@@ -22,8 +24,7 @@ def inverted(information: Floats) -> Floats:
     factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
     if failure or min(factor.diagonal().tolist()) < 1e-5:
         values, vectors = np.linalg.eigh(information * both)
-        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
-        halves = vectors / np.sqrt(np.maximum(values, 1e-14))
+        halves = vectors / np.sqrt(np.maximum(values, _SMALLEST))
         inverse = halves @ halves.T
     return np.asarray(inverse * both)
 
@@ -68,7 +69,6 @@ def log_determinants(information: Floats, least: Floats) -> Floats:
     for i in np.flatnonzero(~(signs > 0)).tolist():
         size = information[i].diagonal()
         values = np.linalg.eigvalsh(information[i] / np.sqrt(np.outer(size, size)))
-        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
-        bounded = np.where(values > 1e-14, values, (least[i] / size).min())
+        bounded = np.where(values > _SMALLEST, values, (least[i] / size).min())
         logs[i] = np.log(size).sum() + np.log(bounded).sum()
     return np.asarray(logs)
