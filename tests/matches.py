@@ -77,7 +77,7 @@ def matches_of(*sensors: Seen) -> Matches:
         finest=of_each("finest"),
         extra=np.zeros(arrays["weights"].shape),
         radii=np.zeros(arrays["weights"].shape),
-        sized=np.zeros(len(sensors), np.bool_),
+        cut=np.full((*arrays["weights"].shape, 2), np.nan),
     )
 
 

@@ -80,7 +80,7 @@ def test_a_spot_is_taken_to_be_off_by_as_much_as_its_area_says(
     found = weighed_by_size(views, BODY, TRUTH, known, RULES)
     pattern = found[0].observation.pattern
     assert isinstance(pattern, PointPattern)
-    assert pattern.is_sized
+    assert pattern.cut is not None
     whole = np.delete(pattern.deviations, 2)
     assert whole.max() < NOISE
     before = views[0].observation.pattern
@@ -132,7 +132,7 @@ def test_a_frame_by_itself_learns_the_size_from_its_pose(
     tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH, rules=exact)
     data = tracker.data(tracker.begin(), 0, None, views)
     best = tracker.explain(data)[0]
-    assert best.used.sized.all()
+    assert np.isfinite(best.used.cut).all()
     deviation = np.sqrt(best.used.extra[0, 1]) * best.used.sigmas[0]
     known = sizes_after(Sizes(), best, RULES)
     assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)

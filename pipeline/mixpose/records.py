@@ -36,8 +36,8 @@ class PointPattern:
     deviations: Floats = field(default_factory=lambda: np.zeros(()))
     # (M,) of a disk of as much area as is seen of each, sensor units; 0 where that is not known
     radii: Floats = field(default_factory=lambda: np.zeros(()))
-    # whether deviations are those of spots that have not the size of a marker
-    is_sized: bool = False
+    # (M, 2) chance that each is cut or merged unseen, and what it errs by then, sensor units
+    cut: Floats | None = None
 
     is_even: bool = field(init=False, default=True)  # whether none errs by more than others
 
@@ -60,7 +60,8 @@ class PointPattern:
         """Some of the points (M,)."""
         fields = self.points, self.weights, self.deviations, self.radii
         points, weights, deviations, radii = [one[chosen] for one in fields]
-        return PointPattern(points, weights, deviations, radii, self.is_sized)
+        cut = None if self.cut is None else self.cut[chosen]
+        return PointPattern(points, weights, deviations, radii, cut)
 
     def weighed(self, deviation: float) -> PointPattern:
         """With weights as exact as detections are beside those that err by a deviation."""

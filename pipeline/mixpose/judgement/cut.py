@@ -49,10 +49,14 @@ def with_cut_spots(
     M = 1 / np.maximum(1 - values, 1e-9)
     G, r = axes @ G, (axes @ r[..., None])[..., 0]
     m, s2 = found.dimensions[met[0]], variances[met]
-    v = np.maximum(np.array([*np.square(errors.cuts), 1e9])[:, None] / s2, 1.0)
-    # a little or much; what is somebody else's may be anywhere
-    given = np.array([[*errors.chances, 0.0], [*errors.sized, 0.0]])[found.sized.astype(np.intp)]
-    prior = np.where(v > 1, given[met[0]].T, 0.0)
+    # a little or much, or as its size tells; what is somebody else's may be anywhere
+    own, is_sized = found.cut[met], np.isfinite(found.cut[met][:, 0])
+    wide = np.where(is_sized, own[:, 1], np.square(errors.cuts)[:, None])
+    v = np.maximum(np.vstack([wide, np.full(len(own), 1e9)]) / s2, 1.0)
+    # of those whose sizes tell it is one case
+    one = np.eye(len(errors.cuts))[:, :1] * own[:, 0]
+    given = np.where(is_sized, one, np.array(errors.chances)[:, None])
+    prior = np.where(v > 1, np.vstack([given, np.zeros(len(own))]), 0.0)
     prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1]) ** (m / 2)
     P = M + (v - 1)[..., None]
     shares = (v - 1)[..., None] / P

@@ -73,11 +73,11 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    extra, radii = _looks(views, by, partner, rules.middle)
+    extra, radii, cut = _looks(views, by, partner, rules.middle)
     return Matches(
         extra=extra,
         radii=radii,
-        sized=np.array([getattr(view.observation.pattern, "is_sized", False) for view in views]),
+        cut=cut,
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,
@@ -120,9 +120,10 @@ def _detections(views: Sequence[View]) -> Floats:
 
 def _looks(
     views: Sequence[View], by: Indices, partner: Indices, middle: float
-) -> tuple[Floats, Floats]:
-    """Variances (L, n) of what meets features beyond noise, σ_ε², and radii, sensor units."""
+) -> tuple[Floats, Floats, Floats]:
+    """Variances (L, n) of what meets features beyond noise, σ_ε², radii, sensor units, and `cut`."""
     extra, radii = np.where(partner >= 0, middle**2, 0.0), np.zeros(by.shape)
+    cut = np.full((*by.shape, 2), np.nan)
     for k, view in enumerate(views):
         pattern = view.observation.pattern
         if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
@@ -132,7 +133,10 @@ def _looks(
         deviations = pattern.deviations[by[k, single]] / view.observation.sigma
         extra[k, single] = deviations * deviations
         radii[k, single] = pattern.radii[by[k, single]]
-    return extra, radii
+        if pattern.cut is not None:
+            chances, errors = pattern.cut[by[k, single]].T
+            cut[k, single] = np.stack([chances, np.square(errors / view.observation.sigma)], axis=1)
+    return extra, radii, cut
 
 
 def _to_nearest(

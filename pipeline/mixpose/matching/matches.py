@@ -51,7 +51,9 @@ class Matches:
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
     extra: Floats  # (..., L, N) variances of what meets them beyond the noise, σ_ε²: of what is cut
     radii: Floats  # (..., L, N) of the spots that meet them, sensor units; 0 where nobody knows
-    sized: Mask  # (..., L) whether its spots show by their size how far they are cut
+    # (..., L, N, 2) chances that these are cut or merged unseen, and variances then, σ_ε²; NaN where
+    # their sizes do not tell
+    cut: Floats
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
     parts: Floats | float = 1.0  # (L,) that a coordinate counts: 1/2 where two images show it
 
@@ -178,11 +180,6 @@ class ErrorRules:
     chances: tuple[float, float, float] = constant(
         (0.01, 0.0, 0.003),
         "of each: of 13,400 spots before a hand 1.0, 0.5, 0.1 % are 0.14, 0.22, 2.8 px off",
-    )
-    sized: tuple[float, float, float] = constant(
-        (0.006, 0.002, 0.0),
-        "of each by their sizes: of 12,100 spots 1.6, 0.6, 0.2, 0.05 % are 0.1, 0.15, 0.3, 0.5 px "
-        "off, and none 1 px",
     )
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 

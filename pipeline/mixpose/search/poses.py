@@ -171,7 +171,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         detections=by,
         explained=nothing,
         unseen=np.count_nonzero(faced & ~seen, axis=2),
-        sized=nothing > 0,
+        cut=np.full((*seen.shape, 2), np.nan),
         merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
         crowd=crowd,

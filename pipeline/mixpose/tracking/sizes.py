@@ -86,12 +86,14 @@ def weighed_by_size(
         scales = _scales(at.J[k, 0, seen])[away.argmin(axis=1)]
         logs = np.log(pattern.radii / scales)
         whole = scales * np.exp(sizes.mean)
-        smaller = np.exp(-2 * np.abs(logs - sizes.mean))
-        moved = np.maximum(pattern.radii, whole) * (1 - smaller)
+        smaller = np.exp(-2 * np.hypot(logs - sizes.mean, sizes.scatter(rules)))
+        # of each of two coordinates
+        moved = np.maximum(pattern.radii, whole) * (1 - smaller) / np.sqrt(2)
         # what is likely whole is not made less exact by a little
-        is_cut = sizes.cut(logs, rules) > 0.5
-        own = np.where(is_cut, moved / np.sqrt(2), 0.0)  # of each of two coordinates
-        known = replace(pattern, deviations=np.maximum(pattern.deviations, own), is_sized=True)
+        chances = sizes.cut(logs, rules)
+        own = np.where(chances > 0.5, moved, 0.0)
+        cut = np.stack([chances, moved], axis=1)
+        known = replace(pattern, deviations=np.maximum(pattern.deviations, own), cut=cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
 
