@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.extraction import METHODS, ExtractOptions, check_options, extract
-from mixpose.extraction.threshold import RULES
-from mixpose.records import GridPattern, PointPattern
+from mixpose.extraction import METHODS, ExtractOptions, check_options, extract, extract_together
+from mixpose.extraction.threshold import RULES, Window
+from mixpose.records import GridPattern, Image, PointPattern
 
 GRADIENT = np.arange(48, dtype=np.uint8).reshape(6, 8)
 
@@ -169,7 +169,7 @@ def test_function_may_return_patterns(tmp_path: Path) -> None:
     write_module(
         tmp_path,
         "patterns",
-        "import numpy as np\nfrom mixpose.records import GridPattern, PointPattern\n"
+        "import numpy as np\nfrom mixpose.records import GridPattern, Image, PointPattern\n"
         "def points(image, options):\n"
         "    return PointPattern(np.array([[1.0, 2.0]]), np.array([3.0]))\n"
         "def grid(image, options):\n"
@@ -231,3 +231,31 @@ def test_function_of_an_installed_module_needs_no_folder() -> None:
     with pytest.raises(SessionError, match="json:dumps"):
         extract(GRADIENT, ExtractOptions(method="json:dumps"))
     check_options(ExtractOptions(method="json:dumps"))
+
+
+# Several images
+
+
+def test_images_that_are_looked_at_together_hold_what_each_holds_alone() -> None:
+    disks = np.random.default_rng(1).integers(19, 22, (160, 200), dtype=np.uint8)
+    yy, xx = np.mgrid[:160, :200]
+    for u, v, radius in ((40.3, 50.7, 12), (120.6, 80.2, 15), (60.1, 120.4, 9)):
+        disks[(xx - u) ** 2 + (yy - v) ** 2 < radius**2] = 180
+    dark = np.asarray(255 - disks[::-1], dtype=np.uint8)
+    asked: list[tuple[Image, ExtractOptions, Window | None]] = [
+        (disks, ExtractOptions(), None),
+        (lit_square(), ExtractOptions(method="intensity"), (50, 30, 90, 60)),
+        (dark, ExtractOptions(polarity="dark", max_area=500.0), None),
+        (disks, ExtractOptions(), (300, 0, 400, 100)),  # outside
+        (disks, ExtractOptions(), (80, 40, 200, 160)),
+    ]
+    for (image, options, window), found in zip(asked, extract_together(asked), strict=True):
+        alone = extract(image, options, window=window)
+        if isinstance(found, PointPattern):
+            assert isinstance(alone, PointPattern)
+            assert len(found.points) == len(alone.points)
+            # images are looked up in one piece, at places in single precision
+            np.testing.assert_allclose(found.points, alone.points, atol=1e-3)
+        else:
+            assert isinstance(alone, GridPattern)
+            np.testing.assert_array_equal(found.values, alone.values)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import mixpose
 from mixpose import runner
-from mixpose.extraction import ExtractOptions, extract
+from mixpose.extraction import extract, extract_together
 from mixpose.frames import Source
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, PointPattern, RawFrame
@@ -76,11 +76,11 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The windows of all extractions, None for a whole frame."""
     used: list[Any] = []
 
-    def recorded(image: Any, options: ExtractOptions, *, window: Any = None, **others: Any) -> Any:
-        used.append(window)
-        return extract(image, options, window=window, **others)
+    def recorded(images: Any, **others: Any) -> Any:
+        used.extend(window for _, _, window in images)
+        return extract_together(images, **others)
 
-    monkeypatch.setattr(runner, "extract", recorded)
+    monkeypatch.setattr(runner, "extract_together", recorded)
     return used
 
 

@@ -8,13 +8,13 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
 from mixpose.density import Observation
 from mixpose.errors import SessionError
-from mixpose.extraction import Window, extract
+from mixpose.extraction import Window, extract_together
 from mixpose.frames import SensorKind, Source, SourceSpec, open_source, pair, paired_by_stamp
 from mixpose.limits import MOST_DETECTIONS
 from mixpose.objective import View
@@ -274,16 +274,18 @@ def observe(
     session: Session, frame_set: FrameSet, windows: Mapping[str, Window] | None = None
 ) -> list[View]:
     """Extract the features of every sensor that has a frame, of some in a window only."""
+    there = [
+        (setup, frame_set.frames[setup.name], (windows or {}).get(setup.name))
+        for setup in session.sensors
+        if setup.name in frame_set.frames
+    ]
     views = []
-    for setup in session.sensors:
-        frame = frame_set.frames.get(setup.name)
-        if frame is not None:
-            observation = observation_of(session, setup, frame, (windows or {}).get(setup.name))
-            view = _view(setup, observation, frame_set, frame)
-            if isinstance(setup.sensor, CloudSensor):
-                views += plane_views(view.name, setup.sensor, observation, view.delay)
-            else:
-                views.append(view)
+    for (setup, frame, _), observation in zip(there, _observations(session, there), strict=True):
+        view = _view(setup, observation, frame_set, frame)
+        if isinstance(setup.sensor, CloudSensor):
+            views += plane_views(view.name, setup.sensor, observation, view.delay)
+        else:
+            views.append(view)
     return views
 
 
@@ -314,28 +316,36 @@ def _view(
     )
 
 
-def observation_of(
-    session: Session, setup: SensorSetup, frame: RawFrame, window: Window | None = None
-) -> Observation:
+def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
     """The feature pattern of one sensor's frame, with the width of its features."""
-    options = setup.extract
-    pattern: Pattern
-    if isinstance(frame.data, PointPattern):
-        return Observation(frame.data, options.sigma)
-    if isinstance(frame.data, GridPattern):
-        # noise may take a profile below zero; cutting that off would leave a floor of noise
-        pattern = frame.data
-    else:
-        _refuse_code(session, options.method)
-        pattern = extract(frame.data, options, window=window, base=session.folder)
-        if isinstance(pattern, PointPattern) and len(pattern.points) > MOST_DETECTIONS:
+    return _observations(session, [(setup, frame, None)])[0]
+
+
+def _observations(
+    session: Session, there: Sequence[tuple[SensorSetup, RawFrame, Window | None]]
+) -> list[Observation]:
+    """The same of several sensors, of some in a window only; images are looked at together."""
+    images = {}
+    for k, (setup, frame, window) in enumerate(there):
+        if isinstance(frame.data, np.ndarray):
+            _refuse_code(session, setup.extract.method)
+            images[k] = frame.data, setup.extract, window
+    extracted = extract_together(list(images.values()), base=session.folder)
+    patterns = dict(zip(images, extracted, strict=True))
+    observations = []
+    for k, (setup, frame, _) in enumerate(there):
+        options, pattern = setup.extract, patterns.get(k, cast("Pattern", frame.data))
+        if isinstance(pattern, GridPattern):
+            # noise may take a profile below zero; cutting that off would leave a floor of noise
+            width = float(np.hypot(options.sigma, options.spot_sigma))
+            observations.append(Observation(pattern, width, intrinsic=options.spot_sigma))
+        elif k in patterns and len(pattern.points) > MOST_DETECTIONS:
             # flooded with light or noise: nothing in it can be told from anything
             empty = PointPattern(pattern.points[:0], pattern.weights[:0])
-            return Observation(empty, options.sigma, passed_over=pattern.size)
-    if isinstance(pattern, PointPattern):
-        return Observation(pattern, options.sigma)
-    width = float(np.hypot(options.sigma, options.spot_sigma))
-    return Observation(pattern, width, intrinsic=options.spot_sigma)
+            observations.append(Observation(empty, options.sigma, passed_over=pattern.size))
+        else:
+            observations.append(Observation(pattern, options.sigma))
+    return observations
 
 
 def _refuse_code(session: Session, method: str) -> None:

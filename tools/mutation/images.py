@@ -103,8 +103,8 @@ _SHAPES = (
     Mutant(
         "extraction-min-area-ignored",
         "extraction/blobs.py",
-        "for contour, area in both if area >= min_area]",
-        "for contour, area in both]",
+        "for one, area in both if area >= min_area]",
+        "for one, area in both]",
         "specks count as features",
         (_BLOBS,),
     ),

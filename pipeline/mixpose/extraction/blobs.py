@@ -17,6 +17,7 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import cv2
 import numpy as np
@@ -91,11 +92,24 @@ def extract_blobs(
 
     In pixels of the whole image, each of weight 1.
     """
-    blobs = find_blobs(foreground(image, options, window, rules.threshold), options, rules)
-    points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
-    radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
-    weights = np.ones(len(points))
-    return PointPattern(points + window[:2], weights, deviations_of(blobs, rules), radii)
+    return extract_all([(image, options, window)], rules)[0]
+
+
+def extract_all(
+    images: Sequence[tuple[Image, ExtractOptions, Window]], rules: BlobRules = BlobRules()
+) -> list[PointPattern]:
+    """The same of several images: it is the number of calls that takes time, not that of blobs."""
+    scenes = [
+        (foreground(image, options, window, rules.threshold), options)
+        for image, options, window in images
+    ]
+    patterns = []
+    for blobs, (_, _, window) in zip(find_blobs(scenes, rules), images, strict=True):
+        points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
+        radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
+        deviations = deviations_of(blobs, rules)
+        patterns.append(PointPattern(points + window[:2], np.ones(len(points)), deviations, radii))
+    return patterns
 
 
 def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floats:
@@ -125,9 +139,11 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
 class Part:
     """What is connected above a level, and what is found of it."""
 
+    scene: Foreground
     contour: Contour
     area: float  # number of pixels that it encloses
     level: float
+    min_area: float  # of what is looked for in it
     # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
     # Itself, where it is large and no disk: taken where nothing is inside of it.
@@ -137,32 +153,39 @@ class Part:
 
 
 def find_blobs(
-    scene: Foreground, options: ExtractOptions, rules: BlobRules = BlobRules()
-) -> list[Blob]:
-    """The blobs of a foreground; limits of their area are those of the options, holes filled.
+    scenes: Sequence[tuple[Foreground, ExtractOptions]], rules: BlobRules = BlobRules()
+) -> list[list[Blob]]:
+    """The blobs of foregrounds; limits of their area are those of the options, holes filled.
 
     What has no shape is taken apart at all higher levels first: then all rims are looked at
     together, and all spots.
     """
-    parts = _parts(outlines(scene), scene.level, options.min_area)
-    shapeless = _without_disks(scene, parts, rules)
+    found = [
+        _parts(scene, outlines(scene), scene.level, options.min_area) for scene, options in scenes
+    ]
+    shapeless = _without_disks(list(chain(*found)), rules)
     for part in shapeless:
-        _take_apart(scene, part, options.min_area, rules, islands=True)
-    below = list(_below(shapeless))
-    _without_disks(scene, below, rules)
-    _find_spots(scene, [*parts, *below], rules)
-    largest = math.inf if options.max_area is None else options.max_area
-    blobs = _outside_disks(_blobs_of(scene, parts, rules))
-    return [blob for blob in blobs if blob.area <= largest]
+        _take_apart(part, rules, islands=True)
+    below = [list(_below(parts)) for parts in found]
+    _without_disks(list(chain(*below)), rules)
+    blobs = []
+    for (scene, options), parts, others in zip(scenes, found, below, strict=True):
+        _find_spots(scene, parts + others, rules)
+        largest = math.inf if options.max_area is None else options.max_area
+        all_of_it = _outside_disks(_blobs_of(parts, rules))
+        blobs.append([blob for blob in all_of_it if blob.area <= largest])
+    return blobs
 
 
-def _parts(contours: Sequence[Contour], level: float, min_area: float) -> list[Part]:
+def _parts(
+    scene: Foreground, contours: Sequence[Contour], level: float, min_area: float
+) -> list[Part]:
     """Those of the contours that are large enough."""
     # A contour of n pixels encloses less than n² of them: noise is soon done with.
     some = [contour for contour in contours if len(contour) ** 2 >= min_area]
     areas = [filled_area(contour) for contour in some]
     both = zip(some, areas, strict=True)
-    return [Part(contour, area, level) for contour, area in both if area >= min_area]
+    return [Part(scene, one, area, level, min_area) for one, area in both if area >= min_area]
 
 
 def _below(parts: Sequence[Part]) -> Iterator[Part]:
@@ -173,10 +196,10 @@ def _below(parts: Sequence[Part]) -> Iterator[Part]:
             yield from _below(layer)
 
 
-def _without_disks(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> list[Part]:
+def _without_disks(parts: Sequence[Part], rules: BlobRules) -> list[Part]:
     """The large ones that are no disks; the others know their disk."""
     large = [part for part in parts if part.area > rules.small_area]
-    disks = _disks(scene, [part.contour for part in large], rules)
+    disks = _disks([(part.scene, part.contour) for part in large], rules)
     for part, disk in zip(large, disks, strict=True):
         part.found = [disk] if disk else []
     return [part for part in large if not part.found]
@@ -192,28 +215,33 @@ def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> N
         part.found = [Blob(u, v, part.area / len(spots), length) for u, v in spots]
 
 
-def _blobs_of(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
+def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
     """What is found of parts that are beside each other, and of what they came apart into."""
     blobs = [blob for part in parts for blob in part.found]
     shapeless = [part for part in parts if part.area > rules.small_area and not part.found]
     for group in neighbours([part.contour for part in shapeless], rules.contours):
-        joined = [np.concatenate([shapeless[k].contour for k in group])] if len(group) > 1 else []
-        rims = [disk for disk in _disks(scene, joined, rules) if disk]
+        some = [shapeless[k] for k in group]
+        joined = [(some[0].scene, np.concatenate([part.contour for part in some]))]
+        rims = [disk for disk in _disks(joined[: len(some) - 1], rules) if disk]
         blobs += rims
-        for part in [shapeless[k] for k in group if not rims]:
-            inner = [blob for layer in part.inner for blob in _blobs_of(scene, layer, rules)]
-            blobs += _blobs_of(scene, part.beside, rules) + (inner or part.whole)
+        for part in some if not rims else []:
+            inner = [blob for layer in part.inner for blob in _blobs_of(layer, rules)]
+            blobs += _blobs_of(part.beside, rules) + (inner or part.whole)
     return blobs
 
 
-def _disks(scene: Foreground, contours: Sequence[Contour], rules: BlobRules) -> list[Blob | None]:
+def _disks(outlined: Sequence[tuple[Foreground, Contour]], rules: BlobRules) -> list[Blob | None]:
     """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
-    rims = find_rims(scene.grey, contours, scene.level, rules.rims)
+    if not outlined:
+        return []
+    scenes, contours = zip(*outlined, strict=True)
+    levels = np.array([scene.level for scene in scenes])
+    rims = find_rims([scene.grey for scene in scenes], contours, levels, rules.rims)
     return [
         Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse.length, rim)
         if rim is not None and _is_disk(scene, contour, rim, rules)
         else None
-        for contour, rim in zip(contours, rims, strict=True)
+        for (scene, contour), rim in zip(outlined, rims, strict=True)
     ]
 
 
@@ -223,18 +251,21 @@ def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) ->
         return False
     if not scene.judged:
         return True
-    patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
+    # mostly the brightest pixel tells, which is quicker than the median
+    u, v, width, height = box = cv2.boundingRect(contour)
+    highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
+    if rim.contrast >= rules.spots.min_step * (highest - scene.zero):
+        return True
+    patch, inside, _ = cut_out(scene, contour, box, 0)
     return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)
 
 
-def _take_apart(
-    scene: Foreground, part: Part, min_area: float, rules: BlobRules, *, islands: bool = False
-) -> None:
+def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
     """Find what a large part without an elliptical rim is: compact, or others inside of it.
 
     With `islands`, what is in its holes is yet to be looked for.
     """
-    contour, level = part.contour, part.level
+    scene, contour, level = part.scene, part.contour, part.level
     box = cv2.boundingRect(contour)
     patch, inside, corner = cut_out(scene, contour, box, 0)
     if scene.judged and cv2.minMaxLoc(patch, inside)[1] < scene.least_peak:
@@ -244,7 +275,8 @@ def _take_apart(
     first = contour[0, 0] - corner
     cv2.floodFill(inside, None, first.tolist(), 2, flags=8)
     if islands:
-        part.beside = _parts(pieces((inside == 1).view(np.uint8), corner), level, min_area)
+        found = pieces((inside == 1).view(np.uint8), corner)
+        part.beside = _parts(scene, found, level, part.min_area)
     inside >>= 1
     peak, typical = cv2.minMaxLoc(patch, inside)[1], 0.0
     if scene.judged and is_solid(contour, rules.solidity):
@@ -261,10 +293,12 @@ def _take_apart(
         clear = stands_out and peak < rules.core_ratio * typical
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]
-        part.inner = [_parts(pieces(mask, corner), lvl, min_area) for mask, lvl in apart]
+        part.inner = [
+            _parts(scene, pieces(mask, corner), lvl, part.min_area) for mask, lvl in apart
+        ]
     for one in [one for layer in (part.beside, *part.inner) for one in layer]:
         if one.area > rules.small_area:
-            _take_apart(scene, one, min_area, rules)
+            _take_apart(one, rules)
 
 
 def _hull_blob(contour: Contour) -> Blob:
@@ -277,7 +311,12 @@ def _hull_blob(contour: Contour) -> Blob:
 def _brightness(scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]) -> float:
     """Median of what is above the detection level within a contour."""
     values = patch[(inside > 0) & (patch > scene.level)]
-    return float(np.median(values)) if values.size else 0.0
+    if not values.size:
+        return 0.0
+    # as `np.median`, in a tenth of its time
+    middle = [(values.size - 1) // 2, values.size // 2]
+    values.partition(middle)
+    return float(values[middle].sum() / 2)
 
 
 def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:

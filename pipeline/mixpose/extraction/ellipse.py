@@ -90,18 +90,16 @@ class Rim:
 
 
 def find_rims(
-    signal: Grey,
+    signals: Sequence[Grey],
     outlines: Sequence[Contour],
-    least_contrast: float,
+    least_contrasts: Floats,
     rules: EllipseRules = EllipseRules(),
 ) -> list[Rim | None]:
-    """The elliptical rims of bright features, by outlines in pixels of the signal (H, W).
+    """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
 
-    An edge is a step of at least `least_contrast`.  None where nothing like an ellipse is found.
+    An edge is a step of at least `least_contrasts` (B,).  None where nothing is like an ellipse.
     """
     rims: list[Rim | None] = [None] * len(outlines)
-    if not outlines:
-        return rims
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
@@ -112,7 +110,8 @@ def find_rims(
         some, sound = ellipses.select(ellipses.sound), found[ellipses.sound]
         if not sound.size:
             return rims
-        ellipses, edges = _rims_near(signal, some, least_contrast, least, rules)
+        of_sound = [signals[k] for k in sound.tolist()]
+        ellipses, edges = _rims_near(of_sound, some, least_contrasts[sound], least, rules)
         found = sound
     for k, i in enumerate(found.tolist()):
         if ellipses.sound[k]:
@@ -131,13 +130,17 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signal: Grey, ellipses: Ellipses, least_contrast: float, least: float, rules: EllipseRules
+    signals: Sequence[Grey],
+    ellipses: Ellipses,
+    least_contrasts: Floats,
+    least: float,
+    rules: EllipseRules,
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each.
 
     Those that have edges in less than a share `least` of the directions are not fitted.
     """
-    edges, found, steps, lows = _edges(signal, ellipses, least_contrast, rules)
+    edges, found, steps, lows = _edges(signals, ellipses, least_contrasts, rules)
     found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
@@ -240,7 +243,7 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
+    signals: Sequence[Grey], ellipses: Ellipses, least_contrasts: Floats, rules: EllipseRules
 ) -> tuple[Floats, Mask, Floats, Floats]:
     """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
 
@@ -263,10 +266,11 @@ def _edges(
             (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
             for k in (0, 1)
         )
-        profiles = sample_each(signal, u, v)
+        profiles = sample_each([signals[k] for k in some.tolist()], u, v)
         step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
-        sure = (step >= least_contrast) & below & (np.abs(place) <= whole)
         shape = (len(some), DIRECTIONS)
+        sure = step >= np.repeat(least_contrasts[some], DIRECTIONS).astype(np.float32)
+        sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
     return on_rim + normals * where[..., None], found > 0, steps, lows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -38,30 +39,33 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
     return cv2.remap(patch, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def sample_each(grey: Grey, u: Floats, v: Floats) -> NDArray[np.float32]:
-    """As `sample`, at u and v (B, n) of B features, of each near each other.
+def sample_each(greys: Sequence[Grey], u: Floats, v: Floats) -> NDArray[np.float32]:
+    """As `sample`, at u and v (B, n) of B features, of each near each other, in an image for each.
 
     Only what is around each feature is turned into single precision, not all between them.
     """
-    across, left, columns = _part(u, grey.shape[1])
-    down, top, rows = _part(v, grey.shape[0])
+    heights, widths = np.array([grey.shape for grey in greys]).T
+    across, left, columns = _part(u, widths)
+    down, top, rows = _part(v, heights)
     most = max(MOST_ROWS // rows, 1)
     samples = np.empty(u.shape, np.float32)
     for first in range(0, len(u), most):
         some = slice(first, first + most)
-        corners = list(zip(left[some].tolist(), top[some].tolist(), strict=True))
-        parts = np.zeros((len(corners), rows, columns), np.float32)
-        for part, (u0, v0) in zip(parts, corners, strict=True):
+        corners = zip(greys[some], left[some].tolist(), top[some].tolist(), strict=True)
+        parts = np.zeros((len(u[some]), rows, columns), np.float32)
+        for part, (grey, u0, v0) in zip(parts, corners, strict=True):
             patch = grey[v0 : v0 + rows, u0 : u0 + columns]
             part[: patch.shape[0], : patch.shape[1]] = patch
-        below = (np.arange(len(corners), dtype=np.float32) * rows)[:, None]
+        below = (np.arange(len(parts), dtype=np.float32) * rows)[:, None]
         samples[some] = _remap(parts.reshape(-1, columns), across[some], down[some] + below)
     return samples
 
 
-def _part(places: Floats, size: int) -> tuple[NDArray[np.float32], NDArray[np.intp], int]:
-    """Places (B, n) within a part of one side of an image, where it begins, and its length."""
-    inside = np.minimum(np.maximum(places, 0), size - 1)
+def _part(
+    places: Floats, sizes: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.intp], int]:
+    """Places (B, n) within a part of one side (B,) of images, where it begins, and its length."""
+    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1)
     first = inside.min(axis=1).astype(np.intp)
     # the last pixel's neighbour is not looked at, but has to be there
     length = int((inside.max(axis=1) - first).max()) + 2

@@ -228,7 +228,7 @@ def _about_extra(finding: Finding, expected: Expectation, light: _Light) -> list
     if finding.points is None or not expected.unexplained.any():
         return []
     sizes, peaks = [], []
-    for blob in find_blobs(light.scene, light.options):
+    for blob in find_blobs([(light.scene, light.options)])[0]:
         place, radius = np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi)
         sizes.append(blob.area)
         peaks.append(float(light.raw[_around(place, radius, light.raw.shape)].max()))
