@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import cv2
@@ -40,6 +40,7 @@ from mixpose.extraction.contours import (
 )
 from mixpose.extraction.ellipse import EllipseRules, Rim, find_rims, is_waisted
 from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.shape import off_centre
 from mixpose.extraction.single_spots import all_spots
 from mixpose.extraction.spots import SpotRules, come_apart
 from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
@@ -72,6 +73,8 @@ class BlobRules:
     exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
     rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
     off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
+    beside: float = constant(2.0, "px outside of a rim that its grey values reach: optics blur it")
+    usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 5 %")
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ class Blob:
     area: float
     length: float = 1.0  # by width
     rim: Rim | None = None
+    off: float | None = None  # px by which its centre may be off, where its grey values tell
 
 
 def extract_blobs(
@@ -117,8 +121,11 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
 
     A disk of which something is hidden, or that is merged with something, is longer than wide by as
     much as its centre is off, in radii.  So are oblique ones, but all alike, and with all of a rim.
+    What little is hidden shows in grey values, beyond what noise makes.
     """
     deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
+    told = sorted([blob.off for blob in blobs if blob.off is not None])
+    usual = rules.usual * told[(len(told) - 1) // 4] if told else 0.0
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
     typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
     for k, blob in enumerate(blobs):
@@ -129,9 +136,12 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
             rim.coverage < rules.whole or rim.residual > rules.exact * residual
         ):
             longer = blob.length / typical[0] - 1
-        else:
+            deviations[k] = rules.off_centre * radius * max(longer, 0.0)
             continue
-        deviations[k] = rules.off_centre * radius * max(longer, 0.0)
+        else:
+            longer = 0.0
+        beyond = math.sqrt(max((blob.off or 0.0) ** 2 - usual**2, 0.0))
+        deviations[k] = max(rules.off_centre * radius * longer, beyond)
     return deviations
 
 
@@ -212,7 +222,7 @@ def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> N
     found = all_spots(scene, contours, areas, levels, rules.spots)
     for part, spots in zip(small, found, strict=True):
         length = length_by_width(part.contour) if len(spots) == 1 else 1.0
-        part.found = [Blob(u, v, part.area / len(spots), length) for u, v in spots]
+        part.found = [Blob(u, v, part.area / len(spots), length, off=off) for u, v, off in spots]
 
 
 def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
@@ -237,12 +247,24 @@ def _disks(outlined: Sequence[tuple[Foreground, Contour]], rules: BlobRules) -> 
     scenes, contours = zip(*outlined, strict=True)
     levels = np.array([scene.level for scene in scenes])
     rims = find_rims([scene.grey for scene in scenes], contours, levels, rules.rims)
-    return [
+    disks = [
         Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse.length, rim)
         if rim is not None and _is_disk(scene, contour, rim, rules)
         else None
         for (scene, contour), rim in zip(outlined, rims, strict=True)
     ]
+    # a larger one is told by its rim
+    some = [
+        (k, scenes[k], disk.rim.ellipse)
+        for k, disk in enumerate(disks)
+        if disk and disk.rim and disk.area < math.pi * rules.large**2
+    ]
+    if some:
+        given = [(scene, ellipse) for _, scene, ellipse in some]
+        off = off_centre(given, rules.spots.margin, rules.spots.centroid, rules.beside).tolist()
+        for (k, *_), own in zip(some, off, strict=True):
+            disks[k] = replace(disks[k], off=own)
+    return disks
 
 
 def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) -> bool:

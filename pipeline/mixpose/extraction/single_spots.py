@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.spots import SpotRules, find_spots, is_long, monomials
+from mixpose.extraction.shape import centroids
+from mixpose.extraction.spots import SpotRules, find_spots, is_long
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats
 
 FEWEST = 3  # for which it pays
 WIDEST_PX = 15
 
-Spots = list[tuple[float, float]]
+Spots = list[tuple[float, float, float]]
 
 
 def all_spots(
@@ -36,15 +37,14 @@ def all_spots(
     bright, usual = _bright(scene, contours, levels, rules)
     if len(usual) >= FEWEST and float(levels.min()) > 0:
         own, boxes = (np.array(one) for one in zip(*usual, strict=True))
-        centres, sure, clear = _together(scene, boxes, areas[own], levels[own], rules)
-        for k, centre, stands_out in zip(
-            own[sure].tolist(), centres[sure].tolist(), clear[sure].tolist(), strict=True
-        ):
+        centres, off, sure, clear = _together(scene, boxes, areas[own], levels[own], rules)
+        told = (one[sure].tolist() for one in (own, centres, off, clear))
+        for k, centre, apart, stands_out in zip(*told, strict=True):
             if not stands_out:
                 bright.remove(k)
             elif not (scene.judged and is_long(contours[k], rules)):
                 bright.remove(k)
-                found[k] = [(centre[0], centre[1])]
+                found[k] = [(centre[0], centre[1], apart)]
     for k in bright:
         found[k] = find_spots(scene, contours[k], areas[k], float(levels[k]), rules)
     return found
@@ -75,8 +75,8 @@ def _bright(
 
 def _together(
     scene: Foreground, boxes: NDArray[np.intp], areas: Floats, levels: Floats, rules: SpotRules
-) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Centres (K, 2), which of them need no mask, and which of them stand out."""
+) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Centres (K, 2), how far they may be off, which need no mask, and which stand out."""
     first_u, first_v = (boxes[:, :2] - rules.margin).T
     width, height = (boxes[:, 2:] + 2 * rules.margin).T
     each = np.arange(len(boxes))
@@ -102,7 +102,6 @@ def _together(
     base = np.minimum(base, levels)
     cut = np.maximum(levels, base + rules.centroid * (peak - base)).astype(np.float32)
     weights = np.maximum(signal - cut[:, None, None], 0)
-    moments = weights.reshape(len(boxes), -1) @ monomials(side.size, side.size).T
-    total = moments[:, 0]
-    centres = moments[:, 1:] / np.where(total > 0, total, 1.0)[:, None]
-    return centres + np.stack([first_u, first_v], axis=1), alone & (total > 0), bright
+    centres, off = centroids(weights)
+    alone &= np.isfinite(off)
+    return centres + np.stack([first_u, first_v], axis=1), off, alone, bright

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import cast
 
 import cv2
 import numpy as np
@@ -12,11 +10,8 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.contours import Contour, filled, on_border, signal_about
+from mixpose.extraction.shape import background, centroids
 from mixpose.extraction.threshold import Foreground, above
-from mixpose.records import Floats
-
-# Patches of so many shapes are prepared for.
-SHAPES = 256
 
 
 @dataclass(frozen=True)
@@ -48,8 +43,10 @@ def find_spots(
     area: float,
     level: float,
     rules: SpotRules = SpotRules(),
-) -> list[tuple[float, float]]:
+) -> list[tuple[float, float, float]]:
     """Centre (u, v) of a small blob, px of the window, or the centres of blobs that touch in it.
+
+    Each with how far it may be off.
 
     The contour encloses `area` px that are above the level.  There is none if the border of the
     window cuts the blob or it does not stand out.
@@ -61,9 +58,7 @@ def find_spots(
     if highest < scene.least_peak or on_border(scene, box):
         return []
     patch, corner = signal_about(scene, box, rules.margin)
-    frame = patch.take(_border(*patch.shape))
-    frame.partition(frame.size // 2)
-    base = float(frame[frame.size // 2])
+    base = background(patch)
     # The usual blob has the patch for itself, and nothing else there needs to be masked.
     alone = np.count_nonzero(patch > level) == area
     inside = None if alone else filled(contour, patch.shape, corner)
@@ -82,31 +77,12 @@ def find_spots(
         weights = np.maximum(patch - np.float32(cut), 0)
         if part is not None:
             weights *= part
-        if not (moments := _moments(weights))[0] > 0:
+        if not weights.any():
             # Nothing but rounding above the cut: all of its pixels alike.
-            moments = _moments(above(patch, level) if part is None else part)
-        total, by_u, by_v = moments
-        centres.append((corner[0] + by_u / total, corner[1] + by_v / total))
+            weights = above(patch, level) if part is None else part
+        (centre,), (off,) = (one.tolist() for one in centroids(weights[None]))
+        centres.append((corner[0] + centre[0], corner[1] + centre[1], off))
     return centres
-
-
-def _moments(weights: NDArray[np.float32] | NDArray[np.uint8]) -> list[float]:
-    """Sum of weights, and of weights by u and by v."""
-    return cast("list[float]", (monomials(*weights.shape) @ weights.ravel()).tolist())
-
-
-@lru_cache(maxsize=SHAPES)
-def monomials(rows: int, columns: int) -> Floats:
-    """1, u and v of every pixel of a patch (3, rows * columns)."""
-    v, u = np.indices((rows, columns), dtype=np.float64).reshape(2, -1)
-    return np.array([np.ones(u.size), u, v])
-
-
-@lru_cache(maxsize=SHAPES)
-def _border(rows: int, columns: int) -> NDArray[np.intp]:
-    """Places of the outermost pixels of a patch, corners twice."""
-    places = np.arange(rows * columns).reshape(rows, columns)
-    return np.concatenate([places[0], places[-1], places[:, 0], places[:, -1]])
 
 
 def come_apart(
