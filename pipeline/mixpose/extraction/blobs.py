@@ -107,16 +107,25 @@ def extract_all(
         (foreground(image, options, window, rules.threshold), options)
         for image, options, window in images
     ]
-    patterns = []
-    for blobs, (_, _, window) in zip(find_blobs(scenes, rules), images, strict=True):
+    patterns, found = [], find_blobs(scenes, rules)
+    usual = usually_off(list(chain(*found)))
+    for blobs, (_, _, window) in zip(found, images, strict=True):
         points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
         radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
-        deviations = deviations_of(blobs, rules)
+        deviations = deviations_of(blobs, usual, rules)
         patterns.append(PointPattern(points + window[:2], np.ones(len(points)), deviations, radii))
     return patterns
 
 
-def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floats:
+def usually_off(blobs: Sequence[Blob]) -> float:
+    """What grey values of whole blobs tell of their centres for noise, px: the lower quartile."""
+    told = sorted([blob.off for blob in blobs if blob.off is not None])
+    return told[(len(told) - 1) // 4] if told else 0.0
+
+
+def deviations_of(
+    blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRules()
+) -> Floats:
     """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
 
     A disk of which something is hidden, or that is merged with something, is longer than wide by as
@@ -124,8 +133,6 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
     What little is hidden shows in grey values, beyond what noise makes.
     """
     deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
-    told = sorted([blob.off for blob in blobs if blob.off is not None])
-    usual = rules.usual * told[(len(told) - 1) // 4] if told else 0.0
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
     typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
     for k, blob in enumerate(blobs):
@@ -140,8 +147,8 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
             continue
         else:
             longer = 0.0
-        beyond = math.sqrt(max((blob.off or 0.0) ** 2 - usual**2, 0.0))
-        deviations[k] = max(rules.off_centre * radius * longer, beyond)
+        shown = blob.off if blob.off and blob.off > rules.usual * usual else 0.0
+        deviations[k] = max(rules.off_centre * radius * longer, shown)
     return deviations
 
 
