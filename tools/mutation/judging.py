@@ -114,7 +114,7 @@ _CUT = (
     Mutant(
         "judgement-nothing-is-cut",
         "judgement/cut.py",
-        "np.where(v > 1, given[met[0]].T, 0.0)",
+        "np.where(v > 1, np.vstack([given, np.zeros(len(own))]), 0.0)",
         "np.zeros(v.shape)",
         "a pose of few spots is as sure as if none of them could be cut",
         ("test_judgement_cut.py",),

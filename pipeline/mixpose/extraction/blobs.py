@@ -74,7 +74,8 @@ class BlobRules:
     rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
     off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
     beside: float = constant(2.0, "px outside of a rim that its grey values reach: optics blur it")
-    usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 5 %")
+    usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 4 %")
+    finest: float = constant(0.01, "px, that this is at least: pixels alone make as much")
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def extract_all(
         for image, options, window in images
     ]
     patterns, found = [], find_blobs(scenes, rules)
-    usual = usually_off(list(chain(*found)))
+    usual = usually_off(list(chain(*found)), rules)
     for blobs, (_, _, window) in zip(found, images, strict=True):
         points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
         radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
@@ -117,10 +118,10 @@ def extract_all(
     return patterns
 
 
-def usually_off(blobs: Sequence[Blob]) -> float:
-    """What grey values of whole blobs tell of their centres for noise, px: the lower quartile."""
+def usually_off(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> float:
+    """By how much centres of whole blobs seem off for noise, px: the lower quartile."""
     told = sorted([blob.off for blob in blobs if blob.off is not None])
-    return told[(len(told) - 1) // 4] if told else 0.0
+    return max(told[(len(told) - 1) // 4] if told else 0.0, rules.finest)
 
 
 def deviations_of(
