@@ -191,7 +191,7 @@ def _parts(
 def _below(parts: Sequence[Part]) -> Iterator[Part]:
     """All parts that others came apart into."""
     for part in parts:
-        for layer in (part.beside, *part.inner):
+        for layer in filter(None, (part.beside, *part.inner)):
             yield from layer
             yield from _below(layer)
 

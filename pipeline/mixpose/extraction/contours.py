@@ -135,10 +135,11 @@ def neighbours(
 ) -> list[list[int]]:
     """Groups of contours, by their places, that nearly touch: perhaps parts of one broken rim."""
     groups: list[list[int]] = []
-    for k, contour in enumerate(contours):
+    boxed = [(contour, cv2.boundingRect(contour)) for contour in contours]
+    for k, one in enumerate(boxed):
         apart, together = [], [k]
         for group in groups:
-            if any(_near(contour, contours[other], rules) for other in group):
+            if any(_near(one, boxed[other], rules) for other in group):
                 together += group
             else:
                 apart.append(group)
@@ -146,10 +147,9 @@ def neighbours(
     return groups
 
 
-def _near(a: Contour, b: Contour, rules: ContourRules) -> bool:
-    """Whether the gap between two contours is small beside them."""
-    ua, va, wa, ha = cv2.boundingRect(a)
-    ub, vb, wb, hb = cv2.boundingRect(b)
+def _near(one: tuple[Contour, Box], other: tuple[Contour, Box], rules: ContourRules) -> bool:
+    """Whether the gap between two contours, with their boxes, is small beside them."""
+    (a, (ua, va, wa, ha)), (b, (ub, vb, wb, hb)) = one, other
     gap = rules.gap * min(max(wa, ha), max(wb, hb)) + rules.gap_px
     if max(ua - ub - wb, ub - ua - wa, va - vb - hb, vb - va - ha) > gap:
         return False

@@ -103,7 +103,7 @@ def find_rims(
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
-    ellipses = fit_ellipses(*_side_by_side(hulls), rules)
+    ellipses, _ = fit_ellipses(*_side_by_side(hulls), rules)
     found = np.arange(len(outlines))
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
     for least in (rules.coverage / 2, rules.coverage):
@@ -145,8 +145,7 @@ def _rims_near(
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
-    better = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
-    distance = np.abs(distances(better, edges))
+    better, distance = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
     within = tolerance(better.half_axes.min(axis=1), rules)
     on_rim = found & (distance <= within[:, None]) & better.sound[:, None]
     count = on_rim.sum(axis=1)
@@ -176,10 +175,13 @@ def tolerance(minor: Any, rules: EllipseRules) -> Any:
     return np.maximum(rules.tolerance, np.maximum(np.minimum(0.1 * minor, 1.0), 0.02 * minor))
 
 
-def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules()) -> Ellipses:
+def fit_ellipses(
+    points: Floats, there: Mask, rules: EllipseRules = EllipseRules()
+) -> tuple[Ellipses, Floats]:
     """Ellipses through those of points (B, n, 2), in order along each, that are there (B, n).
 
     Some may lie elsewhere.  Sound but for less than six points, or where they are on no ellipse.
+    With the distances (B, n) of points from them.
     """
     best = fit_conics(points, there, rules.oblique)
     distance, spread = _spreads(best, points, there)
@@ -192,15 +194,20 @@ def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules
         distance, spread = _spreads(best, points, there)
     hopeless = spread > rules.spread + rules.hopeless * best.half_axes.min(axis=1)
     best = replace(best, sound=best.sound & ~hopeless)
+    rows = np.flatnonzero(best.sound)
     for _ in range(REFITS):
-        near = there & (distance <= np.maximum(rules.spread, 3.0 * spread)[:, None])
-        changed = np.flatnonzero((near != used).any(axis=1) & best.sound)
-        if not changed.size:
+        # those whose points stay the same are done
+        within = np.maximum(rules.spread, 3.0 * spread[rows])
+        near = there[rows] & (distance[rows] <= within[:, None])
+        changed = (near != used[rows]).any(axis=1)
+        rows, near = rows[changed], near[changed]
+        if not rows.size:
             break
-        refitted = fit_conics(points[changed], near[changed], rules.oblique)
-        best, used = best.replaced(changed, refitted), near
-        distance, spread = _spreads(best, points, there)
-    return best
+        refitted = fit_conics(points[rows], near, rules.oblique)
+        best, used[rows] = best.replaced(rows, refitted), near
+        distance[rows], spread[rows] = _spreads(refitted, points[rows], there[rows])
+        rows = rows[refitted.sound]
+    return best, distance
 
 
 def _spreads(ellipses: Ellipses, points: Floats, there: Mask) -> tuple[Floats, Floats]:
@@ -262,10 +269,7 @@ def _edges(
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
         offsets = np.arange(-whole - 1.5, whole + 2)
-        u, v = (
-            (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
-            for k in (0, 1)
-        )
+        u, v = (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets for k in (0, 1))
         profiles = sample_each([signals[k] for k in some.tolist()], u, v)
         step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
         shape = (len(some), DIRECTIONS)
@@ -292,7 +296,8 @@ def _fall(
     outside = column > (steepest + 1)[:, None]
     high = np.where(outside, -np.inf, profiles)
     summit = high.argmax(axis=1)
-    low = np.where(outside, profiles, np.inf).min(axis=1)
+    # of long columns, which is quicker than of short rows
+    low = np.ascontiguousarray(np.where(outside, profiles, np.inf).T).min(axis=0)
     half = (high[rows, summit] + low) / 2
     below = (column > summit[:, None]) & (profiles < half[:, None])
     after = np.maximum(below.argmax(axis=1), 1)

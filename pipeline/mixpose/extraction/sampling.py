@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -14,6 +14,9 @@ from mixpose.records import Floats
 
 # OpenCV takes maps with sides below 32767.
 MOST_ROWS = 30000
+
+# Of parts that are stacked: places in single precision are exact to 1e-4 px there.
+STACK_ROWS = 2000
 
 
 def sample(grey: Grey, places: Floats) -> Floats:
@@ -40,33 +43,50 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
 
 
 def sample_each(greys: Sequence[Grey], u: Floats, v: Floats) -> NDArray[np.float32]:
-    """As `sample`, at u and v (B, n) of B features, of each near each other, in an image for each.
+    """As `sample`, at u and v (B, n, k) of B features, along lines, in an image (H, W) for each.
 
     Only what is around each feature is turned into single precision, not all between them.
     """
     heights, widths = np.array([grey.shape for grey in greys]).T
     across, left, columns = _part(u, widths)
     down, top, rows = _part(v, heights)
-    most = max(MOST_ROWS // rows, 1)
-    samples = np.empty(u.shape, np.float32)
-    for first in range(0, len(u), most):
-        some = slice(first, first + most)
-        corners = zip(greys[some], left[some].tolist(), top[some].tolist(), strict=True)
-        parts = np.zeros((len(u[some]), rows, columns), np.float32)
-        for part, (grey, u0, v0) in zip(parts, corners, strict=True):
-            patch = grey[v0 : v0 + rows, u0 : u0 + columns]
+    samples = np.empty(across.shape, np.float32)
+    for some in _lots(rows, columns):
+        of_each = zip(np.arange(len(u))[some].tolist(), left[some].tolist(), top[some].tolist())
+        height, width = int(rows[some].max()), int(columns[some].max())
+        parts = np.zeros((len(rows[some]), height, width), np.float32)
+        for part, (k, u0, v0) in zip(parts, of_each, strict=True):
+            patch = greys[k][v0 : v0 + height, u0 : u0 + width]
             part[: patch.shape[0], : patch.shape[1]] = patch
-        below = (np.arange(len(parts), dtype=np.float32) * rows)[:, None]
-        samples[some] = _remap(parts.reshape(-1, columns), across[some], down[some] + below)
-    return samples
+        below = (np.arange(len(parts), dtype=np.float32) * height)[:, None]
+        samples[some] = _remap(parts.reshape(-1, width), across[some], down[some] + below)
+    return samples.reshape(u.shape)
+
+
+def _lots(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Iterator[slice | NDArray[np.intp]]:
+    """Which parts, of rows and columns (B,), are stacked, each as high as the highest of them."""
+    if len(rows) * rows.max() <= STACK_ROWS:
+        yield np.s_[:]
+        return
+    order = np.argsort(np.maximum(rows, columns))
+    while order.size:
+        stacked = np.maximum.accumulate(rows[order]) * np.arange(1, order.size + 1)
+        count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
+        yield order[:count]
+        order = order[count:]
 
 
 def _part(
     places: Floats, sizes: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.intp], int]:
-    """Places (B, n) within a part of one side (B,) of images, where it begins, and its length."""
-    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1)
-    first = inside.min(axis=1).astype(np.intp)
+) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
+    """Places (B, n * k) within parts of one side (B,) of images, their first pixels and lengths."""
+    # what is farthest is at the ends of lines
+    ends = places[..., [0, -1]].reshape(len(places), -1)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    if low.min() < 0 or (high > sizes - 1).any():
+        places = np.minimum(np.maximum(places, 0), sizes[:, None, None] - 1.0)
+        low, high = (np.minimum(np.maximum(end, 0), sizes - 1) for end in (low, high))
+    first = low.astype(np.intp)
+    inside = (places - first[:, None, None]).astype(np.float32).reshape(len(places), -1)
     # the last pixel's neighbour is not looked at, but has to be there
-    length = int((inside.max(axis=1) - first).max()) + 2
-    return (inside - first[:, None]).astype(np.float32), first, length
+    return inside, first, (high - first).astype(np.intp) + 2
