@@ -31,6 +31,7 @@ from mixpose.extraction.contours import (
     ContourRules,
     cut_out,
     filled_area,
+    is_oval,
     is_solid,
     length_by_width,
     neighbours,
@@ -144,6 +145,7 @@ class Part:
     area: float  # number of pixels that it encloses
     level: float
     min_area: float  # of what is looked for in it
+    is_apart: bool = False
     # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
     # Itself, where it is large and no disk: taken where nothing is inside of it.
@@ -158,19 +160,23 @@ def find_blobs(
     """The blobs of foregrounds; limits of their area are those of the options, holes filled.
 
     What has no shape is taken apart at all higher levels first: then all rims are looked at
-    together, and all spots.
+    together, and all spots.  Few are found to have none only then, with a second look.
     """
     found = [
         _parts(scene, outlines(scene), scene.level, options.min_area) for scene, options in scenes
     ]
-    shapeless = _without_disks(list(chain(*found)), rules)
-    for part in shapeless:
+    parts = list(chain(*found))
+    early = [part for part in parts if part.area > rules.small_area and not is_oval(part.contour)]
+    for part in early:
         _take_apart(part, rules, islands=True)
-    below = [list(_below(parts)) for parts in found]
-    _without_disks(list(chain(*below)), rules)
+    shapeless = _without_disks([*parts, *_below(early)], rules)
+    late = [part for part in shapeless if not part.is_apart]
+    for part in late:
+        _take_apart(part, rules, islands=True)
+    _without_disks(list(_below(late)), rules)
     blobs = []
-    for (scene, options), parts, others in zip(scenes, found, below, strict=True):
-        _find_spots(scene, parts + others, rules)
+    for (scene, options), parts in zip(scenes, found, strict=True):
+        _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
         largest = math.inf if options.max_area is None else options.max_area
         all_of_it = _outside_disks(_blobs_of(parts, rules))
         blobs.append([blob for blob in all_of_it if blob.area <= largest])
@@ -265,7 +271,7 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
 
     With `islands`, what is in its holes is yet to be looked for.
     """
-    scene, contour, level = part.scene, part.contour, part.level
+    part.is_apart, scene, contour, level = True, part.scene, part.contour, part.level
     box = cv2.boundingRect(contour)
     patch, inside, corner = cut_out(scene, contour, box, 0)
     if scene.judged and cv2.minMaxLoc(patch, inside)[1] < scene.least_peak:

@@ -25,6 +25,9 @@ MOST_ROWS_SHARE = 0.5
 
 CONTOUR_SAMPLES = 64
 
+# Of an ellipse's area for its moments, from which it is taken for one until rims tell.
+OVAL = 0.985
+
 
 @dataclass(frozen=True)
 class ContourRules:
@@ -87,6 +90,13 @@ def length_by_width(contour: Contour) -> float:
     middle, half = (m["mu20"] + m["mu02"]) / 2, math.hypot((m["mu20"] - m["mu02"]) / 2, m["mu11"])
     long, short = (4 * max(v, 0.0) / m["m00"] for v in (middle + half, middle - half))
     return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
+
+
+def is_oval(contour: Contour) -> bool:
+    """Whether a contour may be an ellipse, by its area and moments: of most, rims say the same."""
+    m = cv2.moments(contour)
+    spread = math.sqrt(max(m["mu20"] * m["mu02"] - m["mu11"] ** 2, 0.0))
+    return bool(m["m00"] ** 2 >= OVAL * 4 * math.pi * spread)
 
 
 def is_solid(contour: Contour, least: float) -> bool:
