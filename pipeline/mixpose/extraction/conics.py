@@ -86,14 +86,12 @@ def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:
     # in single precision, which is exact near the ellipse only
     middle = points[np.arange(len(points)), chosen.argmax(axis=1)]
     near = (points - middle[:, None]).astype(np.float32)[chosen]
-    ends = np.cumsum(counts)
-    rows = []
-    for first, end in zip((ends - counts)[sound].tolist(), ends[sound].tolist(), strict=True):
+    ends = [0, *np.cumsum(counts).tolist()]
+    for k in np.flatnonzero(sound).tolist():
         # it moves points by chance where they fix no ellipse, each time otherwise but for this
         cv2.setRNGSeed(0)
-        centre, axes, angle = cv2.fitEllipseAMS(near[first:end])
-        rows.append((*centre, *axes, angle))
-    found[sound] = np.array(rows).reshape(-1, 5)
+        centre, axes, angle = cv2.fitEllipseAMS(near[ends[k] : ends[k + 1]])
+        found[k] = *centre, *axes, angle
     sound &= np.isfinite(found).all(axis=1)
     half_axes = found[:, 2:4] / 2
     sound &= half_axes.min(axis=1) >= np.maximum(oblique * half_axes.max(axis=1), _LEAST)

@@ -92,12 +92,12 @@ class Rim:
 def find_rims(
     signals: Sequence[Grey],
     outlines: Sequence[Contour],
-    least_contrasts: Floats,
+    contrasts: Floats,
     rules: EllipseRules = EllipseRules(),
 ) -> list[Rim | None]:
     """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
 
-    An edge is a step of at least `least_contrasts` (B,).  None where nothing is like an ellipse.
+    An edge is a step of at least such `contrasts` (B,).  None where nothing is like an ellipse.
     """
     rims: list[Rim | None] = [None] * len(outlines)
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
@@ -111,7 +111,7 @@ def find_rims(
         if not sound.size:
             return rims
         of_sound = [signals[k] for k in sound.tolist()]
-        ellipses, edges = _rims_near(of_sound, some, least_contrasts[sound], least, rules)
+        ellipses, edges = _rims_near(of_sound, some, contrasts[sound], least, rules)
         found = sound
     for k, i in enumerate(found.tolist()):
         if ellipses.sound[k]:
@@ -130,17 +130,13 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signals: Sequence[Grey],
-    ellipses: Ellipses,
-    least_contrasts: Floats,
-    least: float,
-    rules: EllipseRules,
+    signals: Sequence[Grey], others: Ellipses, contrasts: Floats, least: float, rules: EllipseRules
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each.
 
     Those that have edges in less than a share `least` of the directions are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, ellipses, least_contrasts, rules)
+    edges, found, steps, lows = _edges(signals, others, contrasts, rules)
     found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
@@ -197,8 +193,7 @@ def fit_ellipses(
     rows = np.flatnonzero(best.sound)
     for _ in range(REFITS):
         # those whose points stay the same are done
-        within = np.maximum(rules.spread, 3.0 * spread[rows])
-        near = there[rows] & (distance[rows] <= within[:, None])
+        near = there[rows] & (distance[rows] <= np.maximum(rules.spread, 3 * spread[rows])[:, None])
         changed = (near != used[rows]).any(axis=1)
         rows, near = rows[changed], near[changed]
         if not rows.size:
@@ -250,11 +245,11 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signals: Sequence[Grey], ellipses: Ellipses, least_contrasts: Floats, rules: EllipseRules
+    signals: Sequence[Grey], ellipses: Ellipses, contrasts: Floats, rules: EllipseRules
 ) -> tuple[Floats, Mask, Floats, Floats]:
     """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
 
-    There the signal falls through half the height of the edge; whether by `least_contrast`, well
+    There the signal falls through half the height of the edge; whether by one of `contrasts`, well
     within reach, by how much, and down to what (B, DIRECTIONS).
     """
     axes = ellipses.half_axes[:, None]
@@ -269,11 +264,14 @@ def _edges(
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
         offsets = np.arange(-whole - 1.5, whole + 2)
-        u, v = (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets for k in (0, 1))
+        u, v = (
+            (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
+            for k in (0, 1)
+        )
         profiles = sample_each([signals[k] for k in some.tolist()], u, v)
         step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
         shape = (len(some), DIRECTIONS)
-        sure = step >= np.repeat(least_contrasts[some], DIRECTIONS).astype(np.float32)
+        sure = step >= np.repeat(contrasts[some], DIRECTIONS).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -43,50 +43,37 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
 
 
 def sample_each(greys: Sequence[Grey], u: Floats, v: Floats) -> NDArray[np.float32]:
-    """As `sample`, at u and v (B, n, k) of B features, along lines, in an image (H, W) for each.
+    """As `sample`, at u and v (B, n) of B features, of each near each other, in an image for each.
 
     Only what is around each feature is turned into single precision, not all between them.
     """
     heights, widths = np.array([grey.shape for grey in greys]).T
     across, left, columns = _part(u, widths)
     down, top, rows = _part(v, heights)
-    samples = np.empty(across.shape, np.float32)
-    for some in _lots(rows, columns):
-        of_each = zip(np.arange(len(u))[some].tolist(), left[some].tolist(), top[some].tolist())
-        height, width = int(rows[some].max()), int(columns[some].max())
-        parts = np.zeros((len(rows[some]), height, width), np.float32)
-        for part, (k, u0, v0) in zip(parts, of_each, strict=True):
-            patch = greys[k][v0 : v0 + height, u0 : u0 + width]
-            part[: patch.shape[0], : patch.shape[1]] = patch
-        below = (np.arange(len(parts), dtype=np.float32) * height)[:, None]
-        samples[some] = _remap(parts.reshape(-1, width), across[some], down[some] + below)
-    return samples.reshape(u.shape)
-
-
-def _lots(rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Iterator[slice | NDArray[np.intp]]:
-    """Which parts, of rows and columns (B,), are stacked, each as high as the highest of them."""
-    if len(rows) * rows.max() <= STACK_ROWS:
-        yield np.s_[:]
-        return
+    samples = np.empty(u.shape, np.float32)
     order = np.argsort(np.maximum(rows, columns))
     while order.size:
+        # parts as large as the largest of them, in a stack that is not too high
         stacked = np.maximum.accumulate(rows[order]) * np.arange(1, order.size + 1)
         count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
-        yield order[:count]
-        order = order[count:]
+        some, order = order[:count], order[count:]
+        height, width = int(rows[some].max()), int(columns[some].max())
+        parts = np.zeros((count, height, width), np.float32)
+        corners = zip(some.tolist(), left[some].tolist(), top[some].tolist(), strict=True)
+        for part, (k, u0, v0) in zip(parts, corners, strict=True):
+            patch = greys[k][v0 : v0 + height, u0 : u0 + width]
+            part[: patch.shape[0], : patch.shape[1]] = patch
+        below = (np.arange(count, dtype=np.float32) * height)[:, None]
+        samples[some] = _remap(parts.reshape(-1, width), across[some], down[some] + below)
+    return samples
 
 
 def _part(
     places: Floats, sizes: NDArray[np.intp]
 ) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
-    """Places (B, n * k) within parts of one side (B,) of images, their first pixels and lengths."""
-    # what is farthest is at the ends of lines
-    ends = places[..., [0, -1]].reshape(len(places), -1)
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    if low.min() < 0 or (high > sizes - 1).any():
-        places = np.minimum(np.maximum(places, 0), sizes[:, None, None] - 1.0)
-        low, high = (np.minimum(np.maximum(end, 0), sizes - 1) for end in (low, high))
-    first = low.astype(np.intp)
-    inside = (places - first[:, None, None]).astype(np.float32).reshape(len(places), -1)
+    """Places (B, n) within parts of one side (B,) of images, where these begin, their lengths."""
+    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1.0)
+    first = inside.min(axis=1).astype(np.intp)
     # the last pixel's neighbour is not looked at, but has to be there
-    return inside, first, (high - first).astype(np.intp) + 2
+    lengths = (inside.max(axis=1) - first).astype(np.intp) + 2
+    return (inside - first[:, None]).astype(np.float32), first, lengths
