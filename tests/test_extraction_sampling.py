@@ -10,10 +10,10 @@ from mixpose.extraction.sampling import sample, sample_each
 def test_many_features_in_several_images_are_looked_up_as_exactly_as_one() -> None:
     rng = np.random.default_rng(0)
     images = [rng.uniform(0, 100, shape).astype(np.float32) for shape in ((300, 500), (400, 260))]
-    own = rng.integers(0, 2, 400)
-    radii = rng.choice([4.0, 9.0, 120.0], 400, p=[0.5, 0.45, 0.05])
+    own = rng.integers(0, 2, 1500)
+    radii = rng.choice([4.0, 9.0, 120.0], 1500, p=[0.5, 0.45, 0.05])
     # beyond the borders of both, too
-    centres = rng.uniform(-5, 405, (400, 2))
+    centres = rng.uniform(-5, 405, (1500, 2))
     turned = np.linspace(0, 2 * np.pi, 24)
     u = centres[:, :1] + radii[:, None] * np.cos(turned)
     v = centres[:, 1:] + radii[:, None] * np.sin(turned)
