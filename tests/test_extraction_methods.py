@@ -242,14 +242,15 @@ def test_images_that_are_looked_at_together_hold_what_each_holds_alone() -> None
     for u, v, radius in ((40.3, 50.7, 12), (120.6, 80.2, 15), (60.1, 120.4, 9)):
         disks[(xx - u) ** 2 + (yy - v) ** 2 < radius**2] = 180
     dark = np.asarray(255 - disks[::-1], dtype=np.uint8)
-    asked: list[tuple[Image, ExtractOptions, Window | None]] = [
-        (disks, ExtractOptions(), None),
-        (lit_square(), ExtractOptions(method="intensity"), (50, 30, 90, 60)),
-        (dark, ExtractOptions(polarity="dark", max_area=500.0), None),
-        (disks, ExtractOptions(), (300, 0, 400, 100)),  # outside
-        (disks, ExtractOptions(), (80, 40, 200, 160)),
-    ]
-    for (image, options, window), found in zip(asked, extract_together(asked), strict=True):
+    asked: dict[str, tuple[Image, ExtractOptions, Window | None]] = {
+        "disks": (disks, ExtractOptions(), None),
+        "square": (lit_square(), ExtractOptions(method="intensity"), (50, 30, 90, 60)),
+        "dark": (dark, ExtractOptions(polarity="dark", max_area=500.0), None),
+        "outside": (disks, ExtractOptions(), (300, 0, 400, 100)),
+        "part": (disks, ExtractOptions(), (80, 40, 200, 160)),
+    }
+    for name, found in extract_together(asked).items():
+        image, options, window = asked[name]
         alone = extract(image, options, window=window)
         if isinstance(found, PointPattern):
             assert isinstance(alone, PointPattern)

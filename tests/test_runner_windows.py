@@ -77,7 +77,7 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     used: list[Any] = []
 
     def recorded(images: Any, **others: Any) -> Any:
-        used.extend(window for _, _, window in images)
+        used.extend(window for _, _, window in images.values())
         return extract_together(images, **others)
 
     monkeypatch.setattr(runner, "extract_together", recorded)

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from mixpose.records import (
     Floats,
     FrameSet,
     GridPattern,
-    Pattern,
     PointPattern,
     RawFrame,
     SensorReport,
@@ -274,14 +273,10 @@ def observe(
     session: Session, frame_set: FrameSet, windows: Mapping[str, Window] | None = None
 ) -> list[View]:
     """Extract the features of every sensor that has a frame, of some in a window only."""
-    there = [
-        (setup, frame_set.frames[setup.name], (windows or {}).get(setup.name))
-        for setup in session.sensors
-        if setup.name in frame_set.frames
-    ]
     views = []
-    for (setup, frame, _), observation in zip(there, _observations(session, there), strict=True):
-        view = _view(setup, observation, frame_set, frame)
+    frames = frame_set.frames
+    for setup, observation in _observations(session, session.sensors, frames, windows or {}):
+        view = _view(setup, observation, frame_set, frames[setup.name])
         if isinstance(setup.sensor, CloudSensor):
             views += plane_views(view.name, setup.sensor, observation, view.delay)
         else:
@@ -318,33 +313,37 @@ def _view(
 
 def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
     """The feature pattern of one sensor's frame, with the width of its features."""
-    return _observations(session, [(setup, frame, None)])[0]
+    return _observations(session, [setup], {setup.name: frame}, {})[0][1]
 
 
 def _observations(
-    session: Session, there: Sequence[tuple[SensorSetup, RawFrame, Window | None]]
-) -> list[Observation]:
-    """The same of several sensors, of some in a window only; images are looked at together."""
-    images = {}
-    for k, (setup, frame, window) in enumerate(there):
-        if isinstance(frame.data, np.ndarray):
+    session: Session,
+    setups: Sequence[SensorSetup],
+    frames: Mapping[str, RawFrame],
+    windows: Mapping[str, Window],
+) -> list[tuple[SensorSetup, Observation]]:
+    """The same of all that have a frame, of some in a window only; images are taken together."""
+    images, observations = {}, []
+    there = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
+    for setup, data in there:
+        if isinstance(data, np.ndarray):
             _refuse_code(session, setup.extract.method)
-            images[k] = frame.data, setup.extract, window
-    extracted = extract_together(list(images.values()), base=session.folder)
-    patterns = dict(zip(images, extracted, strict=True))
-    observations = []
-    for k, (setup, frame, _) in enumerate(there):
-        options, pattern = setup.extract, patterns.get(k, cast("Pattern", frame.data))
+            images[setup.name] = data, setup.extract, windows.get(setup.name)
+    patterns = extract_together(images, base=session.folder)
+    for setup, data in there:
+        options = setup.extract
+        pattern = patterns[setup.name] if isinstance(data, np.ndarray) else data
         if isinstance(pattern, GridPattern):
             # noise may take a profile below zero; cutting that off would leave a floor of noise
             width = float(np.hypot(options.sigma, options.spot_sigma))
-            observations.append(Observation(pattern, width, intrinsic=options.spot_sigma))
-        elif k in patterns and len(pattern.points) > MOST_DETECTIONS:
+            observation = Observation(pattern, width, intrinsic=options.spot_sigma)
+        elif setup.name in patterns and len(pattern.points) > MOST_DETECTIONS:
             # flooded with light or noise: nothing in it can be told from anything
             empty = PointPattern(pattern.points[:0], pattern.weights[:0])
-            observations.append(Observation(empty, options.sigma, passed_over=pattern.size))
+            observation = Observation(empty, options.sigma, passed_over=pattern.size)
         else:
-            observations.append(Observation(pattern, options.sigma))
+            observation = Observation(pattern, options.sigma)
+        observations.append((setup, observation))
     return observations
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import cast
 
@@ -67,33 +67,31 @@ def extract(
     RecordingError
         If the image is of another type, or holds NaN or infinite values.
     """
-    return extract_together([(image, options, window)], base=base)[0]
+    return extract_together({"": (image, options, window)}, base=base)[""]
 
 
 def extract_together(
-    images: Sequence[tuple[Image, ExtractOptions, Window | None]], *, base: Path | None = None
-) -> list[Pattern]:
+    images: Mapping[str, tuple[Image, ExtractOptions, Window | None]], *, base: Path | None = None
+) -> dict[str, Pattern]:
     """As `extract`, of several images with options and windows: blobs of all in fewer calls."""
-    patterns: list[Pattern] = [PointPattern(np.empty((0, 2)), np.empty(0)) for _ in images]
-    blobs: dict[int, tuple[Image, ExtractOptions, Window]] = {}
-    for k, (given, options, window) in enumerate(images):
+    patterns: dict[str, Pattern] = {}
+    blobs: dict[str, tuple[Image, ExtractOptions, Window]] = {}
+    for name, (given, options, window) in images.items():
         check_options(options)
         image = _checked(given)
         height, width = image.shape
         u0, v0, u1, v1 = (0, 0, width, height) if window is None else window
         box = (max(int(u0), 0), max(int(v0), 0), min(int(u1), width), min(int(v1), height))
-        if box[0] >= box[2] or box[1] >= box[3]:
-            continue
         method = METHODS.get(options.method)
-        if method is extract_blobs:
-            blobs[k] = (image, options, box)
+        if box[0] >= box[2] or box[1] >= box[3]:
+            patterns[name] = PointPattern(np.empty((0, 2)), np.empty(0))
+        elif method is extract_blobs:
+            blobs[name] = (image, options, box)
         elif method is None:
-            patterns[k] = extract_custom(image, options, box, base)
+            patterns[name] = extract_custom(image, options, box, base)
         else:
-            patterns[k] = method(image, options, box)
-    for k, pattern in zip(blobs, extract_all(list(blobs.values())), strict=True):
-        patterns[k] = pattern
-    return patterns
+            patterns[name] = method(image, options, box)
+    return patterns | dict(zip(blobs, extract_all(list(blobs.values())), strict=True))
 
 
 def check_options(options: ExtractOptions, *, base: Path | None = None) -> None:

@@ -31,6 +31,7 @@ from mixpose.extraction.contours import (
     ContourRules,
     cut_out,
     filled_area,
+    is_oval,
     is_solid,
     length_by_width,
     neighbours,
@@ -162,6 +163,7 @@ class Part:
     area: float  # number of pixels that it encloses
     level: float
     min_area: float  # of what is looked for in it
+    is_apart: bool = False
     # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
     # Itself, where it is large and no disk: taken where nothing is inside of it.
@@ -176,19 +178,21 @@ def find_blobs(
     """The blobs of foregrounds; limits of their area are those of the options, holes filled.
 
     What has no shape is taken apart at all higher levels first: then all rims are looked at
-    together, and all spots.
+    together, and all spots.  Few are found to have none only then, with a second look.
     """
     found = [
         _parts(scene, outlines(scene), scene.level, options.min_area) for scene, options in scenes
     ]
-    shapeless = _without_disks(list(chain(*found)), rules)
-    for part in shapeless:
-        _take_apart(part, rules, islands=True)
-    below = [list(_below(parts)) for parts in found]
-    _without_disks(list(chain(*below)), rules)
+    parts = list(chain(*found))
+    shapeless = [p for p in parts if p.area > rules.small_area and not is_oval(p.contour)]
+    for _ in range(2):
+        for part in shapeless:
+            _take_apart(part, rules, islands=True)
+        rest = _without_disks([*parts, *_below(shapeless)], rules)
+        parts, shapeless = [], [part for part in rest if not part.is_apart]
     blobs = []
-    for (scene, options), parts, others in zip(scenes, found, below, strict=True):
-        _find_spots(scene, parts + others, rules)
+    for (scene, options), parts in zip(scenes, found, strict=True):
+        _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
         largest = math.inf if options.max_area is None else options.max_area
         all_of_it = _outside_disks(_blobs_of(parts, rules))
         blobs.append([blob for blob in all_of_it if blob.area <= largest])
@@ -209,7 +213,7 @@ def _parts(
 def _below(parts: Sequence[Part]) -> Iterator[Part]:
     """All parts that others came apart into."""
     for part in parts:
-        for layer in (part.beside, *part.inner):
+        for layer in filter(None, (part.beside, *part.inner)):
             yield from layer
             yield from _below(layer)
 
@@ -240,7 +244,7 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
     for group in neighbours([part.contour for part in shapeless], rules.contours):
         some = [shapeless[k] for k in group]
         joined = [(some[0].scene, np.concatenate([part.contour for part in some]))]
-        rims = [disk for disk in _disks(joined[: len(some) - 1], rules) if disk]
+        rims = [disk for disk in _disks(joined if len(some) > 1 else [], rules) if disk]
         blobs += rims
         for part in some if not rims else []:
             inner = [blob for layer in part.inner for blob in _blobs_of(layer, rules)]
@@ -295,7 +299,7 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
 
     With `islands`, what is in its holes is yet to be looked for.
     """
-    scene, contour, level = part.scene, part.contour, part.level
+    part.is_apart, scene, contour, level = True, part.scene, part.contour, part.level
     box = cv2.boundingRect(contour)
     patch, inside, corner = cut_out(scene, contour, box, 0)
     if scene.judged and cv2.minMaxLoc(patch, inside)[1] < scene.least_peak:
@@ -341,12 +345,9 @@ def _hull_blob(contour: Contour) -> Blob:
 def _brightness(scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]) -> float:
     """Median of what is above the detection level within a contour."""
     values = patch[(inside > 0) & (patch > scene.level)]
-    if not values.size:
-        return 0.0
-    # as `np.median`, in a tenth of its time
     middle = [(values.size - 1) // 2, values.size // 2]
-    values.partition(middle)
-    return float(values[middle].sum() / 2)
+    # as `np.median`, in a tenth of its time
+    return float(np.partition(values, middle)[middle].sum() / 2) if values.size else 0.0
 
 
 def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:

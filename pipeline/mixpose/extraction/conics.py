@@ -81,14 +81,16 @@ def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:
     is the least width by length.
     """
     found = np.ones((len(points), 5))
-    sound = chosen.sum(axis=1) >= FEWEST
+    counts = chosen.sum(axis=1)
+    sound = counts >= FEWEST
     # in single precision, which is exact near the ellipse only
     middle = points[np.arange(len(points)), chosen.argmax(axis=1)]
-    near = (points - middle[:, None]).astype(np.float32)
+    near = (points - middle[:, None]).astype(np.float32)[chosen]
+    ends = [0, *np.cumsum(counts).tolist()]
     for k in np.flatnonzero(sound).tolist():
         # it moves points by chance where they fix no ellipse, each time otherwise but for this
         cv2.setRNGSeed(0)
-        centre, axes, angle = cv2.fitEllipseAMS(near[k][chosen[k]])
+        centre, axes, angle = cv2.fitEllipseAMS(near[ends[k] : ends[k + 1]])
         found[k] = *centre, *axes, angle
     sound &= np.isfinite(found).all(axis=1)
     half_axes = found[:, 2:4] / 2

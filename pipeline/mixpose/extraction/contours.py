@@ -25,6 +25,9 @@ MOST_ROWS_SHARE = 0.5
 
 CONTOUR_SAMPLES = 64
 
+# Of an ellipse's area for its moments, from which it is taken for one until rims tell.
+OVAL = 0.985
+
 
 @dataclass(frozen=True)
 class ContourRules:
@@ -89,6 +92,13 @@ def length_by_width(contour: Contour) -> float:
     return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
 
 
+def is_oval(contour: Contour) -> bool:
+    """Whether a contour may be an ellipse, by its area and moments: of most, rims say the same."""
+    m = cv2.moments(contour)
+    spread = math.sqrt(max(m["mu20"] * m["mu02"] - m["mu11"] ** 2, 0.0))
+    return bool(m["m00"] ** 2 >= OVAL * 4 * math.pi * spread)
+
+
 def is_solid(contour: Contour, least: float) -> bool:
     """Whether a contour fills so much of its convex hull."""
     return bool(cv2.contourArea(contour) >= least * cv2.contourArea(cv2.convexHull(contour)))
@@ -135,10 +145,11 @@ def neighbours(
 ) -> list[list[int]]:
     """Groups of contours, by their places, that nearly touch: perhaps parts of one broken rim."""
     groups: list[list[int]] = []
-    for k, contour in enumerate(contours):
+    boxed = [(contour, cv2.boundingRect(contour)) for contour in contours]
+    for k, one in enumerate(boxed):
         apart, together = [], [k]
         for group in groups:
-            if any(_near(contour, contours[other], rules) for other in group):
+            if any(_near(one, boxed[other], rules) for other in group):
                 together += group
             else:
                 apart.append(group)
@@ -146,10 +157,9 @@ def neighbours(
     return groups
 
 
-def _near(a: Contour, b: Contour, rules: ContourRules) -> bool:
-    """Whether the gap between two contours is small beside them."""
-    ua, va, wa, ha = cv2.boundingRect(a)
-    ub, vb, wb, hb = cv2.boundingRect(b)
+def _near(one: tuple[Contour, Box], other: tuple[Contour, Box], rules: ContourRules) -> bool:
+    """Whether the gap between two contours, with their boxes, is small beside them."""
+    (a, (ua, va, wa, ha)), (b, (ub, vb, wb, hb)) = one, other
     gap = rules.gap * min(max(wa, ha), max(wb, hb)) + rules.gap_px
     if max(ua - ub - wb, ub - ua - wa, va - vb - hb, vb - va - ha) > gap:
         return False

@@ -92,18 +92,18 @@ class Rim:
 def find_rims(
     signals: Sequence[Grey],
     outlines: Sequence[Contour],
-    least_contrasts: Floats,
+    contrasts: Floats,
     rules: EllipseRules = EllipseRules(),
 ) -> list[Rim | None]:
     """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
 
-    An edge is a step of at least `least_contrasts` (B,).  None where nothing is like an ellipse.
+    An edge is a step of at least such `contrasts` (B,).  None where nothing is like an ellipse.
     """
     rims: list[Rim | None] = [None] * len(outlines)
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
-    ellipses = fit_ellipses(*_side_by_side(hulls), rules)
+    ellipses, _ = fit_ellipses(*_side_by_side(hulls), rules)
     found = np.arange(len(outlines))
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
     for least in (rules.coverage / 2, rules.coverage):
@@ -111,7 +111,7 @@ def find_rims(
         if not sound.size:
             return rims
         of_sound = [signals[k] for k in sound.tolist()]
-        ellipses, edges = _rims_near(of_sound, some, least_contrasts[sound], least, rules)
+        ellipses, edges = _rims_near(of_sound, some, contrasts[sound], least, rules)
         found = sound
     for k, i in enumerate(found.tolist()):
         if ellipses.sound[k]:
@@ -130,23 +130,18 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signals: Sequence[Grey],
-    ellipses: Ellipses,
-    least_contrasts: Floats,
-    least: float,
-    rules: EllipseRules,
+    signals: Sequence[Grey], others: Ellipses, contrasts: Floats, least: float, rules: EllipseRules
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each.
 
     Those that have edges in less than a share `least` of the directions are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, ellipses, least_contrasts, rules)
+    edges, found, steps, lows = _edges(signals, others, contrasts, rules)
     found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
-    better = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
-    distance = np.abs(distances(better, edges))
+    better, distance = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
     within = tolerance(better.half_axes.min(axis=1), rules)
     on_rim = found & (distance <= within[:, None]) & better.sound[:, None]
     count = on_rim.sum(axis=1)
@@ -176,10 +171,13 @@ def tolerance(minor: Any, rules: EllipseRules) -> Any:
     return np.maximum(rules.tolerance, np.maximum(np.minimum(0.1 * minor, 1.0), 0.02 * minor))
 
 
-def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules()) -> Ellipses:
+def fit_ellipses(
+    points: Floats, there: Mask, rules: EllipseRules = EllipseRules()
+) -> tuple[Ellipses, Floats]:
     """Ellipses through those of points (B, n, 2), in order along each, that are there (B, n).
 
     Some may lie elsewhere.  Sound but for less than six points, or where they are on no ellipse.
+    With the distances (B, n) of points from them.
     """
     best = fit_conics(points, there, rules.oblique)
     distance, spread = _spreads(best, points, there)
@@ -192,15 +190,19 @@ def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules
         distance, spread = _spreads(best, points, there)
     hopeless = spread > rules.spread + rules.hopeless * best.half_axes.min(axis=1)
     best = replace(best, sound=best.sound & ~hopeless)
+    rows = np.flatnonzero(best.sound)
     for _ in range(REFITS):
-        near = there & (distance <= np.maximum(rules.spread, 3.0 * spread)[:, None])
-        changed = np.flatnonzero((near != used).any(axis=1) & best.sound)
-        if not changed.size:
+        # those whose points stay the same are done
+        near = there[rows] & (distance[rows] <= np.maximum(rules.spread, 3 * spread[rows])[:, None])
+        changed = (near != used[rows]).any(axis=1)
+        rows, near = rows[changed], near[changed]
+        if not rows.size:
             break
-        refitted = fit_conics(points[changed], near[changed], rules.oblique)
-        best, used = best.replaced(changed, refitted), near
-        distance, spread = _spreads(best, points, there)
-    return best
+        refitted = fit_conics(points[rows], near, rules.oblique)
+        best, used[rows] = best.replaced(rows, refitted), near
+        distance[rows], spread[rows] = _spreads(refitted, points[rows], there[rows])
+        rows = rows[refitted.sound]
+    return best, distance
 
 
 def _spreads(ellipses: Ellipses, points: Floats, there: Mask) -> tuple[Floats, Floats]:
@@ -243,11 +245,11 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signals: Sequence[Grey], ellipses: Ellipses, least_contrasts: Floats, rules: EllipseRules
+    signals: Sequence[Grey], ellipses: Ellipses, contrasts: Floats, rules: EllipseRules
 ) -> tuple[Floats, Mask, Floats, Floats]:
     """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
 
-    There the signal falls through half the height of the edge; whether by `least_contrast`, well
+    There the signal falls through half the height of the edge; whether by one of `contrasts`, well
     within reach, by how much, and down to what (B, DIRECTIONS).
     """
     axes = ellipses.half_axes[:, None]
@@ -269,7 +271,7 @@ def _edges(
         profiles = sample_each([signals[k] for k in some.tolist()], u, v)
         step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
         shape = (len(some), DIRECTIONS)
-        sure = step >= np.repeat(least_contrasts[some], DIRECTIONS).astype(np.float32)
+        sure = step >= np.repeat(contrasts[some], DIRECTIONS).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
@@ -292,7 +294,8 @@ def _fall(
     outside = column > (steepest + 1)[:, None]
     high = np.where(outside, -np.inf, profiles)
     summit = high.argmax(axis=1)
-    low = np.where(outside, profiles, np.inf).min(axis=1)
+    # of long columns, which is quicker than of short rows
+    low = np.ascontiguousarray(np.where(outside, profiles, np.inf).T).min(axis=0)
     half = (high[rows, summit] + low) / 2
     below = (column > summit[:, None]) & (profiles < half[:, None])
     after = np.maximum(below.argmax(axis=1), 1)

@@ -15,6 +15,9 @@ from mixpose.records import Floats
 # OpenCV takes maps with sides below 32767.
 MOST_ROWS = 30000
 
+# Of parts that are stacked: places in single precision are exact to 1e-4 px there.
+STACK_ROWS = 2000
+
 
 def sample(grey: Grey, places: Floats) -> Floats:
     """Bilinear samples (n, k) of an image (H, W) at pixel coordinates u, v (n, k, 2).
@@ -47,26 +50,30 @@ def sample_each(greys: Sequence[Grey], u: Floats, v: Floats) -> NDArray[np.float
     heights, widths = np.array([grey.shape for grey in greys]).T
     across, left, columns = _part(u, widths)
     down, top, rows = _part(v, heights)
-    most = max(MOST_ROWS // rows, 1)
     samples = np.empty(u.shape, np.float32)
-    for first in range(0, len(u), most):
-        some = slice(first, first + most)
-        corners = zip(greys[some], left[some].tolist(), top[some].tolist(), strict=True)
-        parts = np.zeros((len(u[some]), rows, columns), np.float32)
-        for part, (grey, u0, v0) in zip(parts, corners, strict=True):
-            patch = grey[v0 : v0 + rows, u0 : u0 + columns]
+    order = np.argsort(np.maximum(rows, columns))
+    while order.size:
+        # parts as large as the largest of them, in a stack that is not too high
+        stacked = np.maximum.accumulate(rows[order]) * np.arange(1, order.size + 1)
+        count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
+        some, order = order[:count], order[count:]
+        height, width = int(rows[some].max()), int(columns[some].max())
+        parts = np.zeros((count, height, width), np.float32)
+        corners = zip(some.tolist(), left[some].tolist(), top[some].tolist(), strict=True)
+        for part, (k, u0, v0) in zip(parts, corners, strict=True):
+            patch = greys[k][v0 : v0 + height, u0 : u0 + width]
             part[: patch.shape[0], : patch.shape[1]] = patch
-        below = (np.arange(len(parts), dtype=np.float32) * rows)[:, None]
-        samples[some] = _remap(parts.reshape(-1, columns), across[some], down[some] + below)
+        below = (np.arange(count, dtype=np.float32) * height)[:, None]
+        samples[some] = _remap(parts.reshape(-1, width), across[some], down[some] + below)
     return samples
 
 
 def _part(
     places: Floats, sizes: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.intp], int]:
-    """Places (B, n) within a part of one side (B,) of images, where it begins, and its length."""
-    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1)
+) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
+    """Places (B, n) within parts of one side (B,) of images, where these begin, their lengths."""
+    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1.0)
     first = inside.min(axis=1).astype(np.intp)
     # the last pixel's neighbour is not looked at, but has to be there
-    length = int((inside.max(axis=1) - first).max()) + 2
-    return (inside - first[:, None]).astype(np.float32), first, length
+    lengths = (inside.max(axis=1) - first).astype(np.intp) + 2
+    return (inside - first[:, None]).astype(np.float32), first, lengths
