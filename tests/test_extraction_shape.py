@@ -21,7 +21,7 @@ MIDDLE = np.array([333.5, 322.5]) / SCALE - 0.5  # of a pixel of what is drawn f
 def disk(
     axes: tuple[float, float], *, lost: float = 0.0, angle_deg: float = 0.0, blur: float = 0.8
 ) -> Singles:
-    """A patch (40, 40) with a disk or ellipse, of which a segment as deep as `lost` px is hidden."""
+    """A patch (40, 40) with a disk or an ellipse without a segment as deep as `lost` px."""
     big = np.zeros((40 * SCALE, 40 * SCALE), np.uint8)
     middle = ((MIDDLE + 0.5) * SCALE - 0.5).astype(int)
     size = round(axes[0] * SCALE), round(axes[1] * SCALE)

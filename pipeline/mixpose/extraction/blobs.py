@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 
 import cv2
@@ -90,6 +90,12 @@ class Blob:
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
 
+    @classmethod
+    def of_rim(cls, rim: Rim, off: float | None) -> Blob:
+        """A disk."""
+        ellipse = rim.ellipse
+        return cls(*ellipse.centre, ellipse.area, ellipse.length, rim, off)
+
 
 def extract_blobs(
     image: Image, options: ExtractOptions, window: Window, rules: BlobRules = BlobRules()
@@ -125,9 +131,7 @@ def usually_off(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> float:
     return max(told[(len(told) - 1) // 4] if told else 0.0, rules.finest)
 
 
-def deviations_of(
-    blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRules()
-) -> Floats:
+def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRules()) -> Floats:
     """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
 
     A disk of which something is hidden, or that is merged with something, is longer than wide by as
@@ -260,23 +264,20 @@ def _disks(outlined: Sequence[tuple[Foreground, Contour]], rules: BlobRules) -> 
     levels = np.array([scene.level for scene in scenes])
     rims = find_rims([scene.grey for scene in scenes], contours, levels, rules.rims)
     disks = [
-        Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse.length, rim)
-        if rim is not None and _is_disk(scene, contour, rim, rules)
-        else None
+        rim if rim is not None and _is_disk(scene, contour, rim, rules) else None
         for (scene, contour), rim in zip(outlined, rims, strict=True)
     ]
     # a larger one is told by its rim
-    some = [
-        (k, scenes[k], disk.rim.ellipse)
-        for k, disk in enumerate(disks)
-        if disk and disk.rim and disk.area < math.pi * rules.large**2
+    told = {
+        k: (scene, rim.ellipse)
+        for k, (scene, rim) in enumerate(zip(scenes, disks, strict=True))
+        if rim and rim.ellipse.area < math.pi * rules.large**2
+    }
+    off = off_centre([*told.values()], rules.spots.margin, rules.spots.centroid, rules.beside)
+    by_number = dict(zip(told, off.tolist(), strict=True))
+    return [
+        None if rim is None else Blob.of_rim(rim, by_number.get(k)) for k, rim in enumerate(disks)
     ]
-    if some:
-        given = [(scene, ellipse) for _, scene, ellipse in some]
-        off = off_centre(given, rules.spots.margin, rules.spots.centroid, rules.beside).tolist()
-        for (k, *_), own in zip(some, off, strict=True):
-            disks[k] = replace(disks[k], off=own)
-    return disks
 
 
 def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) -> bool:

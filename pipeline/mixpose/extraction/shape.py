@@ -41,7 +41,7 @@ def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats,
 
 @lru_cache(maxsize=SHAPES)
 def _monomials(rows: int, columns: int) -> Floats:
-    """1, z, |z|², z² and z³ of every pixel of a patch (8, rows * columns), parts of complex ones."""
+    """1, z, |z|², z² and z³ of the pixels of a patch (8, rows * columns), complex ones as two."""
     v, u = np.indices((rows, columns), dtype=np.float64).reshape(2, -1)
     z2, z3 = (u + 1j * v) ** 2, (u + 1j * v) ** 3
     return np.array([np.ones(u.size), u, v, u * u + v * v, z2.real, z2.imag, z3.real, z3.imag])
@@ -69,6 +69,8 @@ def off_centre(
     Up to `beside` px outside of an ellipse, what is brighter than a share of the peak counts, above
     the background `margin` px around it.
     """
+    if not disks:
+        return np.zeros(0)
     patches, corners = [], []
     for scene, ellipse in disks:
         patch, corner = signal_about(scene, _box(ellipse), margin)

@@ -121,7 +121,7 @@ def _detections(views: Sequence[View]) -> Floats:
 def _looks(
     views: Sequence[View], by: Indices, partner: Indices, middle: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Variances (L, n) of what meets features beyond noise, σ_ε², radii, sensor units, and `cut`."""
+    """Variances (L, n) of what meets features beyond noise, σ_ε²; radii, sensor units; `cut`."""
     extra, radii = np.where(partner >= 0, middle**2, 0.0), np.zeros(by.shape)
     cut = np.full((*by.shape, 2), np.nan)
     for k, view in enumerate(views):
