@@ -51,7 +51,7 @@ class Matches:
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
     extra: Floats  # (..., L, N) variances of what meets them beyond the noise, σ_ε²: of what is cut
     radii: Floats  # (..., L, N) of the spots that meet them, sensor units; 0 where nobody knows
-    # (..., L, N, 2) chances that these are cut unseen, and variances then, σ_ε²; NaN: sizes are silent
+    # (..., L, N, 2) chances that these are cut unseen, and variances then, σ_ε²; NaN: nobody knows
     cut: Floats
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
     parts: Floats | float = 1.0  # (L,) that a coordinate counts: 1/2 where two images show it
