@@ -74,6 +74,7 @@ class BlobRules:
     exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
     rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
     off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
+    by_rim: float = constant(0.3, "of what grey values show, that what is seen of a rim is off by")
     beside: float = constant(2.0, "px outside of a rim that its grey values reach: optics blur it")
     usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 4 %")
     finest: float = constant(0.01, "px, that this is at least: pixels alone make as much")
@@ -142,18 +143,15 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
     typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
     for k, blob in enumerate(blobs):
-        radius, rim = math.sqrt(blob.area / math.pi), blob.rim
+        radius, rim, longer, share = math.sqrt(blob.area / math.pi), blob.rim, 0.0, 1.0
         if rim is None:
             longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5
         elif radius < rules.large and (
             rim.coverage < rules.whole or rim.residual > rules.exact * residual
         ):
-            longer = blob.length / typical[0] - 1
-            deviations[k] = rules.off_centre * radius * max(longer, 0.0)
-            continue
-        else:
-            longer = 0.0
-        shown = blob.off if blob.off and blob.off > rules.usual * usual else 0.0
+            longer, share = blob.length / typical[0] - 1, rules.by_rim
+        off = blob.off or 0.0
+        shown = share * off if off > rules.usual * usual else 0.0
         deviations[k] = max(rules.off_centre * radius * longer, shown)
     return deviations
 
