@@ -9,7 +9,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from mixpose.cli.words import AllowCode, ConvertFormat, PosesFile, Recordings, SessionFile, taking
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    PosesFile,
+    Recordings,
+    SessionFile,
+    option,
+    taking,
+)
 
 TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 
@@ -53,45 +61,26 @@ class ConvertRequest:
     """What was asked for."""
 
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout (-).")
-    ] = None
-    format: Annotated[
-        ConvertFormat | None,
-        typer.Option(
-            help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
-        ),
-    ] = None
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
-    ] = None
-    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None
-    only_ok: Annotated[bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")] = (
-        False
+    output: Path | None = option(None, "Write here, not to stdout (-).", "-o", "--output")
+    format: ConvertFormat | None = option(
+        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
     )
-    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None
-    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None
-    relative_to: Annotated[
-        str | None,
-        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
-    ] = None
-    session: Annotated[
-        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
-    ] = None
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
-    ] = None
-    measured: Annotated[
-        bool,
-        typer.Option(
-            "--measured", help="c3d, trc: leave gaps where a marker was not measured by itself."
-        ),
-    ] = False
-    fps: Annotated[
-        float | None,
-        typer.Option(min=1e-6, max=1e6, help="c3d, trc: frames a second, in place of times."),
-    ] = None
+    unit: str | None = option(None, "Unit of lengths where POSES does not say: m, cm, mm, um.")
+    object: str | None = option(None, "Only the poses of this object.")
+    only_ok: bool = option(False, "Leave out ambiguous frames too.")
+    scene_id: int | None = option(None, "bop: the scene; 0.", min=0)
+    obj_id: int | None = option(None, "bop: the object; 1.", min=0)
+    relative_to: str | None = option(
+        None, "bop, ros, tum: relative to a camera, not the world.", metavar="SENSOR"
+    )
+    session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
+    source: list[str] | None = option(None, "rerun: as for run.", metavar="NAME=PATH")
+    measured: bool = option(
+        False, "c3d, trc: leave gaps where a marker was not measured by itself."
+    )
+    fps: float | None = option(
+        None, "c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6
+    )
     allow_code: AllowCode = False
 
 
@@ -131,19 +120,11 @@ class PivotRequest:
     """What was asked for."""
 
     poses: PosesFile
-    object: Annotated[
-        str | None, typer.Option(metavar="OBJECT", help="The tool, where there are several bodies.")
-    ] = None
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            metavar="OBJECT", help="The tip stays at a point of this body; else of the world."
-        ),
-    ] = None
-    into: Annotated[
-        Path | None,
-        typer.Option(metavar="SESSION.toml", help="Write the tip into this session."),
-    ] = None
+    object: str | None = option(None, "The tool, where there are several bodies.", metavar="OBJECT")
+    reference: str | None = option(
+        None, "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
+    )
+    into: Path | None = option(None, "Write the tip into this session.", metavar="SESSION.toml")
 
 
 @taking(PivotRequest)
@@ -159,17 +140,13 @@ class AlignRequest:
     """What was asked for."""
 
     session: SessionFile
-    floor: Annotated[
-        list[str],
-        typer.Option(
-            metavar="POSES.jsonl|OBJECT@FRAME",
-            help="What lies on the floor: poses, or a body in a frame. Repeatable.",
-        ),
-    ]
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="ALIGNED.toml", help="The aligned session.")
-    ]
-    up: Annotated[Literal["x", "y", "z"], typer.Option(help="The axis that points up.")] = "z"
+    floor: list[str] = option(
+        ...,
+        "What lies on the floor: poses, or a body in a frame. Repeatable.",
+        metavar="POSES.jsonl|OBJECT@FRAME",
+    )
+    output: Path = option(..., "The aligned session.", "-o", "--output", metavar="ALIGNED.toml")
+    up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
     source: Recordings = None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import field, fields
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
@@ -28,16 +29,31 @@ AllowCode = Annotated[
         help='Run functions that the session names: method = "module:function".',
     ),
 ]
-Step = Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")]
-Start = Annotated[int | None, typer.Option(help="First frame number.")]
-Stop = Annotated[int | None, typer.Option(help="Frame number to stop before.")]
+
+
+def option(default: Any, meaning: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """A field of a record that is an option of a command, needed where the default is `...`.
+
+    Without names it is called like the field. `panel` heads a group of options in the help, and
+    typer takes `more`.
+    """
+    settings = {"help": meaning, "rich_help_panel": panel, **more}
+    metadata = {"names": names, "settings": settings}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
 def taking(request: type[Request]) -> Callable[[Callable[[Request], None]], Callable[..., None]]:
     """Make a command of a function of a record, whose fields are its arguments and options."""
 
     def decorated(command: Callable[[Request], None]) -> Callable[..., None]:
-        hints = get_type_hints(request, include_extras=True)
+        hints: dict[str, Any] = get_type_hints(request, include_extras=True)
+        for one in fields(request):  # type: ignore[arg-type]
+            if one.metadata:
+                kind, names = hints[one.name], one.metadata["names"]
+                if kind is bool and not names:  # else typer adds one that begins with "no-"
+                    names = (f"--{one.name.replace('_', '-')}",)
+                option = typer.Option(*names, **one.metadata["settings"])
+                hints[one.name] = Annotated[kind, option]
         form = signature(request)
         typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
 

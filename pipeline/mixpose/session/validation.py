@@ -105,11 +105,14 @@ def _literals(field: FieldInfo | None) -> list[str]:
 
 
 def allowed_for(field: FieldInfo | None) -> str:
-    """What a key may be, for people; empty where nothing is said."""
+    """What a key may be, for people; what its type says where nothing else does."""
     if field is None:
         return ""
-    carried = (getattr(mark, "description", None) for mark in field.metadata)
-    return field.description or next((text for text in carried if text), "")
+    if field.annotation is bool:
+        return "true or false"
+    carried = [getattr(mark, "description", None) for mark in field.metadata]
+    said = (text for text in [field.description, *carried] if text)
+    return next(said, one_of(_literals(field)))
 
 
 def _tag_problem(place: _Place, value: Any) -> BadKeyError:
