@@ -12,13 +12,7 @@ from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import (
-    Output,
-    OutputPerBody,
-    is_apart,
-    refuse_to_overwrite,
-    written_paths,
-)
+from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source

@@ -51,6 +51,5 @@ def simulate_session(request: SimulateRequest) -> None:
         )
     count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(
-        f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}",
-        file=sys.stderr,
+        f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr
     )

@@ -25,8 +25,7 @@ Recordings = Annotated[
 AllowCode = Annotated[
     bool,
     typer.Option(
-        "--allow-code",
-        help='Run functions that the session names: method = "module:function".',
+        "--allow-code", help='Run functions that the session names: method = "module:function".'
     ),
 ]
 

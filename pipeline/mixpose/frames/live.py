@@ -17,7 +17,6 @@ from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
-from types import TracebackType
 from typing import ClassVar
 from urllib.parse import urlsplit
 
@@ -182,12 +181,7 @@ class _Reader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         # a thread that still waits for a silent camera is left to end by itself
         self._thread.join(_FAREWELL_S)

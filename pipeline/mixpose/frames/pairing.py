@@ -33,10 +33,7 @@ _SHARE = 0.5  # of the usual distance of frames: farther apart they belong to di
 
 
 def pair(
-    sources: Mapping[str, Source],
-    start: int | None = None,
-    stop: int | None = None,
-    step: int = 1,
+    sources: Mapping[str, Source], start: int | None = None, stop: int | None = None, step: int = 1
 ) -> Generator[FrameSet, None, None]:
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 

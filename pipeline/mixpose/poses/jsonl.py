@@ -95,10 +95,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         },
         **({"points": _points(estimate.points)} if estimate.points else {}),
         "hypotheses": [
-            {
-                "T_world_object": plain(rival.T_world_object),
-                "weight": plain(rival.weight),
-            }
+            {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms or 0.0),

@@ -279,12 +279,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
 
 def latency(series: Series) -> list[Chart]:
     """How long frames took, as a histogram over a logarithmic axis."""
-    from matplotlib.ticker import (  # noqa: PLC0415 - heavy
-        LogLocator,
-        MaxNLocator,
-        NullFormatter,
-        StrMethodFormatter,
-    )
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415 - heavy
 
     known = series.latency_ms[series.latency_ms > 0]  # NaN is not greater either
     if not known.size:

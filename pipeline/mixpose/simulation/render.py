@@ -81,10 +81,7 @@ class ProfileFormat:
 
 
 def render_image(
-    visible: VisibleSpots,
-    form: ImageFormat,
-    options: SimulationOptions,
-    rng: np.random.Generator,
+    visible: VisibleSpots, form: ImageFormat, options: SimulationOptions, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """The image (H, W) that a camera takes of spots in px; what is brighter than 255 is 255."""
     width, height = form.resolution
@@ -141,10 +138,7 @@ def draw_light(
 
 
 def render_profile(
-    visible: VisibleSpots,
-    form: ProfileFormat,
-    options: SimulationOptions,
-    rng: np.random.Generator,
+    visible: VisibleSpots, form: ProfileFormat, options: SimulationOptions, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """The profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
     profile = np.zeros(form.bins)
