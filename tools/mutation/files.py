@@ -310,8 +310,8 @@ _FORMATS = (
     Mutant(
         "poses-csv-lower-triangle",
         "poses/csvtable.py",
-        "upper: list[Any] = plain(estimate.covariance[_UPPER])",
-        "upper: list[Any] = plain(estimate.covariance[np.tril_indices(6)])",
+        "plain(estimate.covariance[_UPPER])",
+        "plain(estimate.covariance[np.tril_indices(6)])",
         "covariances stand under the names of others",
     ),
     Mutant(

@@ -9,9 +9,17 @@ from typing import Annotated
 
 import typer
 
-from mixpose.cli.app_after import align, convert, evaluate, pivot, report, schema, smooth
-from mixpose.cli.app_before import calibrate, design, import_, learn
-from mixpose.cli.app_simulate import simulate
+from mixpose.cli.app_after import (
+    AlignRequest,
+    ConvertRequest,
+    PivotRequest,
+    SmoothRequest,
+    evaluate,
+    report,
+    schema,
+)
+from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
+from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
 from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, option, taking
 
@@ -55,7 +63,7 @@ Sources = Annotated[
 
 @dataclass(frozen=True)
 class RunWords:
-    """What was asked for, as it was typed; `mixpose.cli.request.RunRequest` is made of it."""
+    """Estimate a pose per frame."""
 
     context: typer.Context
     sessions: Annotated[
@@ -117,10 +125,8 @@ class RunWords:
     allow_code: AllowCode = False
 
 
-@app.command(cls=Command)
-@taking(RunWords)
 def run(words: RunWords) -> None:
-    """Estimate a pose per frame."""
+    """Run one session here, or many in processes of their own, as was asked for."""
     from mixpose.cli.request import RunRequest, format_of, output_of  # noqa: PLC0415
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
     from mixpose.errors import SessionError  # noqa: PLC0415
@@ -158,7 +164,6 @@ def run(words: RunWords) -> None:
     run_session(Path(sessions[0]), request)
 
 
-@app.command(cls=Command)
 def check(
     session: SessionFile,
     quick: Annotated[
@@ -175,7 +180,7 @@ def check(
 
 @dataclass(frozen=True)
 class InspectRequest:
-    """What was asked for."""
+    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
     session: SessionFile
     output: Path = option(..., "Folder for the pictures.", "-o", "--output")
@@ -187,28 +192,22 @@ class InspectRequest:
     allow_code: AllowCode = False
 
 
-@app.command(cls=Command)
-@taking(InspectRequest)
-def inspect(request: InspectRequest) -> None:
-    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
-    from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
-
-    inspect_frame(request)
-
-
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "import": import_,
-    "simulate": simulate,
+    "run": taking(RunWords, run),
+    "check": check,
+    "inspect": taking(InspectRequest, "inspect:inspect_frame"),
+    "import": taking(ImportRequest, "importing:import_files"),
+    "simulate": taking(SimulateRequest, "simulate:simulate_session"),
     "evaluate": evaluate,
-    "convert": convert,
+    "convert": taking(ConvertRequest, "convert:convert_poses"),
     "schema": schema,
     "report": report,
-    "calibrate": calibrate,
-    "design": design,
-    "pivot": pivot,
-    "align": align,
-    "smooth": smooth,
-    "learn": learn,
+    "calibrate": taking(CalibrateRequest, "calibrate:calibrate_session"),
+    "design": taking(DesignRequest, "design:design_sessions"),
+    "pivot": taking(PivotRequest, "pivot:pivot_poses"),
+    "align": taking(AlignRequest, "align:align_session"),
+    "smooth": taking(SmoothRequest, "smooth:smooth_poses"),
+    "learn": taking(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():
     app.command(name, cls=Command)(command)

@@ -16,7 +16,6 @@ from mixpose.cli.words import (
     Recordings,
     SessionFile,
     option,
-    taking,
 )
 
 TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
@@ -58,7 +57,7 @@ def schema() -> None:
 
 @dataclass(frozen=True)
 class ConvertRequest:
-    """What was asked for."""
+    """Write poses in the format of another program."""
 
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
     output: Path | None = option(None, "Write here, not to stdout (-).", "-o", "--output")
@@ -84,40 +83,25 @@ class ConvertRequest:
     allow_code: AllowCode = False
 
 
-@taking(ConvertRequest)
-def convert(request: ConvertRequest) -> None:
-    """Write poses in the format of another program."""
-    from mixpose.cli.convert import convert_poses  # noqa: PLC0415
-
-    convert_poses(request)
-
-
-def smooth(
-    poses: PosesFile,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="SMOOTH.jsonl", help="Write here, not to stdout."),
-    ] = None,
-    fill: Annotated[
-        float,
-        typer.Option(
-            min=0, metavar="SECONDS", help="Fill gaps of at most so long, marked; else none."
-        ),
-    ] = 0.0,
-    motion: Annotated[
-        Literal["acceleration", "jerk", "snap", "crackle"] | None,
-        typer.Option(help="Which derivative of the motion takes white noise; else the likeliest."),
-    ] = None,
-) -> None:
+@dataclass(frozen=True)
+class SmoothRequest:
     """Smooth the poses of a recording, each by all that came before and after."""
-    from mixpose.cli.smooth import smooth_poses  # noqa: PLC0415
 
-    smooth_poses(poses, output, fill_s=fill, motion=motion)
+    poses: PosesFile
+    output: Path | None = option(
+        None, "Write here, not to stdout.", "-o", "--output", metavar="SMOOTH.jsonl"
+    )
+    fill: float = option(
+        0.0, "Fill gaps of at most so long, marked; else none.", min=0, metavar="SECONDS"
+    )
+    motion: Literal["acceleration", "jerk", "snap", "crackle"] | None = option(
+        None, "Which derivative of the motion takes white noise; else the likeliest."
+    )
 
 
 @dataclass(frozen=True)
 class PivotRequest:
-    """What was asked for."""
+    """The tip of a tool, from poses while it turns about its tip."""
 
     poses: PosesFile
     object: str | None = option(None, "The tool, where there are several bodies.", metavar="OBJECT")
@@ -127,17 +111,9 @@ class PivotRequest:
     into: Path | None = option(None, "Write the tip into this session.", metavar="SESSION.toml")
 
 
-@taking(PivotRequest)
-def pivot(request: PivotRequest) -> None:
-    """The tip of a tool, from poses while it turns about its tip."""
-    from mixpose.cli.pivot import pivot_poses  # noqa: PLC0415
-
-    pivot_poses(request)
-
-
 @dataclass(frozen=True)
 class AlignRequest:
-    """What was asked for."""
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
 
     session: SessionFile
     floor: list[str] = option(
@@ -148,11 +124,3 @@ class AlignRequest:
     output: Path = option(..., "The aligned session.", "-o", "--output", metavar="ALIGNED.toml")
     up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
     source: Recordings = None
-
-
-@taking(AlignRequest)
-def align(request: AlignRequest) -> None:
-    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
-    from mixpose.cli.align import align_session  # noqa: PLC0415
-
-    align_session(request)

@@ -8,10 +8,13 @@ from typing import Annotated
 
 import typer
 
-from mixpose.cli.words import AllowCode, LengthUnit, Recordings, SessionFile, option, taking
+from mixpose.cli.words import AllowCode, LengthUnit, Recordings, SessionFile, option
 
 
-def import_(
+@dataclass(frozen=True)
+class ImportRequest:
+    """Make a session of the calibration files of other programs."""
+
     files: Annotated[
         list[Path],
         typer.Argument(
@@ -19,25 +22,17 @@ def import_(
             help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
             "and bodies: .csv, .rom, .vsk or .obj.",
         ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The session file, which must be new.")
-    ],
-    unit: Annotated[LengthUnit, typer.Option(help="Unit of lengths in the session.")] = "mm",
-    lengths: Annotated[
-        LengthUnit | None,
-        typer.Option(help="Unit of translations in files whose format does not fix it."),
-    ] = None,
-) -> None:
-    """Make a session of the calibration files of other programs."""
-    from mixpose.cli.importing import import_files  # noqa: PLC0415
-
-    import_files(files, output, unit=unit, lengths=lengths)
+    ]
+    output: Path = option(..., "The session file, which must be new.", "-o", "--output")
+    unit: LengthUnit = option("mm", "Unit of lengths in the session.")
+    lengths: LengthUnit | None = option(
+        None, "Unit of translations in files whose format does not fix it."
+    )
 
 
 @dataclass(frozen=True)
 class CalibrateRequest:
-    """What was asked for."""
+    """Calibrate sensors from a recording of the body, without matching markers."""
 
     session: SessionFile
     output: Path | None = option(
@@ -65,17 +60,9 @@ class CalibrateRequest:
     source: Recordings = None
 
 
-@taking(CalibrateRequest)
-def calibrate(request: CalibrateRequest) -> None:
-    """Calibrate sensors from a recording of the body, without matching markers."""
-    from mixpose.cli.calibrate import calibrate_session  # noqa: PLC0415
-
-    calibrate_session(request)
-
-
 @dataclass(frozen=True)
 class LearnRequest:
-    """What was asked for."""
+    """Learn the markers of bodies from a recording in which they move."""
 
     session: SessionFile
     output: Path = option(
@@ -100,17 +87,9 @@ class LearnRequest:
     allow_code: AllowCode = False
 
 
-@taking(LearnRequest)
-def learn(request: LearnRequest) -> None:
-    """Learn the markers of bodies from a recording in which they move."""
-    from mixpose.cli.learn import learn_session  # noqa: PLC0415
-
-    learn_session(request)
-
-
 @dataclass(frozen=True)
 class DesignRequest:
-    """What was asked for."""
+    """Predict the accuracy of planned systems, side by side, and what would improve them."""
 
     sessions: Annotated[
         list[Path],
@@ -153,11 +132,3 @@ class DesignRequest:
         "for one on this machine.",
         metavar="ADDRESS",
     )
-
-
-@taking(DesignRequest)
-def design(request: DesignRequest) -> None:
-    """Predict the accuracy of planned systems, side by side, and what would improve them."""
-    from mixpose.cli.design import design_sessions  # noqa: PLC0415
-
-    design_sessions(request)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from mixpose.cli.words import SessionFile, option, taking
+from mixpose.cli.words import SessionFile, option
 
 MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
 IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
@@ -13,7 +13,7 @@ IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
 
 @dataclass(frozen=True)
 class SimulateRequest:
-    """What was asked for; most of it are fields of `mixpose.simulation.SimulationOptions`."""
+    """Render a recording with truth.jsonl that `run` can play."""
 
     session: SessionFile
     output: Path = option(..., "New folder for the recording.", "-o", "--output")
@@ -76,11 +76,3 @@ class SimulateRequest:
         None, "Frames after which the body is gone.", min=0, panel=MOTION
     )
     overwrite: bool = option(False, "Replace a recording in the folder.")
-
-
-@taking(SimulateRequest)
-def simulate(request: SimulateRequest) -> None:
-    """Render a recording with truth.jsonl that `run` can play."""
-    from mixpose.cli.simulate import simulate_session  # noqa: PLC0415
-
-    simulate_session(request)

@@ -48,20 +48,11 @@ def convert_poses(request: ConvertRequest) -> None:
         if output.is_file() | (not output.exists()):
             refuse_to_overwrite(output, [path])
     if name == "rerun":
-        write_rerun(
-            poses,
-            lines,
-            request.output,
-            request.session,
-            request.source or (),
-            allow_code=request.allow_code,
-        )
+        write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
         session = session_of(poses, request.session, allow_code=request.allow_code)
         _unit(poses, request)
-        write_markers(
-            poses, lines, session, request.output, name, measured=request.measured, fps=request.fps
-        )
+        write_markers(poses, lines, session, name, request)
         return
     else:
         _write(poses, lines, name, request)

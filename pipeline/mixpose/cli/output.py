@@ -10,7 +10,7 @@ from typing import TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
@@ -194,8 +194,6 @@ def write_text(path: Path, text: str, option: str) -> None:
 
     Raises SessionError if it cannot be written.
     """
-    try:
-        with appearing_whole(path) as part:
-            part.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error
+    told = reporting(SessionError, f"{option} {path}: cannot be written")
+    with told, appearing_whole(path) as part:
+        part.write_text(text, encoding="utf-8", newline="\n")

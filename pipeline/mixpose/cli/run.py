@@ -129,9 +129,7 @@ def _not_there(estimates: Iterable[Estimate], there: ResumePoint | None) -> Iter
     for estimate in estimates:
         if there is not None:
             seen += estimate.frame == there.frame
-            if estimate.frame < there.frame or (
-                estimate.frame == there.frame and seen <= there.lines
-            ):
+            if (estimate.frame, seen) <= (there.frame, there.lines):
                 continue
         yield estimate
 

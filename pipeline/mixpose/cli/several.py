@@ -33,7 +33,7 @@ from mixpose.cli.recording_job import (
     run_job,
 )
 from mixpose.cli.request import SUFFIXES, RunRequest
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.executing import Executor, in_threads, on_cluster
 from mixpose.limits import MOST_BYTES
 from mixpose.whole_files import appearing_whole
@@ -230,10 +230,8 @@ def _folder(folder: Path | None, count: int) -> Path:
             f"-o {folder}: found the name of a file; allowed for {sessions}: a folder, in which "
             f"each gets its own; as -o {folder.with_suffix('')}, and --format for the format"
         )
-    try:
+    with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
     return folder
 
 

@@ -123,6 +123,14 @@ def is_number(value: object) -> TypeGuard[int | float]:
     return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64
 
 
+def as_number(text: str) -> float:
+    """A text as a number; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def limits(value: object) -> str:
     """What to say where a number is beyond the limits that all numbers have; else nothing."""
     if isinstance(value, int | float) and not isinstance(value, bool):

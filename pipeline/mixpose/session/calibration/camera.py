@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.session.intrinsics import CameraModel, Intrinsics
+from mixpose.session.intrinsics import CameraModel, Intrinsics, column_as_list
 from mixpose.session.messages import BadKeyError, found, in_file, one_of, under
 from mixpose.session.motion import rigid
 from mixpose.session.setup import Unit
@@ -83,19 +84,17 @@ class Format:
 def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floats:
     """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists."""
     with under("translation"):
-        t = numbers(_flat(translation), (3,), "[x, y, z]")
-    if isinstance(rotation, list) and rotation and isinstance(rotation[0], list | tuple):
-        rotation = _flat(rotation) if len(rotation[0]) == 1 else rotation
+        t = numbers(column_as_list(translation), (3,), "[x, y, z]")
+    rotation = column_as_list(rotation)
     allowed = "a rotation, three rows of three numbers or [x, y, z], axis times angle in radians"
     if isinstance(rotation, list) and len(rotation) == 9:
         rotation = [rotation[k : k + 3] for k in (0, 3, 6)]
-    if isinstance(rotation, list) and rotation and isinstance(rotation[0], list):
-        with under(key):
-            R = numbers(rotation, (3, 3), allowed)
-        return rigid(from_parts(R, t), key)
+    is_matrix = isinstance(rotation, list) and bool(rotation) and isinstance(rotation[0], list)
     with under(key):
-        vector = numbers(rotation, (3,), allowed)
-    return from_parts(Rotation.from_rotvec(vector).as_matrix(), t)
+        values = numbers(rotation, (3, 3) if is_matrix else (3,), allowed)
+    if is_matrix:
+        return rigid(from_parts(values, t), key)
+    return from_parts(Rotation.from_rotvec(values).as_matrix(), t)
 
 
 def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) -> Floats:
@@ -107,13 +106,6 @@ def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) ->
     if not 0.5 < np.linalg.norm(wxyz) < 2:
         raise BadKeyError(f"found a quaternion of length {np.linalg.norm(wxyz):.3g}; allowed: 1")
     return from_parts(Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(translation))
-
-
-def _flat(value: Any) -> Any:
-    """A column of numbers as a list."""
-    if isinstance(value, list) and all(isinstance(v, list) and len(v) == 1 for v in value):
-        return [item[0] for item in value]
-    return value
 
 
 def model_of_distortion(name: object) -> CameraModel | None:
@@ -139,11 +131,8 @@ def plain(value: Any) -> Any:
     """Turn text such as 1e-05, which YAML does not take for a number, into numbers."""
     if isinstance(value, list):
         return [plain(item) for item in value]
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return value
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
     return value
 
 

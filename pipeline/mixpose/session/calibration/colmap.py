@@ -23,7 +23,7 @@ from mixpose.session.calibration.camera import (
 )
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
-from mixpose.session.values import LARGEST
+from mixpose.session.values import LARGEST, as_number
 
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
@@ -159,10 +159,7 @@ def _whole(cell: str) -> int:
 def _floats(cells: Sequence[str]) -> list[float]:
     values = []
     for cell in cells:
-        try:
-            value = float(cell)
-        except ValueError:
-            value = np.nan
+        value = as_number(cell)
         if not abs(value) < LARGEST:
             raise BadKeyError(found(cell, "a finite number"))
         values.append(value)
