@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field
 
 from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
@@ -19,7 +19,7 @@ from mixpose.rigid import TWIST_NAMES
 from mixpose.session.schema_common import ExtractTable, Motion, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import FREE_ALLOWED, RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, Free
 
 MOST_ALIKE = 1000
 """Identical bodies that a session may have."""
@@ -136,9 +136,7 @@ class EstimatorTable(Table):
     """What is maximised: the normalised objective, the paper's product of the sensors inside the
     integral, or the product of one objective per sensor.
     Example: `objective = "paper"`"""
-    free: Annotated[tuple[str, ...], PlainValidator(read_free)] = Field(
-        TWIST_NAMES, description=FREE_ALLOWED
-    )
+    free: Free = TWIST_NAMES
     """Directions of the world that are estimated; the others stay where `[start]` has them.
     Example: `free = ["x", "y", "rz"]`"""
     samples: int = Field(

@@ -7,18 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator
+from pydantic import BaseModel, ConfigDict, Field
 
 from mixpose.records import Floats
-from mixpose.session.values import (
-    LARGEST,
-    METHOD_ALLOWED,
-    SMALLEST,
-    THRESHOLD_ALLOWED,
-    ArrayOf,
-    read_method,
-    read_threshold,
-)
+from mixpose.session.values import LARGEST, SMALLEST, ArrayOf, Method, Threshold
 
 Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
 Number: TypeAlias = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -65,9 +57,7 @@ class ExtractTable(Table):
     are found already, and of these keys only `sigma` counts.
     """
 
-    method: Annotated[str | None, PlainValidator(read_method)] = Field(
-        None, description=METHOD_ALLOWED
-    )
+    method: Method = None
     """Centres of spots and disks (`"blobs"`), corners of a chessboard, the grey values themselves,
     centres of unsharp or faint spots by the Laplacian of Gaussian (`"log"`, which needs
     `spot_sigma`: about how wide they are), or a function of your own in a module beside the session
@@ -76,9 +66,7 @@ class ExtractTable(Table):
     polarity: Literal["bright", "dark"] | None = None
     """Whether features are brighter or darker than what surrounds them.
     Example: `polarity = "dark"`"""
-    threshold: Annotated[str | Number | None, PlainValidator(read_threshold)] = Field(
-        None, description=THRESHOLD_ALLOWED
-    )
+    threshold: Threshold = None
     """Grey level that parts features from the background. `"auto"` goes by the noise of the image
     and the brightest feature. `"triangle"` and `"li"` go by the histogram: they keep what is dim
     beside something much brighter, and more of what is no feature. `"otsu"` parts two classes of

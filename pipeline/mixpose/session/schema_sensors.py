@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field, PlainValidator
 
 from mixpose.records import Floats
 from mixpose.session.intrinsics import MATRIX_FORM
@@ -23,14 +23,12 @@ from mixpose.session.schema_common import (
 )
 from mixpose.session.setup import Unit
 from mixpose.session.values import (
-    DELAY_ALLOWED,
     RESOLUTION_FORM,
-    SOURCE_ALLOWED,
     ArrayOf,
+    Delay,
+    SensorName,
+    Source,
     read_calibration_key,
-    read_delay,
-    read_sensor_name,
-    read_source,
 )
 from mixpose.session.values import resolution as resolution_of
 
@@ -92,14 +90,10 @@ class CalibrationErrorTable(Table):
 class SensorTable(Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
-    name: Annotated[str, AfterValidator(read_sensor_name)] = Field(
-        description="a name for the sensor, as text"
-    )
+    name: SensorName
     """Name of the sensor, a different one for each.
     Example: `name = "left"`"""
-    source: Annotated[str | tuple[str, ...], PlainValidator(read_source)] = Field(
-        (), description=SOURCE_ALLOWED
-    )
+    source: Source = ()
     """The recording, relative to the session file: images, a video, a table of detections
     (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
     profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
@@ -112,9 +106,7 @@ class SensorTable(Table):
     fps: Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
     Example: `fps = 25`"""
-    delay: Annotated[float | Literal["estimate"], PlainValidator(read_delay)] = Field(
-        0.0, description=DELAY_ALLOWED
-    )
+    delay: Delay = 0.0
     """Seconds by which this sensor's frames are taken later than their times say; negative where
     they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
     delay is known (`docs/sensors-in-time.md`).

@@ -13,14 +13,8 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.calibration.camera import (
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    motion_of_quaternion,
-    size_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import motion_of_quaternion, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
 from mixpose.session.values import LARGEST, as_number
