@@ -197,13 +197,11 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 def _options(request: RunRequest) -> tuple[str, ...]:
     """Of a run of one session."""
     chosen = request.selection
-    options = [f"--format={request.format}", f"--step={chosen.step}"]
-    options += [f"--start={chosen.start}"] if chosen.start is not None else []
-    options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
-    options += ["--allow-code"] if request.allow_code else []
-    options += ["--labels"] if request.labels else []
-    options += ["--debug"] if request.debug else []
-    return tuple(options)
+    values: dict[str, object] = {"format": request.format, "step": chosen.step}
+    values |= {"start": chosen.start, "stop": chosen.stop}
+    flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
+    given = [f"--{name}={value}" for name, value in values.items() if value is not None]
+    return (*given, *(f"--{name}" for name, is_on in flags.items() if is_on))
 
 
 def _sha256(session: Path) -> str:
