@@ -123,10 +123,6 @@ class TimeAxes:
             rasterized=self._as_pixels,
         )
 
-    def mark_ambiguous(self, values: Floats) -> None:
-        """Mark the values of ambiguous frames."""
-        mark_ambiguous(self._axes, self._series.x, values, self._series)
-
     def mark_lost(self) -> None:
         """Shade the stretches of lost frames from top to bottom."""
         lost = self._series.status == "lost"
@@ -319,7 +315,7 @@ def _draw(axes: Axes, series: Series, values: Floats) -> None:
     panel = TimeAxes(axes, series)
     panel.mark_lost()
     panel.draw(values)
-    panel.mark_ambiguous(values)
+    mark_ambiguous(axes, series.x, values, series)
     panel.frame()
     axes.set_ylim(bottom=0.0)
 
@@ -355,7 +351,7 @@ def _values(
     if truth is not None:
         panel.draw(truth, TRUTH)
     panel.draw(values)
-    panel.mark_ambiguous(values)
+    mark_ambiguous(upper, series.x, values, series)
     panel.frame()
     _limit(upper, values, truth, half_width)
     upper.tick_params(labelbottom=False)
