@@ -154,7 +154,7 @@ def key_docstrings(table: type[Table]) -> dict[str, str]:
 
 def split_example(text: str) -> tuple[str, str | None]:
     """A docstring's meaning and its example, a line of TOML."""
-    meaning, _, example = text.partition("\n\nExample: ")
+    meaning, _, example = text.partition("\nExample: ")
     return meaning, example.strip("`") or None
 
 

@@ -6,6 +6,9 @@ without a traceback and leaves with `exit_status`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class MixposeError(Exception):
     """Base of every error that mixpose raises on purpose."""
@@ -23,3 +26,12 @@ class RecordingError(MixposeError):
     """A recording (images, video, table, poses file) cannot be read."""
 
     exit_status = 3
+
+
+@contextmanager
+def reporting(kind: type[MixposeError], what: str) -> Iterator[None]:
+    """Tell of an OSError inside as an error of ours: what cannot be done, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror}") from error

@@ -98,8 +98,8 @@ _SETUPS = (
     Mutant(
         "session-bias-by-default",
         "session/schema_sensors.py",
-        'range_bias: Annotated[Number, Field(description="a length")] = 0.0',
-        'range_bias: Annotated[Number, Field(description="a length")] = 1.0',
+        'range_bias: Number = Field(0.0, description="a length")',
+        'range_bias: Number = Field(1.0, description="a length")',
         "ranges are off by a length that nobody wrote",
     ),
     Mutant(
@@ -112,8 +112,8 @@ _SETUPS = (
     Mutant(
         "session-few-samples-by-default",
         "session/schema.py",
-        "    ] = 1000\n",
-        "    ] = 100\n",
+        "        1000, ge=2, le=1_000_000",
+        "        100, ge=2, le=1_000_000",
         "poses of blurred bodies scatter three times as much",
     ),
     Mutant(
@@ -142,7 +142,7 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-equidistant-is-pinhole",
-        "session/calibration/camera.py",
+        "session/calibration/pieces.py",
         '"equidistant": "fisheye"',
         '"equidistant": "pinhole"',
         "a fisheye calibration is used for a pinhole camera",
@@ -310,8 +310,8 @@ _FORMATS = (
     Mutant(
         "poses-csv-lower-triangle",
         "poses/csvtable.py",
-        "upper: list[Any] = plain(estimate.covariance[_UPPER])",
-        "upper: list[Any] = plain(estimate.covariance[np.tril_indices(6)])",
+        "plain(estimate.covariance[_UPPER])",
+        "plain(estimate.covariance[np.tril_indices(6)])",
         "covariances stand under the names of others",
     ),
     Mutant(

@@ -50,8 +50,8 @@ _NUMBERS = (
     Mutant(
         "frames-twins-keep-their-number",
         "frames/images.py",
-        "if len(numbers) == len(set(numbers)) == len(paths):",
-        "if len(numbers) == len(paths):",
+        "if len(numbers) == len({*numbers}) == len(paths) else",
+        "if len(numbers) == len(paths) else",
         "two images of one number are frames twice",
     ),
     Mutant(

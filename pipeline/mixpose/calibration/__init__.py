@@ -5,22 +5,9 @@ detections  →  each camera alone (hypotheses)  →  links between sensors  →
 →  what is determined, how well, and whether frames held back agree
 """
 
-from __future__ import annotations
-
-from mixpose.calibration.calibrate import calibrate
-from mixpose.calibration.result import Calibration, Residual
-from mixpose.calibration.rig import Rig
-from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.task import SeenFrame, Task
-from mixpose.calibration.words import free_parameters
-
-__all__ = [
-    "Calibration",
-    "CalibrationRules",
-    "Residual",
-    "Rig",
-    "SeenFrame",
-    "Task",
-    "calibrate",
-    "free_parameters",
-]
+from mixpose.calibration.calibrate import calibrate as calibrate
+from mixpose.calibration.result import Calibration as Calibration, Residual as Residual
+from mixpose.calibration.rig import Rig as Rig
+from mixpose.calibration.rules import CalibrationRules as CalibrationRules
+from mixpose.calibration.task import SeenFrame as SeenFrame, Task as Task
+from mixpose.calibration.words import free_parameters as free_parameters

@@ -46,19 +46,10 @@ def read_frames(
 ) -> tuple[SeenFrame, ...]:
     """Read a recording, or frames spread evenly over a long one, and take what tells most.
 
-    Parameters
-    ----------
-    sources : mapping of str to str
-        Recordings in place of the session's.
-    runs : bool
-        Whether frames next to each other are needed, as motion between them counts.
-    known : collection of int or None
-        Frames whose pose is known, if that is so of any; the others are not needed then.
-
-    Raises
-    ------
-    RecordingError
-        If a source is live or cannot be read, or no frame has a detection.
+    `sources` stand in place of the session's. `runs` says whether frames next to each other are
+    needed, as motion between them counts; `known` are the frames whose pose is known, if that is so
+    of any: the others are not needed then. Raises RecordingError if a source is live or cannot be
+    read, or no frame has a detection.
     """
     opened = open_sources(session, sources)
     live = [name for name, source in opened.items() if source.kind == "live"]

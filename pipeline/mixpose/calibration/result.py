@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -144,6 +145,16 @@ def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
         named = np.array(numbers, dtype=np.intp)[pairs.frame[kept]]
         found[s] = Sights(pairs.y[kept], rows.residual[kept], named, pairs.feature[kept])
     return found
+
+
+def residuals_by(found: Calibration, kind: Literal["frame", "feature"]) -> tuple[Indices, Floats]:
+    """Numbers (n,) of frames or of features, and RMS residuals (n,), in standard deviations."""
+    keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+    for sensor, sights in found.sights.items():
+        keys.append(getattr(sights, kind))
+        squares.append((sights.offset**2).sum(axis=1) / found.noise[sensor] ** 2)
+    numbers, which = np.unique(np.concatenate(keys), return_inverse=True)
+    return numbers, np.sqrt(np.bincount(which, np.concatenate(squares)) / np.bincount(which))
 
 
 @dataclass(frozen=True)

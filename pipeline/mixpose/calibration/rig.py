@@ -178,10 +178,10 @@ def moved(rig: Rig, blocks: Sequence[Block], step: Floats) -> Rig:
         if block.sensor is None:
             rig = replace(rig, points=rig.points + delta.reshape(-1, 3))
         elif block.kind in ("delay", "drift"):
-            values = (rig.delays if block.kind == "delay" else rig.drifts).copy()
+            field = f"{block.kind}s"
+            values = getattr(rig, field).copy()
             values[block.sensor] += delta[0]
-            late = block.kind == "delay"
-            rig = replace(rig, delays=values) if late else replace(rig, drifts=values)
+            rig = replace(rig, **{field: values})
         else:
             sensor = _changed(rig.sensors[block.sensor], block.kind, delta)
             rig = rig.exchanged(block.sensor, sensor)
@@ -192,7 +192,7 @@ def values_of(rig: Rig, block: Block) -> Floats:
     """Values of a sensor's parameters, other than a pose."""
     assert block.sensor is not None, "features of the body are in rig.points"
     if block.kind in ("delay", "drift"):
-        return (rig.delays if block.kind == "delay" else rig.drifts)[[block.sensor]]
+        return getattr(rig, f"{block.kind}s")[[block.sensor]]  # type: ignore[no-any-return]
     return _values(rig.sensors[block.sensor], block.kind)[: len(block.names)]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.calibration.result import Calibration, Displacement, displacements
+from mixpose.calibration.result import Calibration, Displacement, displacements, residuals_by
 from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
@@ -158,18 +158,14 @@ def _residual_lines(found: Calibration, unit: str) -> list[str]:
 
 def _worst_lines(found: Calibration) -> list[str]:
     """Frames and features that fit worst, by name."""
-    squared = [(s.offset**2).sum(axis=1) / found.noise[k] ** 2 for k, s in found.sights.items()]
-    numbers = [sights.frame for sights in found.sights.values()]
-    features = [sights.feature for sights in found.sights.values()]
     lines = []
-    for title, parts in (("frames", numbers), ("features", features)):
-        keys, which = np.unique(np.concatenate(parts), return_inverse=True)
-        rms = np.sqrt(np.bincount(which, np.concatenate(squared)) / np.bincount(which))
-        called = found.after.labels if title == "features" else dict(zip(keys, keys.astype(str)))
+    for kind in ("frame", "feature"):
+        keys, rms = residuals_by(found, kind)
+        called = found.after.labels if kind == "feature" else dict(zip(keys, keys.astype(str)))
         typical = np.median(rms) if len(rms) else 1.0
         worst = np.lexsort((keys, -rms))[:_WORST]
         told = ", ".join(f"{called[keys[k]]} ({rms[k] / typical:.2g})" for k in worst)
-        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {told}")
+        lines.append(f"{'worst':<10}{kind}s, by their residual over the median of all: {told}")
     return lines
 
 

@@ -18,6 +18,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.sensors import CalibrationError, RangeSensor
+from mixpose.session.values import as_number
 
 ALLOWED = ", ".join(KINDS)
 _FREES: dict[Kind, tuple[str, ...]] = {
@@ -111,10 +112,7 @@ def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
     """
     names, _, value = words.partition("=")
     first, _, second = names.partition(":")
-    try:
-        length = float(value)
-    except ValueError:
-        length = 0.0
+    length = as_number(value)
     if first not in rig.names or second not in rig.names or first == second or not length > 0:
         raise SessionError(
             f"--length {words}: allowed: SENSOR:SENSOR=LENGTH with two of {', '.join(rig.names)} "

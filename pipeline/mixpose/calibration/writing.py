@@ -11,7 +11,7 @@ from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block
 from mixpose.records import Floats
 from mixpose.session import Session
-from mixpose.session.rewriting import ROTATIONS, document_of, plain, put, text_of
+from mixpose.session.rewriting import document_of, plain, put, put_motion, text_of
 
 MARK = "# Calibrated by mixpose"
 
@@ -40,9 +40,7 @@ def _put_sensor(table: Any, found: Calibration, index: int) -> None:
         return there and not np.array_equal(getattr(sensor, key), getattr(before, key))
 
     if has_moved("T_sensor_world"):
-        for key in ROTATIONS:
-            table.pop(key, None)
-        _put(table, "T_sensor_world", sensor.T_sensor_world, said.get("pose"))
+        put_motion(table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose")))
     if {"focal", "principal_point", "distortion"} & said.keys() and hasattr(
         sensor, "camera_matrix"
     ):
@@ -63,7 +61,11 @@ def _put_sensor(table: Any, found: Calibration, index: int) -> None:
 
 
 def _put(table: Any, key: str, value: Floats | float, said: str | None) -> None:
-    put(table, key, plain(value), f"one standard deviation: {said}" if said else None)
+    put(table, key, plain(value), _deviation(said))
+
+
+def _deviation(said: str | None) -> str | None:
+    return f"one standard deviation: {said}" if said else None
 
 
 def _said(found: Calibration, block: Block) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mixpose import __version__, rigid
+from mixpose.calibration.rig import centre_of
 from mixpose.cli.app_after import AlignRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but, write_text
@@ -80,12 +81,7 @@ def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate
 
 def _places(session: Session) -> Floats:
     """Where sensors are; parallel beams, which come from everywhere, as their frames."""
-    places = []
-    for setup in session.sensors:
-        sensor: Any = setup.sensor
-        is_range = hasattr(sensor, "position")
-        places.append(sensor.position if is_range else rigid.inverse(sensor.T_sensor_world)[:3, 3])
-    return np.stack(places)
+    return np.stack([centre_of(setup.sensor) for setup in session.sensors])
 
 
 def _aligned_text(session: Session, floor: Floor, target: Path) -> str:

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mixpose.cli.app_after import align, convert, evaluate, pivot, report, schema, smooth
-from mixpose.cli.app_before import calibrate, design, import_, learn
-from mixpose.cli.app_simulate import simulate
+from mixpose.cli.app_after import (
+    AlignRequest,
+    ConvertRequest,
+    PivotRequest,
+    SmoothRequest,
+    evaluate,
+    report,
+    schema,
+)
+from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
+from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, Start, Step, Stop, taking
+from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, option, taking
 
 app = typer.Typer(
     name="mixpose",
@@ -43,28 +51,6 @@ def _common(
     pass
 
 
-Sessions = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="SESSION.toml...",
-        help="One session file or several, patterns such as 'day*/session.toml', or text files "
-        "(.txt) with one to a line.",
-    ),
-]
-RunOutput = Annotated[
-    Path | None,
-    typer.Option(
-        "-o",
-        "--output",
-        help="Write poses here, not to stdout (-), in the format that the suffix tells. With "
-        "several sessions, a folder in which each gets its own for poses, log and status; what "
-        "is done there already is not done again.",
-    ),
-]
-RunFormat = Annotated[
-    Format | None,
-    typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."),
-]
 Sources = Annotated[
     list[str] | None,
     typer.Option(
@@ -73,122 +59,111 @@ Sources = Annotated[
         "camera; repeatable.",
     ),
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on after the last frame in the output.")]
-Workers = Annotated[int, typer.Option(min=1, help="How many sessions are run at a time.")]
-Overlay = Annotated[
-    Path | None,
-    typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
-]
-Labels = Annotated[
-    bool,
-    typer.Option(
-        "--labels",
-        help="Say in each pose line which detection is which feature, and where features are in "
-        "space by these alone; .jsonl only.",
-    ),
-]
-View = Annotated[
-    str | None,
-    typer.Option(
-        metavar="[PORT]",
-        help="Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
+
+
+@dataclass(frozen=True)
+class RunWords:
+    """Estimate a pose per frame."""
+
+    context: typer.Context
+    sessions: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SESSION.toml...",
+            help="One session file or several, patterns such as 'day*/session.toml', or text files "
+            "(.txt) with one to a line.",
+        ),
+    ]
+    output: Path | None = option(
+        None,
+        "Write poses here, not to stdout (-), in the format that the suffix tells. With "
+        "several sessions, a folder in which each gets its own for poses, log and status; what "
+        "is done there already is not done again.",
+        "-o",
+        "--output",
+    )
+    format: Format | None = option(
+        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
+    )
+    source: Sources = None
+    start: int | None = option(None, "First frame number.")
+    stop: int | None = option(None, "Frame number to stop before.")
+    step: int = option(1, "Take every N-th frame number.", min=1)
+    resume: bool = option(False, "Go on after the last frame in the output.")
+    workers: int = option(1, "How many sessions are run at a time.", min=1)
+    overlay: Path | None = option(
+        None, "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
+    )
+    view: str | None = option(
+        None,
+        "Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
         "opens it to others who have the address with its token.",
-    ),
-]
-Pause = Annotated[
-    bool,
-    typer.Option("--pause", help="With --view, on files: begin paused, to go on from the page."),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
+        metavar="[PORT]",
+    )
+    pause: bool = option(False, "With --view, on files: begin paused, to go on from the page.")
+    scheduler: str | None = option(
+        None,
+        "Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
         "local for one on this machine.",
-    ),
-]
-Publish = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="URL",
-        help="Send each pose to another program too: udp://host:port, tcp://host:port, "
+        metavar="ADDRESS",
+    )
+    labels: bool = option(
+        False,
+        "Say in each pose line which detection is which feature, and where features are in "
+        "space by these alone; .jsonl only.",
+    )
+    publish: list[str] | None = option(
+        None,
+        "Send each pose to another program too: udp://host:port, tcp://host:port, "
         "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
         "'?only=ok' none but those that are ok; repeatable.",
-    ),
-]
-Predict = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS", help="Publish where the body will be so much after each frame."
-    ),
-]
+        metavar="URL",
+    )
+    predict: float | None = option(
+        None, "Publish where the body will be so much after each frame.", metavar="SECONDS"
+    )
+    allow_code: AllowCode = False
 
 
-@app.command(cls=Command)
-def run(
-    context: typer.Context,
-    sessions: Sessions,
-    output: RunOutput = None,
-    format: RunFormat = None,
-    source: Sources = None,
-    start: Start = None,
-    stop: Stop = None,
-    step: Step = 1,
-    resume: Resume = False,
-    workers: Workers = 1,
-    overlay: Overlay = None,
-    view: View = None,
-    pause: Pause = False,
-    scheduler: Scheduler = None,
-    labels: Labels = False,
-    publish: Publish = None,
-    predict: Predict = None,
-    allow_code: AllowCode = False,
-) -> None:
-    """Estimate a pose per frame."""
+def run(words: RunWords) -> None:
+    """Run one session here, or many in processes of their own, as was asked for."""
     from mixpose.cli.request import RunRequest, format_of, output_of  # noqa: PLC0415
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
     from mixpose.errors import SessionError  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
-    selection, output = Selection(start, stop, step), output_of(output)
-    sources, debug = tuple(source or ()), bool(context.obj)
-    many = are_many(sessions, scheduler)
-    written = (format or "jsonl") if many else format_of(output, format)  # of many: a folder
-    request = RunRequest(
-        output,
-        written,
-        sources,
-        selection,
-        resume,
-        overlay,
-        debug,
-        allow_code,
-        scheduler,
-        labels,
-        tuple(publish or ()),
-        predict,
-        view,
-        pause,
-    )
-    if labels and written != "jsonl":
+    sessions, output = words.sessions, output_of(words.output)
+    many = are_many(sessions, words.scheduler)
+    # of many: a folder
+    written = (words.format or "jsonl") if many else format_of(output, words.format)
+    shared = {one.name for one in fields(RunRequest)}
+    given = {
+        **{name: value for name, value in vars(words).items() if name in shared},
+        "output": output,
+        "format": written,
+        "sources": tuple(words.source or ()),
+        "selection": Selection(words.start, words.stop, words.step),
+        "publish": tuple(words.publish or ()),
+        "debug": bool(words.context.obj),
+    }
+    request = RunRequest(**given)
+    if words.labels and written != "jsonl":
         raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
-    if many and (publish or predict is not None):
+    if many and (words.publish or words.predict is not None):
         raise SessionError(
             "--publish: found several sessions; allowed is one, whose poses receivers take for one "
             "recording"
         )
     if many:
-        raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
+        raise typer.Exit(run_sessions(sessions_of(sessions), request, words.workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415
     from mixpose.cli.run import run_session  # noqa: PLC0415
 
-    if workers > 1:
-        warn(f"--workers {workers}: one session is one process, frames follow each other")
+    if words.workers > 1:
+        warn(f"--workers {words.workers}: one session is one process, frames follow each other")
     run_session(Path(sessions[0]), request)
 
 
-@app.command(cls=Command)
 def check(
     session: SessionFile,
     quick: Annotated[
@@ -205,45 +180,34 @@ def check(
 
 @dataclass(frozen=True)
 class InspectRequest:
-    """What was asked for."""
+    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
     session: SessionFile
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")]
-    frame: Annotated[
-        int | None, typer.Option(help="Number of the frame; else the recording's first.")
-    ] = None
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="POSES.jsonl", help="Take the pose from a run, not from this frame alone."
-        ),
-    ] = None
+    output: Path = option(..., "Folder for the pictures.", "-o", "--output")
+    frame: int | None = option(None, "Number of the frame; else the recording's first.")
+    poses: Path | None = option(
+        None, "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
+    )
     source: Recordings = None
     allow_code: AllowCode = False
 
 
-@app.command(cls=Command)
-@taking(InspectRequest)
-def inspect(request: InspectRequest) -> None:
-    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
-    from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
-
-    inspect_frame(request)
-
-
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "import": import_,
-    "simulate": simulate,
+    "run": taking(RunWords, run),
+    "check": check,
+    "inspect": taking(InspectRequest, "inspect:inspect_frame"),
+    "import": taking(ImportRequest, "importing:import_files"),
+    "simulate": taking(SimulateRequest, "simulate:simulate_session"),
     "evaluate": evaluate,
-    "convert": convert,
+    "convert": taking(ConvertRequest, "convert:convert_poses"),
     "schema": schema,
     "report": report,
-    "calibrate": calibrate,
-    "design": design,
-    "pivot": pivot,
-    "align": align,
-    "smooth": smooth,
-    "learn": learn,
+    "calibrate": taking(CalibrateRequest, "calibrate:calibrate_session"),
+    "design": taking(DesignRequest, "design:design_sessions"),
+    "pivot": taking(PivotRequest, "pivot:pivot_poses"),
+    "align": taking(AlignRequest, "align:align_session"),
+    "smooth": taking(SmoothRequest, "smooth:smooth_poses"),
+    "learn": taking(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():
     app.command(name, cls=Command)(command)

@@ -9,7 +9,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from mixpose.cli.words import AllowCode, ConvertFormat, PosesFile, Recordings, SessionFile, taking
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    PosesFile,
+    Recordings,
+    SessionFile,
+    option,
+)
 
 TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 
@@ -50,132 +57,70 @@ def schema() -> None:
 
 @dataclass(frozen=True)
 class ConvertRequest:
-    """What was asked for."""
+    """Write poses in the format of another program."""
 
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout (-).")
-    ] = None
-    format: Annotated[
-        ConvertFormat | None,
-        typer.Option(
-            help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
-        ),
-    ] = None
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
-    ] = None
-    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None
-    only_ok: Annotated[bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")] = (
-        False
+    output: Path | None = option(None, "Write here, not to stdout (-).", "-o", "--output")
+    format: ConvertFormat | None = option(
+        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
     )
-    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None
-    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None
-    relative_to: Annotated[
-        str | None,
-        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
-    ] = None
-    session: Annotated[
-        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
-    ] = None
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
-    ] = None
-    measured: Annotated[
-        bool,
-        typer.Option(
-            "--measured", help="c3d, trc: leave gaps where a marker was not measured by itself."
-        ),
-    ] = False
-    fps: Annotated[
-        float | None,
-        typer.Option(min=1e-6, max=1e6, help="c3d, trc: frames a second, in place of times."),
-    ] = None
+    unit: str | None = option(None, "Unit of lengths where POSES does not say: m, cm, mm, um.")
+    object: str | None = option(None, "Only the poses of this object.")
+    only_ok: bool = option(False, "Leave out ambiguous frames too.")
+    scene_id: int | None = option(None, "bop: the scene; 0.", min=0)
+    obj_id: int | None = option(None, "bop: the object; 1.", min=0)
+    relative_to: str | None = option(
+        None, "bop, ros, tum: relative to a camera, not the world.", metavar="SENSOR"
+    )
+    session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
+    source: list[str] | None = option(None, "rerun: as for run.", metavar="NAME=PATH")
+    measured: bool = option(
+        False, "c3d, trc: leave gaps where a marker was not measured by itself."
+    )
+    fps: float | None = option(
+        None, "c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6
+    )
     allow_code: AllowCode = False
 
 
-@taking(ConvertRequest)
-def convert(request: ConvertRequest) -> None:
-    """Write poses in the format of another program."""
-    from mixpose.cli.convert import convert_poses  # noqa: PLC0415
-
-    convert_poses(request)
-
-
-def smooth(
-    poses: PosesFile,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="SMOOTH.jsonl", help="Write here, not to stdout."),
-    ] = None,
-    fill: Annotated[
-        float,
-        typer.Option(
-            min=0, metavar="SECONDS", help="Fill gaps of at most so long, marked; else none."
-        ),
-    ] = 0.0,
-    motion: Annotated[
-        Literal["acceleration", "jerk", "snap", "crackle"] | None,
-        typer.Option(help="Which derivative of the motion takes white noise; else the likeliest."),
-    ] = None,
-) -> None:
+@dataclass(frozen=True)
+class SmoothRequest:
     """Smooth the poses of a recording, each by all that came before and after."""
-    from mixpose.cli.smooth import smooth_poses  # noqa: PLC0415
 
-    smooth_poses(poses, output, fill_s=fill, motion=motion)
+    poses: PosesFile
+    output: Path | None = option(
+        None, "Write here, not to stdout.", "-o", "--output", metavar="SMOOTH.jsonl"
+    )
+    fill: float = option(
+        0.0, "Fill gaps of at most so long, marked; else none.", min=0, metavar="SECONDS"
+    )
+    motion: Literal["acceleration", "jerk", "snap", "crackle"] | None = option(
+        None, "Which derivative of the motion takes white noise; else the likeliest."
+    )
 
 
 @dataclass(frozen=True)
 class PivotRequest:
-    """What was asked for."""
+    """The tip of a tool, from poses while it turns about its tip."""
 
     poses: PosesFile
-    object: Annotated[
-        str | None, typer.Option(metavar="OBJECT", help="The tool, where there are several bodies.")
-    ] = None
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            metavar="OBJECT", help="The tip stays at a point of this body; else of the world."
-        ),
-    ] = None
-    into: Annotated[
-        Path | None,
-        typer.Option(metavar="SESSION.toml", help="Write the tip into this session."),
-    ] = None
-
-
-@taking(PivotRequest)
-def pivot(request: PivotRequest) -> None:
-    """The tip of a tool, from poses while it turns about its tip."""
-    from mixpose.cli.pivot import pivot_poses  # noqa: PLC0415
-
-    pivot_poses(request)
+    object: str | None = option(None, "The tool, where there are several bodies.", metavar="OBJECT")
+    reference: str | None = option(
+        None, "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
+    )
+    into: Path | None = option(None, "Write the tip into this session.", metavar="SESSION.toml")
 
 
 @dataclass(frozen=True)
 class AlignRequest:
-    """What was asked for."""
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
 
     session: SessionFile
-    floor: Annotated[
-        list[str],
-        typer.Option(
-            metavar="POSES.jsonl|OBJECT@FRAME",
-            help="What lies on the floor: poses, or a body in a frame. Repeatable.",
-        ),
-    ]
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="ALIGNED.toml", help="The aligned session.")
-    ]
-    up: Annotated[Literal["x", "y", "z"], typer.Option(help="The axis that points up.")] = "z"
+    floor: list[str] = option(
+        ...,
+        "What lies on the floor: poses, or a body in a frame. Repeatable.",
+        metavar="POSES.jsonl|OBJECT@FRAME",
+    )
+    output: Path = option(..., "The aligned session.", "-o", "--output", metavar="ALIGNED.toml")
+    up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
     source: Recordings = None
-
-
-@taking(AlignRequest)
-def align(request: AlignRequest) -> None:
-    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
-    from mixpose.cli.align import align_session  # noqa: PLC0415
-
-    align_session(request)

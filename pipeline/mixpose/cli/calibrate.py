@@ -18,13 +18,7 @@ from mixpose.calibration.searching import MARK as SAVED_MARK
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
-from mixpose.calibration.words import (
-    check_world,
-    error_of_held,
-    in_world,
-    with_length,
-    words_of,
-)
+from mixpose.calibration.words import check_world, error_of_held, in_world, with_length, words_of
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
@@ -52,10 +46,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     inputs = [path] if request.poses is None else [path, request.poses]
-    for written, mark, option in (
-        (output, MARK, "-o"),
-        (request.report, REPORT_MARK, "--report"),
-    ):
+    for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
             refuse_to_overwrite_but(written, inputs, mark, option)
     with _calibrated(session, request, inputs) as found:

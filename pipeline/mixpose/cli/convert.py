@@ -13,22 +13,11 @@ import numpy as np
 from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import (
-    Output,
-    OutputPerBody,
-    is_apart,
-    refuse_to_overwrite,
-    written_paths,
-)
+from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
-from mixpose.poses.estimates import (
-    first_answers,
-    header_of,
-    objects_of,
-    relative_to,
-)
+from mixpose.poses.estimates import first_answers, header_of, objects_of, relative_to
 from mixpose.poses.formats import ONE_TRAJECTORY
 from mixpose.poses.header import UNITS_PER_METRE, Header
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -59,26 +48,11 @@ def convert_poses(request: ConvertRequest) -> None:
         if output.is_file() | (not output.exists()):
             refuse_to_overwrite(output, [path])
     if name == "rerun":
-        write_rerun(
-            poses,
-            lines,
-            request.output,
-            request.session,
-            request.source or (),
-            allow_code=request.allow_code,
-        )
+        write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
         session = session_of(poses, request.session, allow_code=request.allow_code)
         _unit(poses, request)
-        write_markers(
-            poses,
-            lines,
-            session,
-            request.output,
-            name,
-            measured=request.measured,
-            fps=request.fps,
-        )
+        write_markers(poses, lines, session, name, request)
         return
     else:
         _write(poses, lines, name, request)

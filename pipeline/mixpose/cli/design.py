@@ -22,6 +22,7 @@ from mixpose.pictures.signature import refuse_foreign, sign_figure
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Floats
 from mixpose.session import Session, load_session
+from mixpose.session.values import as_number
 from mixpose.whole_files import appearing_whole
 
 _MOST_POSES = 2000
@@ -107,10 +108,7 @@ def _poses(session: Session, asked: DesignRequest) -> Floats:
 
 
 def _three(option: str, text: str) -> Floats:
-    try:
-        values = np.array([float(cell) for cell in text.split(",")])
-    except ValueError:
-        values = np.zeros(0)
+    values = np.array([as_number(cell) for cell in text.split(",")])
     if values.shape != (3,) or not (np.abs(values) < 1e9).all():
         raise SessionError(f"{option}: found {text!r}; allowed: three numbers as 0,0,-100")
     return values
@@ -124,10 +122,7 @@ def _noises(
     for text in given:
         place, _, number = text.rpartition("=")
         system, _, sensor = place.rpartition(":")
-        try:
-            value = float(number)
-        except ValueError:
-            value = 0.0
+        value = as_number(number)
         if not (place and 0 < value < 1e9):
             raise SessionError(
                 f"--noise: found {text!r}; allowed: SENSOR=NUMBER or SYSTEM:SENSOR=NUMBER, in px "

@@ -14,61 +14,42 @@ GROUPS = {
 }
 """Commands in the order of the work; each is in one group."""
 
+_CALLS = (
+    "mixpose import camera.yml -o session.toml",
+    "mixpose import left.yml right.yml body.rom -o session.toml",
+    "mixpose calibrate session.toml -o calibrated.toml",
+    "mixpose calibrate session.toml -o calibrated.toml --free left:focal --check",
+    "mixpose learn session.toml -o body.csv",
+    "mixpose learn session.toml -o body.csv --like older.csv",
+    "mixpose check session.toml",
+    "mixpose check session.toml --source left=other/",
+    "mixpose design session.toml",
+    "mixpose design one.toml other.toml --tip 0,0,-200 --plot rigs.png",
+    "mixpose run session.toml -o poses.jsonl",
+    "mixpose run session.toml -o poses.csv --overlay seen.mp4 --publish udp://localhost:5005",
+    "mixpose inspect session.toml -o seen/",
+    "mixpose inspect session.toml --frame 12 -o seen/",
+    "mixpose evaluate poses.jsonl truth.jsonl",
+    "mixpose evaluate poses.jsonl truth.jsonl --json",
+    "mixpose report poses.jsonl -o report.html",
+    "mixpose report poses.jsonl truth.jsonl -o report.html",
+    "mixpose smooth poses.jsonl -o smooth.jsonl",
+    "mixpose smooth poses.jsonl -o smooth.jsonl --fill 0.2",
+    "mixpose pivot poses.jsonl",
+    "mixpose pivot poses.jsonl --reference base --into session.toml",
+    "mixpose align session.toml --floor plate@0 -o aligned.toml",
+    "mixpose align session.toml --floor poses.jsonl -o aligned.toml --up z",
+    "mixpose convert poses.jsonl -o poses.tum",
+    "mixpose convert poses.jsonl -o markers.c3d --measured",
+    "mixpose simulate session.toml -o try/ --frames 50",
+    "mixpose simulate session.toml -o try/ --frames 50 --seed 3 --clutter 4",
+    "mixpose schema",
+    "mixpose schema > poses.schema.json",
+)
 EXAMPLES = {
-    "import": (
-        "mixpose import camera.yml -o session.toml",
-        "mixpose import left.yml right.yml body.rom -o session.toml",
-    ),
-    "calibrate": (
-        "mixpose calibrate session.toml -o calibrated.toml",
-        "mixpose calibrate session.toml -o calibrated.toml --free left:focal --check",
-    ),
-    "learn": (
-        "mixpose learn session.toml -o body.csv",
-        "mixpose learn session.toml -o body.csv --like older.csv",
-    ),
-    "check": ("mixpose check session.toml", "mixpose check session.toml --source left=other/"),
-    "design": (
-        "mixpose design session.toml",
-        "mixpose design one.toml other.toml --tip 0,0,-200 --plot rigs.png",
-    ),
-    "run": (
-        "mixpose run session.toml -o poses.jsonl",
-        "mixpose run session.toml -o poses.csv --overlay seen.mp4 --publish udp://localhost:5005",
-    ),
-    "inspect": (
-        "mixpose inspect session.toml -o seen/",
-        "mixpose inspect session.toml --frame 12 -o seen/",
-    ),
-    "evaluate": (
-        "mixpose evaluate poses.jsonl truth.jsonl",
-        "mixpose evaluate poses.jsonl truth.jsonl --json",
-    ),
-    "report": (
-        "mixpose report poses.jsonl -o report.html",
-        "mixpose report poses.jsonl truth.jsonl -o report.html",
-    ),
-    "smooth": (
-        "mixpose smooth poses.jsonl -o smooth.jsonl",
-        "mixpose smooth poses.jsonl -o smooth.jsonl --fill 0.2",
-    ),
-    "pivot": (
-        "mixpose pivot poses.jsonl",
-        "mixpose pivot poses.jsonl --reference base --into session.toml",
-    ),
-    "align": (
-        "mixpose align session.toml --floor plate@0 -o aligned.toml",
-        "mixpose align session.toml --floor poses.jsonl -o aligned.toml --up z",
-    ),
-    "convert": (
-        "mixpose convert poses.jsonl -o poses.tum",
-        "mixpose convert poses.jsonl -o markers.c3d --measured",
-    ),
-    "simulate": (
-        "mixpose simulate session.toml -o try/ --frames 50",
-        "mixpose simulate session.toml -o try/ --frames 50 --seed 3 --clutter 4",
-    ),
-    "schema": ("mixpose schema", "mixpose schema > poses.schema.json"),
+    name: [call for call in _CALLS if call.split()[1] == name]
+    for names in GROUPS.values()
+    for name in names
 }
 """Two calls of each command."""
 

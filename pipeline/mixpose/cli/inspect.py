@@ -11,7 +11,7 @@ from pathlib import Path
 from mixpose.body import Body
 from mixpose.cli.app import InspectRequest
 from mixpose.cli.run import named_sources
-from mixpose.errors import RecordingError, SessionError
+from mixpose.errors import RecordingError, SessionError, reporting
 from mixpose.frames import Source, pair
 from mixpose.pictures.advice import describe
 from mixpose.pictures.canvas import Picture
@@ -63,10 +63,8 @@ def inspect_frame(request: InspectRequest) -> None:
         pictures |= {prefix + name: picture for name, picture in made.items()}
         lines += summary(session, body, estimate, findings, poses)
         lines += _of_clouds(session, frame_set, body, estimate)
-    try:
+    with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
     for name, picture in pictures.items():
         write_png(folder / name, picture)
     lines.append(f"pictures in {folder}: {', '.join(pictures) or 'none'}")
@@ -134,9 +132,8 @@ def _of_clouds(
             yield f"{name}: no frame"
             continue
         met = [r for r in report.residuals.values() if r is not None] if report else []
-        within = ""
-        if report is not None and report.rms is not None:
-            within = f" within {report.rms:.3g} {session.unit} RMS"
+        rms = None if report is None else report.rms
+        within = "" if rms is None else f" within {rms:.3g} {session.unit} RMS"
         yield (
             f"{name}: {len(data.points)} points found; the pose meets {len(met)} of {len(body)} "
             f"features{within}; clouds are not drawn"

@@ -6,12 +6,11 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
@@ -54,12 +53,7 @@ class Output:
     def __enter__(self) -> Output:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
             if error is None and self._writer is None:
                 self._open()  # a run without frames says at least what it was
@@ -200,8 +194,6 @@ def write_text(path: Path, text: str, option: str) -> None:
 
     Raises SessionError if it cannot be written.
     """
-    try:
-        with appearing_whole(path) as part:
-            part.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error
+    told = reporting(SessionError, f"{option} {path}: cannot be written")
+    with told, appearing_whole(path) as part:
+        part.write_text(text, encoding="utf-8", newline="\n")

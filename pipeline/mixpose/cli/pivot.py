@@ -16,14 +16,7 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.session import load_session
 from mixpose.session.rewriting import document_of, objects_of, plain, put, text_of
-from mixpose.trajectories.pivot import (
-    Pivoting,
-    PivotRules,
-    Tip,
-    find_tip,
-    fixed_in,
-    fixed_in_world,
-)
+from mixpose.trajectories.pivot import Pivoting, PivotRules, Tip, find_tip, fixed_in, fixed_in_world
 
 _DIGITS = 8
 _SLIPPED = 2.0  # times the deviations: a tip that stays where it is gives 1 within a few percent
@@ -98,13 +91,11 @@ def _known(poses: PoseFile, label: str) -> dict[int, PoseLine]:
 def _lines(tool: str, reference: str | None, tip: Tip, unit: str) -> list[str]:
     deviations = np.sqrt(tip.covariance.diagonal())
     turns = ", ".join(f"{value:.3g}" for value in tip.turns_deg[::-1])
-    where = "world" if reference is None else reference
+    where = "the world" if reference is None else reference
     return [
         f"tip of {tool}: ({_numbers(tip.place, deviations)}) {unit}",
         f"one standard deviation: ({', '.join(f'{d:.2g}' for d in deviations)}) {unit}",
-        f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in the {where}"
-        if reference is None
-        else f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in {where}",
+        f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in {where}",
         f"from it: {tip.residual:.3g} {unit} RMS, {tip.held_out:.3g} in frames held out; "
         f"{tip.expected:.3g} by the covariances of the poses",
         f"{tip.frames} frames, {tip.left_out} left out; directions of the body swing by {turns} "

@@ -212,16 +212,9 @@ def _not_shared(job: Job) -> Outcome | None:
 
 def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
     """How a job ended on this machine."""
-    return Outcome(
-        name=job.name,
-        session=job.session,
-        session_sha256=job.session_sha256,
-        options=job.options,
-        mixpose=job.mixpose,
-        state=state,
-        exit_status=exit_status,
-        host=socket.gethostname(),
-    )
+    same = ("name", "session", "session_sha256", "options", "mixpose")
+    told = {key: getattr(job, key) for key in same}
+    return Outcome(**told, state=state, exit_status=exit_status, host=socket.gethostname())
 
 
 def _frames(lines: list[str]) -> dict[str, int]:

@@ -12,13 +12,7 @@ from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import (
-    Output,
-    OutputPerBody,
-    is_apart,
-    refuse_to_overwrite,
-    written_paths,
-)
+from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -135,9 +129,7 @@ def _not_there(estimates: Iterable[Estimate], there: ResumePoint | None) -> Iter
     for estimate in estimates:
         if there is not None:
             seen += estimate.frame == there.frame
-            if estimate.frame < there.frame or (
-                estimate.frame == there.frame and seen <= there.lines
-            ):
+            if (estimate.frame, seen) <= (there.frame, there.lines):
                 continue
         yield estimate
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
@@ -33,19 +34,16 @@ def write_markers(
     poses: PoseFile,
     lines: Sequence[PoseLine],
     session: Session,
-    output: Path | None,
     format_name: str,
-    *,
-    measured: bool,
-    fps: float | None,
+    request: ConvertRequest,
 ) -> None:
     """Write where the markers of all bodies were: measured where they were, else by the pose.
 
-    `lines` are those of the poses to write, `session` has the markers, `measured` leaves a gap
-    where no sensors measured, and `fps` stands in place of the times of the poses. Raises
-    SessionError if a package is missing, or poses and options do not go together, and
-    RecordingError if the poses hold what such a file cannot.
+    `lines` are those of the poses to write, `session` has the markers. Raises SessionError if a
+    package is missing, or poses and options do not go together, and RecordingError if the poses
+    hold what such a file cannot.
     """
+    output, measured = request.output, request.measured
     if format_name == "c3d":
         _require_c3d(output)
     if output is not None:
@@ -56,7 +54,7 @@ def write_markers(
         if measured:
             raise SessionError(f"--measured: {without}; {hint}")
         warn(f"{without}; all places are by the pose; {hint}")
-    trajectories = trajectories_of(poses, lines, session, measured=measured, fps=fps)
+    trajectories = trajectories_of(poses, lines, session, measured=measured, fps=request.fps)
     if output is None:
         write_trc(sys.stdout, trajectories, "markers.trc")
         return
@@ -77,7 +75,10 @@ def trajectories_of(
     measured: bool,
     fps: float | None = None,
 ) -> Trajectories:
-    """Collect the places of all markers from pose lines; arguments as in `write_markers`."""
+    """Collect the places of all markers from pose lines.
+
+    `measured` leaves a gap where no sensors measured; `fps` stands in place of the times.
+    """
     bodies = _bodies(poses, lines, session)
     names = [(label, name) for label, body in bodies.items() for name in body.labels]
     columns = {pair: k for k, pair in enumerate(names)}
@@ -172,20 +173,13 @@ def _say(trajectories: Trajectories, output: Path) -> None:
     )
 
 
-def write_rerun(
-    poses: PoseFile,
-    lines: Sequence[PoseLine],
-    output: Path | None,
-    session_file: Path | None,
-    sources: Sequence[str],
-    *,
-    allow_code: bool = False,
-) -> None:
+def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequest) -> None:
     """Write poses and the recording of their session as an ``.rrd`` file.
 
     Raises SessionError if the viewer's package is missing, or the session is not found or not that
     of the poses. Raises RecordingError if the recording cannot be read.
     """
+    output = request.output
     if output is None:
         raise SessionError("--format rerun: needs -o FILE.rrd, it is no text")
     if find_spec("rerun") is None:
@@ -197,8 +191,8 @@ def write_rerun(
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415
     from mixpose.runner import open_sources  # noqa: PLC0415
 
-    session = session_of(poses, session_file, allow_code=allow_code)
-    opened = open_sources(session, named_sources(sources))
+    session = session_of(poses, request.session, allow_code=request.allow_code)
+    opened = open_sources(session, named_sources(request.source or ()))
     for name, source in opened.items():
         if source.kind == "live":
             raise SessionError(

@@ -33,7 +33,7 @@ from mixpose.cli.recording_job import (
     run_job,
 )
 from mixpose.cli.request import SUFFIXES, RunRequest
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.executing import Executor, in_threads, on_cluster
 from mixpose.limits import MOST_BYTES
 from mixpose.whole_files import appearing_whole
@@ -197,13 +197,11 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 def _options(request: RunRequest) -> tuple[str, ...]:
     """Of a run of one session."""
     chosen = request.selection
-    options = [f"--format={request.format}", f"--step={chosen.step}"]
-    options += [f"--start={chosen.start}"] if chosen.start is not None else []
-    options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
-    options += ["--allow-code"] if request.allow_code else []
-    options += ["--labels"] if request.labels else []
-    options += ["--debug"] if request.debug else []
-    return tuple(options)
+    values: dict[str, object] = {"format": request.format, "step": chosen.step}
+    values |= {"start": chosen.start, "stop": chosen.stop}
+    flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
+    given = [f"--{name}={value}" for name, value in values.items() if value is not None]
+    return (*given, *(f"--{name}" for name, is_on in flags.items() if is_on))
 
 
 def _sha256(session: Path) -> str:
@@ -230,10 +228,8 @@ def _folder(folder: Path | None, count: int) -> Path:
             f"-o {folder}: found the name of a file; allowed for {sessions}: a folder, in which "
             f"each gets its own; as -o {folder.with_suffix('')}, and --format for the format"
         )
-    try:
+    with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
     return folder
 
 

@@ -9,7 +9,7 @@ from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.notices import bar
 from mixpose.errors import SessionError
 from mixpose.session import load_session
-from mixpose.session.values import LONGEST_DELAY_S
+from mixpose.session.values import LONGEST_DELAY_S, as_number
 from mixpose.simulation import SimulationOptions, simulate
 from mixpose.simulation.session_copy import SESSION_NAME
 
@@ -19,10 +19,7 @@ def delays_of(given: list[str]) -> dict[str, float]:
     delays = {}
     for text in given:
         name, _, seconds = text.rpartition("=")
-        try:
-            delays[name] = float(seconds)
-        except ValueError:
-            name = ""
+        delays[name] = as_number(seconds)
         if not name or not abs(delays[name]) <= LONGEST_DELAY_S:
             raise SessionError(
                 f"--delay {text}: allowed: NAME=SECONDS, seconds from -1 to 1, like right=0.006"
@@ -51,6 +48,5 @@ def simulate_session(request: SimulateRequest) -> None:
         )
     count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(
-        f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}",
-        file=sys.stderr,
+        f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr
     )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mixpose import __version__
+from mixpose.cli.app_after import SmoothRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import RecordingError
@@ -21,12 +22,13 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 from mixpose.whole_files import appearing_whole
 
 
-def smooth_poses(path: Path, output: Path | None, *, fill_s: float, motion: str | None) -> None:
+def smooth_poses(request: SmoothRequest) -> None:
     """Smooth the poses of a file and write them.
 
     Raises SessionError if the output would overwrite something else. Raises RecordingError if the
     poses cannot be read, were smoothed before, or say too little.
     """
+    path, output = request.poses, request.output
     poses = read_poses(path)
     if poses.header.get("smoothed"):
         raise RecordingError(
@@ -45,7 +47,7 @@ def smooth_poses(path: Path, output: Path | None, *, fill_s: float, motion: str 
         own = [line for line in poses.poses if line.label == label]
         symmetries = poses.symmetries.get(own[0].object)
         try:
-            bodies[label] = smooth_body(own, symmetries, fill_s=fill_s, motion=motion)
+            bodies[label] = smooth_body(own, symmetries, fill_s=request.fill, motion=request.motion)
         except RecordingError as error:
             raise RecordingError(f"{path}: {error}") from error
     _write(poses, bodies, output)

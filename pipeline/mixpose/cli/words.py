@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import field, fields
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeAlias, get_type_hints
 
 import typer
-
-Request = TypeVar("Request")
 
 Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
 ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
@@ -24,29 +24,44 @@ Recordings = Annotated[
 AllowCode = Annotated[
     bool,
     typer.Option(
-        "--allow-code",
-        help='Run functions that the session names: method = "module:function".',
+        "--allow-code", help='Run functions that the session names: method = "module:function".'
     ),
 ]
-Step = Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")]
-Start = Annotated[int | None, typer.Option(help="First frame number.")]
-Stop = Annotated[int | None, typer.Option(help="Frame number to stop before.")]
 
 
-def taking(request: type[Request]) -> Callable[[Callable[[Request], None]], Callable[..., None]]:
-    """Make a command of a function of a record, whose fields are its arguments and options."""
+def option(default: Any, meaning: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+    """A field of a record that is an option of a command, needed where the default is `...`.
 
-    def decorated(command: Callable[[Request], None]) -> Callable[..., None]:
-        hints = get_type_hints(request, include_extras=True)
-        form = signature(request)
-        typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
+    Without names it is called like the field. `panel` heads a group of options in the help, and
+    typer takes `more`.
+    """
+    settings = {"help": meaning, "rich_help_panel": panel, **more}
+    metadata = {"names": names, "settings": settings}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
-        def called(**given: Any) -> None:
-            command(request(**given))
 
-        called.__name__, called.__doc__ = command.__name__, command.__doc__
-        called.__annotations__ = hints
-        called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
-        return called
+def taking(request: type, work: Callable[[Any], None] | str) -> Callable[..., None]:
+    """A command whose arguments and options are the fields of a record, and its docstring the help.
 
-    return decorated
+    The record goes to `work`, or to that ``module:function`` of this room, imported when called.
+    """
+    hints: dict[str, Any] = get_type_hints(request, include_extras=True)
+    for one in fields(request):
+        if one.metadata:
+            kind, names = hints[one.name], one.metadata["names"]
+            if kind is bool and not names:  # else typer adds one that begins with "no-"
+                names = (f"--{one.name.replace('_', '-')}",)
+            hints[one.name] = Annotated[kind, typer.Option(*names, **one.metadata["settings"])]
+    form = signature(request)
+    typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
+
+    def called(**given: Any) -> None:
+        function = work
+        if isinstance(function, str):
+            module, _, name = function.partition(":")
+            function = getattr(import_module(f"mixpose.cli.{module}"), name)
+        function(request(**given))
+
+    called.__doc__, called.__annotations__ = request.__doc__, hints
+    called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
+    return called

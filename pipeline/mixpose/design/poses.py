@@ -27,21 +27,10 @@ def spread_poses(
     """Poses T_world_object (P, 4, 4) spread evenly over a volume; the first is its middle.
 
     Cameras must have a resolution.  The middle is the session's ``[start]``, else where its sensors
-    look together.
-
-    Parameters
-    ----------
-    volume : (3,) array, optional
-        Sides of the box that the body's middle is in, along the world's axes; left out, twice the
-        body's radius.
-    turn_deg : float, optional
-        Largest angle from the orientation of the middle, up to 180; left out, 20 around a
-        ``[start]`` and else 180.
-
-    Raises
-    ------
-    SessionError
-        If no place is in view of a sensor.
+    look together.  `volume` (3,) are the sides of the box that the body's middle is in, along the
+    world's axes; left out, twice the body's radius.  `turn_deg` is the largest angle from the
+    orientation of the middle, up to 180; left out, 20 around a ``[start]`` and else 180.  Raises
+    SessionError if no place is in view of a sensor.
     """
     centre = central_pose(session, seed)
     body = session.body

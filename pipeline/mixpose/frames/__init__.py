@@ -3,22 +3,9 @@
 `open_source` finds and opens what a session names; `pair` joins the sources of all sensors.
 """
 
-from mixpose.frames.images import read_image
-from mixpose.frames.opening import files_of, open_source
-from mixpose.frames.pairing import pair
-from mixpose.frames.prefetch import prefetch
-from mixpose.frames.source import ALL_NUMBERS, SensorKind, Source, SourceSpec
-from mixpose.frames.pairing import paired_by_stamp
-
-__all__ = [
-    "ALL_NUMBERS",
-    "SensorKind",
-    "Source",
-    "SourceSpec",
-    "files_of",
-    "open_source",
-    "pair",
-    "paired_by_stamp",
-    "prefetch",
-    "read_image",
-]
+from mixpose.frames.images import read_image as read_image
+from mixpose.frames.opening import files_of as files_of, open_source as open_source
+from mixpose.frames.pairing import pair as pair, paired_by_stamp as paired_by_stamp
+from mixpose.frames.prefetch import prefetch as prefetch
+from mixpose.frames.source import ALL_NUMBERS as ALL_NUMBERS, SensorKind as SensorKind
+from mixpose.frames.source import Source as Source, SourceSpec as SourceSpec

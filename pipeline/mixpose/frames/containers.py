@@ -30,9 +30,7 @@ def container_of(path: Path) -> Container | None:
         return "avi"
     if head[4:8] in _MP4_BOXES:
         return "mp4"
-    if head[:4] == _EBML_HEADER:
-        return "matroska"
-    return None
+    return "matroska" if head[:4] == _EBML_HEADER else None
 
 
 def missing_bytes(path: Path) -> int:
@@ -42,17 +40,12 @@ def missing_bytes(path: Path) -> int:
     read.
     """
     container = container_of(path)
+    if container is None:
+        return 0
+    end_of = {"avi": _riff_end, "mp4": _mp4_end, "matroska": _matroska_end}[container]
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        if container == "avi":
-            end = _riff_end(file, size)
-        elif container == "mp4":
-            end = _mp4_end(file, size)
-        elif container == "matroska":
-            end = _matroska_end(file)
-        else:
-            return 0
-    missing = end - size
+        missing = end_of(file, size) - size
     return missing if missing > _SLACK_BYTES else 0
 
 
@@ -85,7 +78,7 @@ def _mp4_end(file: BinaryIO, size: int) -> int:
     return at
 
 
-def _matroska_end(file: BinaryIO) -> int:
+def _matroska_end(file: BinaryIO, size: int) -> int:
     """End of the segment that follows the EBML header (RFC 8794); 0 where its size is unknown."""
     at = 0
     for _ in ("header", "segment"):

@@ -13,9 +13,9 @@ from typing import ClassVar, cast
 import cv2
 import numpy as np
 
-from mixpose.errors import RecordingError
+from mixpose.errors import RecordingError, reporting
 from mixpose.frames.capture import quieten_opencv
-from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
 from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS
 from mixpose.records import Image, RawFrame
@@ -36,7 +36,7 @@ _END_OF_IMAGE = b"\xff\xd9"
 
 
 @dataclass(frozen=True)
-class ImageSequence:
+class ImageSequence(Source):
     """Images of one camera, by ascending frame number."""
 
     kind: ClassVar[SourceKind] = "images"
@@ -79,8 +79,7 @@ class ImageSequence:
             )
         if self.length < 3 or self.numbers != tuple(range(self.length)):
             return None
-        ends = [re.search(r"[0-9]+$", path.stem) for path in self.paths]
-        values = [int(end.group()) if end else None for end in ends]
+        values = [_ending(path) for path in self.paths]
         if all(value == number for value, number in zip(values, self.numbers, strict=True)):
             return None
         bare = [path.name for path, value in zip(self.paths, values, strict=True) if value is None]
@@ -123,17 +122,10 @@ class ImageSequence:
 
 def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) -> ImageSequence:
     """Images in the given order as a source; they are numbered by `frame_numbers`."""
-    numbers = frame_numbers(paths)
-    order = sorted(range(len(paths)), key=numbers.__getitem__)
+    numbers, ordered = zip(*sorted(zip(frame_numbers(paths), paths, strict=True)), strict=True)
     is_stamped = spec.times is None and all(_FIRST_STAMP <= n < _LAST_STAMP for n in numbers)
-    return ImageSequence(
-        tuple(paths[i] for i in order),
-        tuple(numbers[i] for i in order),
-        spec.resolution,
-        _time_of_stamp if is_stamped else clock,
-        is_stamped,
-        spec.fps is not None,
-    )
+    clock = _time_of_stamp if is_stamped else clock
+    return ImageSequence(ordered, numbers, spec.resolution, clock, is_stamped, spec.fps is not None)
 
 
 def _time_of_stamp(stamp: int) -> float:
@@ -147,11 +139,14 @@ def frame_numbers(paths: Sequence[Path]) -> list[int]:
     The number that a name without its extension ends in, where every name ends in one and no two
     are alike; else the place in `paths`, from 0.
     """
-    endings = [re.search(r"[0-9]+$", path.stem) for path in paths]
-    numbers = [int(ending.group()) for ending in endings if ending]
-    if len(numbers) == len(set(numbers)) == len(paths):
-        return numbers
-    return list(range(len(paths)))
+    numbers = [number for path in paths if (number := _ending(path)) is not None]
+    return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
+
+
+def _ending(path: Path) -> int | None:
+    """The number that the name of a file ends in."""
+    found = re.search(r"[0-9]+$", path.stem)
+    return int(found.group()) if found else None
 
 
 def natural_order(paths: Sequence[Path]) -> list[Path]:
@@ -202,7 +197,7 @@ def read_image(path: Path) -> Image:
 
 def _bytes_of(path: Path) -> bytes:
     """All of a file, in few calls of the operating system: each gives the interpreter away."""
-    try:
+    with reporting(RecordingError, f"{path}: cannot be read"):
         status = path.stat()
         is_file, size = stat.S_ISREG(status.st_mode), status.st_size
         if is_file and size <= MOST_IMAGE_BYTES:
@@ -210,8 +205,6 @@ def _bytes_of(path: Path) -> bytes:
                 data = file.read(size)
                 # one call reads it all, but where it is interrupted or the file is cut meanwhile
                 return data if len(data) == size else data + file.read()
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     found = f"{size} bytes" if is_file else "no file"
     raise RecordingError(f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}")
 

@@ -17,7 +17,6 @@ from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
-from types import TracebackType
 from typing import ClassVar
 from urllib.parse import urlsplit
 
@@ -35,7 +34,7 @@ from mixpose.frames.capture import (
     opened,
     retrieve,
 )
-from mixpose.frames.source import SourceKind, selection
+from mixpose.frames.source import Source, SourceKind, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, Moment, RawFrame
 
@@ -73,7 +72,7 @@ def live_address(source: str) -> str | int | None:
 
 
 @dataclass(frozen=True)
-class LiveSource:
+class LiveSource(Source):
     """A camera or a stream, opened when its frames are asked for."""
 
     kind: ClassVar[SourceKind] = "live"
@@ -90,10 +89,6 @@ class LiveSource:
     def describe(self) -> str:
         """One line for people."""
         return f"live {name_of(self.address)}, opened when it is needed"
-
-    def caution(self) -> str | None:
-        """Nothing to say before it is opened."""
-        return None
 
     def check_times(self, wanted: range) -> None:
         """Nothing to look for: nobody knows which frames will come."""
@@ -182,12 +177,7 @@ class _Reader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         # a thread that still waits for a silent camera is left to end by itself
         self._thread.join(_FAREWELL_S)

@@ -33,10 +33,7 @@ _SHARE = 0.5  # of the usual distance of frames: farther apart they belong to di
 
 
 def pair(
-    sources: Mapping[str, Source],
-    start: int | None = None,
-    stop: int | None = None,
-    step: int = 1,
+    sources: Mapping[str, Source], start: int | None = None, stop: int | None = None, step: int = 1
 ) -> Generator[FrameSet, None, None]:
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
@@ -132,8 +129,8 @@ def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list
         at = bisect_left(known, number)
         near = min(known[max(at - 1, 0) : at + 1], key=lambda one: abs(one - number), default=None)
         if near is not None and abs(near - number) < reach:
-            owners[near] = min(owners.get(near, (abs(near - number), place)),
-                               (abs(near - number), place))  # fmt: skip
+            this = abs(near - number), place
+            owners[near] = min(owners.get(near, this), this)
     found = list(numbers)
     for near, (_, place) in owners.items():
         found[place] = near

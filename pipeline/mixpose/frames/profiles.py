@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, csv_rows, finite, require_times
 from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
 
 @dataclass(frozen=True)
-class RangeProfiles:
+class RangeProfiles(Source):
     """Range profiles of one sensor, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "profiles"
@@ -58,10 +58,6 @@ class RangeProfiles:
             f"{self.length} range profile{plural} of {self.bins} bins from {self.range_min:g} to "
             f"{reach:g}, {numbers_text(0, self.length - 1, self.length)}"
         )
-
-    def caution(self) -> str | None:
-        """Nothing to say of it: only images can be misnumbered."""
-        return None
 
     def check_times(self, wanted: range) -> None:
         """See that each profile in the range has a time."""

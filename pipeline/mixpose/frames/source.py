@@ -65,6 +65,7 @@ class Source(Protocol):
 
     def caution(self) -> str | None:
         """What is odd about the recording though it can be read; None if nothing is."""
+        return None
 
     def check_times(self, wanted: range) -> None:
         """Look for a time for each frame in a range of numbers, without decoding frames.

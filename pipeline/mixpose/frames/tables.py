@@ -15,7 +15,14 @@ from typing import ClassVar, NoReturn, TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import (
+    SensorKind,
+    Source,
+    SourceKind,
+    SourceSpec,
+    numbers_text,
+    selection,
+)
 from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, require_times, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
@@ -46,7 +53,7 @@ class _Contents:
 
 
 @dataclass(frozen=True)
-class DetectionTable:
+class DetectionTable(Source):
     """Detections of one sensor, a row each.
 
     A table whose frames ascend is streamed, whatever its length.  One with its rows in another
@@ -83,10 +90,6 @@ class DetectionTable:
             return "0 detections"
         numbers = numbers_text(contents.first, contents.last, contents.frames)
         return f"{contents.rows} detections, {numbers}"
-
-    def caution(self) -> str | None:
-        """Nothing to say of it: only images can be misnumbered."""
-        return None
 
     def check_times(self, wanted: range) -> None:
         """See that each frame in the range has a time; reads the table once more."""

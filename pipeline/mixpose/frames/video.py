@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import cv2
 
-from mixpose.errors import RecordingError
+from mixpose.errors import RecordingError, reporting
 from mixpose.frames.capture import (
     ColourRoom,
     NotOpenedError,
@@ -23,14 +23,14 @@ from mixpose.frames.capture import (
     retrieve,
 )
 from mixpose.frames.containers import container_of, missing_bytes
-from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
 from mixpose.limits import MOST_PIXELS
 from mixpose.records import Moment, RawFrame
 
 
 @dataclass(frozen=True)
-class Video:
+class Video(Source):
     """A video, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "video"
@@ -59,10 +59,6 @@ class Video:
         if self.promised is None:
             return f"{size}, frames from 0"
         return f"{size}, {numbers_text(0, self.promised - 1, self.promised)}"
-
-    def caution(self) -> str | None:
-        """Nothing to say of it: only images can be misnumbered."""
-        return None
 
     def check_times(self, wanted: range) -> None:
         """See that each frame in the range has a time.
@@ -186,10 +182,8 @@ def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
             f"{address}: found {width}x{height} pixels, allowed are {MOST_PIXELS} together"
         )
     promised = int(count) if math.isfinite(count) and count >= 1 else None
-    try:
+    with reporting(RecordingError, f"{address}: cannot be read"):
         missing = missing_bytes(Path(address))
-    except OSError as error:
-        raise RecordingError(f"{address}: cannot be read: {error.strerror}") from error
     return Video(address, spec.resolution, clock, (width, height), promised, missing)
 
 

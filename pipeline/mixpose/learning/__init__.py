@@ -5,22 +5,8 @@ detections  →  points in space of each frame, ghosts among them  →  without 
 →  markers and poses adjusted together by what calibrates sensors  →  a frame for the body
 """
 
-from __future__ import annotations
-
-from mixpose.learning.adjusting import Eyes, Learnt
-from mixpose.learning.axes import Likeness, body_of, by_markers, like
-from mixpose.learning.learn import Lesson, learn, learn_from
-from mixpose.learning.rules import LearningRules
-
-__all__ = [
-    "Eyes",
-    "LearningRules",
-    "Learnt",
-    "Lesson",
-    "Likeness",
-    "body_of",
-    "by_markers",
-    "learn",
-    "learn_from",
-    "like",
-]
+from mixpose.learning.adjusting import Eyes as Eyes, Learnt as Learnt
+from mixpose.learning.axes import Likeness as Likeness, body_of as body_of
+from mixpose.learning.axes import by_markers as by_markers, like as like
+from mixpose.learning.learn import Lesson as Lesson, learn as learn, learn_from as learn_from
+from mixpose.learning.rules import LearningRules as LearningRules

@@ -56,14 +56,9 @@ def learn(
 ) -> Lesson:
     """Learn the bodies that move in a session's recording.
 
-    The session's own bodies are not looked at; `sources` stand in place of its recordings.
-
-    Raises
-    ------
-    SessionError
-        If there are fewer than two cameras.
-    RecordingError
-        If the recording cannot be read, or shows no body that moves.
+    The session's own bodies are not looked at; `sources` stand in place of its recordings.  Raises
+    SessionError if there are fewer than two cameras, RecordingError if the recording cannot be
+    read, or shows no body that moves.
     """
     eyes = eyes_of(session)
     read = replace(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.objective import View
 from mixpose.pictures.canvas import Picture, fit_into
 from mixpose.pictures.scene import draw_scene
@@ -91,14 +91,10 @@ class FolderSink:
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
         """Write the picture of a frame; the first one replaces those of an earlier run."""
-        try:
+        with reporting(SessionError, f"--overlay {self._folder}: cannot be written"):
             self._folder.mkdir(exist_ok=True)
             for path in self._earlier:
                 path.unlink(missing_ok=True)
-        except OSError as error:
-            raise SessionError(
-                f"--overlay {self._folder}: cannot be written: {error.strerror}"
-            ) from error
         self._earlier = []
         write_png(self._folder / f"overlay_{frame:06d}.png", picture)
 
@@ -135,21 +131,18 @@ class VideoSink:
         self._writer.release()
         self._writer = None
         try:
-            sign_video(self._part)
-            # FFmpeg does not tell when a disk is full
-            written = cv2.VideoCapture(str(self._part))
-            count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
-            written.release()
-            if count < self._count - 1:  # containers that only estimate it may be one off
-                raise SessionError(
-                    f"--overlay {self._path}: {count} of {self._count} frames could be written: "
-                    "is the disk full?"
-                )
-            self._part.replace(self._path)
-        except OSError as error:
-            raise SessionError(
-                f"--overlay {self._path}: cannot be written: {error.strerror}"
-            ) from error
+            with reporting(SessionError, f"--overlay {self._path}: cannot be written"):
+                sign_video(self._part)
+                # FFmpeg does not tell when a disk is full
+                written = cv2.VideoCapture(str(self._part))
+                count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+                written.release()
+                if count < self._count - 1:  # containers that only estimate it may be one off
+                    raise SessionError(
+                        f"--overlay {self._path}: {count} of {self._count} frames could be "
+                        "written: is the disk full?"
+                    )
+                self._part.replace(self._path)
         finally:
             self._part.unlink(missing_ok=True)
 

@@ -75,25 +75,15 @@ def draw_pose(
     colour: Colour | None = None,
     named: bool = True,
 ) -> Picture:
-    """Draw a pose on a camera's frame, and return a new picture.
+    """Draw a pose on a camera's frame (H, W, 3), of uint8, and return a new picture.
 
-    Parameters
-    ----------
-    image_bgr : (H, W, 3) uint8
-        The frame, as of `mixpose.pictures.displayable`.
-    T_world_object : (4, 4) array or None
-        None draws no pose, as for a lost frame.
-    covariance : (6, 6) array or None
-        Of the pose, order of `mixpose.rigid`; draws the ellipse that holds a feature's place with
-        95 %, where it is large enough to be seen, `magnified` by a factor.
-    status, frame
-        Written in the corner; the status is the colour of the features, too, unless `colour` is.
-    part : Part
-        What the picture shows of the sensor, where the frame was cut or resized.
-    found : (M, 2) array or None
-        Features found in the frame, in pixels of the sensor; marked too.
-    named : bool
-        Whether names stand beside features.
+    The frame is as of `mixpose.pictures.displayable`; `part` is what it shows of the sensor, where
+    it was cut or resized. Without a pose (4, 4) none is drawn, as for a lost frame. The covariance
+    (6, 6), in the order of `mixpose.rigid`, draws the ellipse that holds a feature's place with
+    95 %, `magnified` by a factor, where it is large enough to be seen. Status and number of the
+    frame are written in the corner; the status is the colour of the features, too, unless `colour`
+    is. Features `found` (M, 2), in pixels of the sensor, are marked too; names stand beside
+    features if they are `named`.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
     pose, radius = None, _MARK_PX * canvas.stroke(picture)

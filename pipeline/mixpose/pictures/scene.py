@@ -266,13 +266,12 @@ def draw_ranges(
     T_world_object: Floats | None,
     covariance: Floats | None = None,
     status: Status | None = None,
-    *,
-    size: tuple[int, int] = STRIP_SIZE,
 ) -> Picture:
     """Draw what a range sensor measured, None where it has no frame, with the ranges of a pose.
 
-    `size` is width and height in px; all else is as for `mixpose.pictures.draw_pose`.
+    The other arguments are as for `mixpose.pictures.draw_pose`.
     """
+    size = STRIP_SIZE
     picture = np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     expected = np.zeros(0)
     if T_world_object is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.pictures.canvas import Picture
 from mixpose.whole_files import appearing_whole
 
@@ -23,11 +23,8 @@ def write_png(path: Path, picture: Picture) -> None:
     encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not encoded:
         raise SessionError(f"{path}: a picture of {picture.shape} cannot be made a PNG")
-    try:
-        with appearing_whole(path) as part:
-            part.write_bytes(_signed(np.asarray(data).tobytes()))
-    except OSError as error:
-        raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
+    with reporting(SessionError, f"{path}: cannot be written"), appearing_whole(path) as part:
+        part.write_bytes(_signed(np.asarray(data).tobytes()))
 
 
 def sign_figure(path: Path) -> None:

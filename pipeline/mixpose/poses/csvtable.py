@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from typing import Any, TextIO
 
 import numpy as np
@@ -38,81 +39,59 @@ class CsvWriter(PoseWriter):
 
     def __init__(self, stream: TextIO, header: Header) -> None:
         super().__init__(stream, header)
-        self._rows = csv.writer(stream, lineterminator="\n")
         self._numbered = any(count > 1 for count in header.objects.values())
-        self._sensors: tuple[str, ...] | None = None
-        if header.sensors:
-            self._write_columns(header.sensors)
+        self._rows = self._begun(header.sensors) if header.sensors else None
+
+    def _begun(self, sensors: Sequence[str]) -> csv.DictWriter[str]:
+        """Write the names of the columns."""
+        of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
+        numbered = ["instance"] if self._numbered else []
+        columns = [*FRAME_COLUMNS[:3], *numbered, *FRAME_COLUMNS[3:], *POSE_COLUMNS]
+        columns += [*COVARIANCE_COLUMNS, "confidence", "score", *of_sensors, "latency_ms"]
+        rows = csv.DictWriter(self._stream, columns, lineterminator="\n")
+        rows.writeheader()
+        self._stream.flush()
+        return rows
 
     def _write(self, estimate: Estimate) -> None:
-        if self._sensors is None:
-            self._write_columns(tuple(estimate.sensors))
-        unknown = set(estimate.sensors) - set(self._sensors or ())
+        self._rows = self._rows or self._begun(tuple(estimate.sensors))
+        row = {
+            "frame": estimate.frame,
+            "time_s": plain_or_none(estimate.time_s),
+            "object": estimate.object,
+            "status": estimate.status,
+            "unit": self._header.unit,
+            **_pose_cells(estimate),
+            "confidence": plain_or_none(estimate.confidence),
+            "score": plain(1.0 if estimate.score is None else estimate.score),
+            "latency_ms": plain(estimate.latency_ms or 0.0),
+        }
+        if self._numbered:
+            row["instance"] = estimate.instance
+        for name, report in estimate.sensors.items():
+            row[f"{name}_used"] = "true" if report.used else "false"
+            row[f"{name}_explained"] = plain_or_none(report.explained)
+            row[f"{name}_rms"] = plain_or_none(report.rms)
+        columns = set(self._rows.fieldnames)
+        unknown = [name for name in estimate.sensors if f"{name}_used" not in columns]
         if unknown:
             raise ValueError(f"frame {estimate.frame}: no columns for sensors {sorted(unknown)}")
-        row = [
-            estimate.frame,
-            plain_or_none(estimate.time_s),
-            estimate.object,
-            *([estimate.instance] if self._numbered else []),
-            estimate.status,
-            self._header.unit,
-            *_pose_cells(estimate),
-            plain_or_none(estimate.confidence),
-            plain(1.0 if estimate.score is None else estimate.score),
-            *self._sensor_cells(estimate),
-            plain(estimate.latency_ms or 0.0),
-        ]
         self._rows.writerow(row)  # csv writes None as an empty cell and floats by repr
 
     def close(self) -> None:
         """Write the column names if no row did, and flush."""
-        if self._sensors is None:
-            self._write_columns(())
+        self._rows = self._rows or self._begun(())
         super().close()
 
-    def _write_columns(self, sensors: tuple[str, ...]) -> None:
-        self._sensors = sensors
-        of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
-        self._rows.writerow(
-            [
-                *FRAME_COLUMNS[:3],
-                *(["instance"] if self._numbered else []),
-                *FRAME_COLUMNS[3:],
-                *POSE_COLUMNS,
-                *COVARIANCE_COLUMNS,
-                "confidence",
-                "score",
-                *of_sensors,
-                "latency_ms",
-            ]
-        )
-        self._stream.flush()
 
-    def _sensor_cells(self, estimate: Estimate) -> list[Any]:
-        cells: list[Any] = []
-        for name in self._sensors or ():
-            report = estimate.sensors.get(name)
-            if report is None:
-                cells += [None] * len(SENSOR_COLUMNS)
-                continue
-            cells += [
-                "true" if report.used else "false",
-                plain_or_none(report.explained),
-                plain_or_none(report.rms),
-            ]
-        return cells
-
-
-def _pose_cells(estimate: Estimate) -> list[Any]:
-    """Cells of the pose and its covariance; empty where there is none."""
+def _pose_cells(estimate: Estimate) -> dict[str, Any]:
+    """Cells of the pose and its covariance, as far as there are any."""
     T = pose_of(estimate)
     if T is None:
-        return [None] * (len(POSE_COLUMNS) + len(COVARIANCE_COLUMNS))
+        return {}
     turn = rigid.quaternion_xyzw(T)
     numbers = np.concatenate([T[:3, 3], turn, Rotation.from_quat(turn).as_rotvec()])
-    cells: list[Any] = plain(numbers)
-    if estimate.covariance is None:
-        return cells + [None] * len(COVARIANCE_COLUMNS)
-    upper: list[Any] = plain(estimate.covariance[_UPPER])
-    return cells + upper
+    cells = dict(zip(POSE_COLUMNS, plain(numbers), strict=True))
+    if estimate.covariance is not None:
+        cells |= zip(COVARIANCE_COLUMNS, plain(estimate.covariance[_UPPER]), strict=True)
+    return cells

@@ -19,6 +19,7 @@ position error is that of the object's origin.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -151,15 +152,11 @@ def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | Non
 
 def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) -> Evaluation:
     compared = {(error.frame, error.object) for error in errors}
-    with_pose = [error for error in errors if error.twist is not None]
-    twists = [(error.frame, error.twist) for error in with_pose if error.twist is not None]
-    trusted = [error for error in with_pose if error.status == "ok"]
+    twists = [(error.frame, error.twist) for error in errors if error.twist is not None]
+    trusted = [error for error in errors if error.status == "ok"]
     sure = [(error.frame, error.twist) for error in trusted if error.twist is not None]
     best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
-    counts = {
-        status: sum(error.status == status for error in errors)
-        for status in ("ok", "ambiguous", "lost", "missing")
-    }
+    counts = Counter(error.status for error in errors)
     rotation_deg, translation = _spreads(twists)
     ok_rotation_deg, ok_translation = _spreads(sure)
     best_rotation_deg, best_translation = _spreads(best)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from mixpose import rigid
-from mixpose.errors import RecordingError, SessionError
+from mixpose.errors import RecordingError, SessionError, reporting
 from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
@@ -44,7 +44,12 @@ class JsonlWriter(PoseWriter):
 
 def header_line(header: Header) -> dict[str, Any]:
     """The first line of a poses file, as what JSON holds."""
-    line: dict[str, Any] = {
+    sometimes = {
+        "objects": header.objects if len(header.labels) > 1 else {},
+        "sources": header.sources,
+        "smoothed": header.smoothed,
+    }
+    return {
         "type": "header",
         "format": FORMAT,
         "version": VERSION,
@@ -55,14 +60,8 @@ def header_line(header: Header) -> dict[str, Any]:
         "mixpose": header.mixpose,
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
+        **{key: dict(held) for key, held in sometimes.items() if held},
     }
-    if len(header.labels) > 1:
-        line["objects"] = dict(header.objects)
-    if header.sources:
-        line["sources"] = dict(header.sources)
-    if header.smoothed:
-        line["smoothed"] = dict(header.smoothed)
-    return line
 
 
 def pose_line(estimate: Estimate) -> dict[str, Any]:
@@ -95,10 +94,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         },
         **({"points": _points(estimate.points)} if estimate.points else {}),
         "hypotheses": [
-            {
-                "T_world_object": plain(rival.T_world_object),
-                "weight": plain(rival.weight),
-            }
+            {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms or 0.0),
@@ -262,19 +258,16 @@ def _sources_text(sources: object) -> str:
 
 def _read_bytes(path: Path) -> bytes:
     lines: list[bytes] = []
-    try:
-        with path.open("rb") as file:
-            # a device or a hole may be a line without end
-            for line in iter(partial(file.readline, MOST_BYTES + 1), b""):
-                lines.append(line)
-                if len(line) > MOST_BYTES:
-                    raise RecordingError(
-                        f"{path}:{len(lines)}: found more than {MOST_BYTES} bytes in a line, as "
-                        "many are allowed; a poses file holds one JSON object per line (.jsonl)"
-                    )
-        return b"".join(lines)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    with reporting(RecordingError, f"{path}: cannot be read"), path.open("rb") as file:
+        # a device or a hole may be a line without end
+        for line in iter(partial(file.readline, MOST_BYTES + 1), b""):
+            lines.append(line)
+            if len(line) > MOST_BYTES:
+                raise RecordingError(
+                    f"{path}:{len(lines)}: found more than {MOST_BYTES} bytes in a line, as "
+                    "many are allowed; a poses file holds one JSON object per line (.jsonl)"
+                )
+    return b"".join(lines)
 
 
 def _parse(path: Path, data: bytes) -> PoseFile:

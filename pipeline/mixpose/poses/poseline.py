@@ -103,30 +103,23 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             f"{where}: T_world_object is {found} while status is {pose.status!r}; it is null "
             "where the status is 'lost' and a 4x4 matrix otherwise"
         )
-    return PoseLine(
-        line=line,
-        frame=pose.frame,
-        time_s=pose.time_s,
-        object=pose.object,
-        status=pose.status,
-        T_world_object=T,
-        covariance=_covariance(pose.covariance, where),
-        score=pose.score,
-        sensors={name: _report(report) for name, report in pose.sensors.items()},
-        hypotheses=tuple(
+    told = dict(pose)
+    told |= {
+        "line": line,
+        "T_world_object": T,
+        "covariance": _covariance(pose.covariance, where),
+        "sensors": {name: _report(report) for name, report in pose.sensors.items()},
+        "hypotheses": tuple(
             Hypothesis(_motion(rival.T_world_object, f"{where}: hypotheses"), rival.weight)
             for rival in pose.hypotheses
         ),
-        latency_ms=pose.latency_ms,
-        instance=pose.instance,
-        confidence=pose.confidence,
-        points={
+        "points": {
             name: MeasuredPoint(np.array(point.at), point.residual)
             for name, point in pose.points.items()
         },
-        tip_object=_in_object(T, pose.tip),
-        filled=pose.filled,
-    )
+        "tip_object": _in_object(T, told.pop("tip")),
+    }
+    return PoseLine(**told)
 
 
 def _in_object(T: Floats | None, tip: list[float] | None) -> Floats | None:
@@ -135,14 +128,8 @@ def _in_object(T: Floats | None, tip: list[float] | None) -> Floats | None:
 
 
 def _report(sensor: _Sensor) -> SensorReport:
-    return SensorReport(
-        sensor.used,
-        sensor.explained,
-        sensor.rms,
-        sensor.why,
-        sensor.residuals,
-        {name: Label(np.array(one.at), one.detection) for name, one in sensor.labels.items()},
-    )
+    labels = {name: Label(np.array(one.at), one.detection) for name, one in sensor.labels.items()}
+    return SensorReport(**{**dict(sensor), "labels": labels})
 
 
 def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:

@@ -7,7 +7,7 @@ https://docs.ros.org/en/rolling/p/geometry_msgs/msg/PoseWithCovarianceStamped.ht
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from functools import partial
 from typing import Any, TextIO
 
 import numpy as np
@@ -30,7 +30,11 @@ class RosWriter(PoseWriter):
     """
 
     def __init__(self, stream: TextIO, header: Header, *, frame_id: str = "world") -> None:
+        import yaml  # noqa: PLC0415 - only where such messages are written
+
         super().__init__(stream, header)
+        dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the former is four times as fast
+        self._yaml_of = partial(yaml.dump, Dumper=dumper, sort_keys=False)
         self._stamps = Stamps(stream, "ros")
         self._frame_id = frame_id
 
@@ -39,7 +43,7 @@ class RosWriter(PoseWriter):
             return
         seconds = self._stamps.time_of(estimate)
         message = pose_message(estimate, self._header.unit, seconds, self._frame_id)
-        header, posed = message["header"], message["pose"]
+        header, pose = message["header"], {"pose": message["pose"]}
         self._stream.write(
             f"# frame {estimate.frame}, {estimate.status}\n"
             "header:\n"
@@ -47,15 +51,7 @@ class RosWriter(PoseWriter):
             f"    sec: {header['stamp']['sec']}\n"
             f"    nanosec: {header['stamp']['nanosec']}\n"
             f"  frame_id: {json.dumps(header['frame_id'])}\n"
-            "pose:\n"
-            "  pose:\n"
-            "    position:\n"
-            + _fields(posed["pose"]["position"])
-            + "    orientation:\n"
-            + _fields(posed["pose"]["orientation"])
-            + "  covariance:\n"
-            + "".join(f"  - {_number(value)}\n" for value in posed["covariance"])
-            + "---\n"
+            f"{self._yaml_of(pose)}---\n"
         )
 
 
@@ -93,13 +89,3 @@ def _covariance(estimate: Estimate, per_metre: float) -> Floats:
         return np.zeros(36)
     scale = np.array([1 / per_metre] * 3 + [1.0] * 3)
     return np.asarray(estimate.covariance * np.outer(scale, scale)).ravel()
-
-
-def _fields(values: Mapping[str, float]) -> str:
-    return "".join(f"      {name}: {_number(value)}\n" for name, value in values.items())
-
-
-def _number(value: float) -> str:
-    """A float as YAML 1.1 has it, which takes 1e-07 for text and 1.0e-07 for a number."""
-    text = repr(plain(value))
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text

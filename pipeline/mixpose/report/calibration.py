@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from mixpose.calibration import Calibration
+from mixpose.calibration.result import residuals_by
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
 from mixpose.report.figures import BARS, POSE, TRUTH, Chart, blank, drawn
@@ -89,16 +90,9 @@ def _above(found: Calibration, unit: str) -> Chart:
     return Chart(title, f"{len(after)} sensors, {len(body)} frames", drawn(figure))
 
 
-def _residuals(found: Calibration, kind: str) -> Chart:
+def _residuals(found: Calibration, kind: Literal["frame", "feature"]) -> Chart:
     """Residuals of each frame, as dots, or of each feature, as bars."""
-    # root mean square by number, in standard deviations
-    keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for index, sights in found.sights.items():
-        keys.append(getattr(sights, kind))
-        squares.append((sights.offset**2).sum(axis=1) / found.noise[index] ** 2)
-    numbers, inverse = np.unique(np.concatenate(keys), return_inverse=True)
-    totals, counts = np.bincount(inverse, np.concatenate(squares)), np.bincount(inverse)
-    values = np.sqrt(totals / np.maximum(counts, 1))
+    numbers, values = residuals_by(found, kind)
     figure, axes = blank()
     if kind == "frame":
         axes.plot(numbers, values, ".", markersize=4, **POSE)

@@ -123,10 +123,6 @@ class TimeAxes:
             rasterized=self._as_pixels,
         )
 
-    def mark_ambiguous(self, values: Floats) -> None:
-        """Mark the values of ambiguous frames."""
-        mark_ambiguous(self._axes, self._series.x, values, self._series)
-
     def mark_lost(self) -> None:
         """Shade the stretches of lost frames from top to bottom."""
         lost = self._series.status == "lost"
@@ -279,12 +275,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
 
 def latency(series: Series) -> list[Chart]:
     """How long frames took, as a histogram over a logarithmic axis."""
-    from matplotlib.ticker import (  # noqa: PLC0415 - heavy
-        LogLocator,
-        MaxNLocator,
-        NullFormatter,
-        StrMethodFormatter,
-    )
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415 - heavy
 
     known = series.latency_ms[series.latency_ms > 0]  # NaN is not greater either
     if not known.size:
@@ -324,7 +315,7 @@ def _draw(axes: Axes, series: Series, values: Floats) -> None:
     panel = TimeAxes(axes, series)
     panel.mark_lost()
     panel.draw(values)
-    panel.mark_ambiguous(values)
+    mark_ambiguous(axes, series.x, values, series)
     panel.frame()
     axes.set_ylim(bottom=0.0)
 
@@ -360,7 +351,7 @@ def _values(
     if truth is not None:
         panel.draw(truth, TRUTH)
     panel.draw(values)
-    panel.mark_ambiguous(values)
+    mark_ambiguous(upper, series.x, values, series)
     panel.frame()
     _limit(upper, values, truth, half_width)
     upper.tick_params(labelbottom=False)

@@ -57,7 +57,8 @@ def distortion(value: Any, model: str) -> Floats:
 
     Raises BadKeyError if a camera of this model cannot have that many.
     """
-    flat = _flatten(value) if isinstance(value, list) else value
+    is_row = isinstance(value, list) and len(value) == 1 and isinstance(value[0], list)
+    flat = value[0] if is_row else column_as_list(value)
     if flat is None or flat == []:
         return np.zeros(0)
     counts = DISTORTION_COUNTS[model]
@@ -68,10 +69,8 @@ def distortion(value: Any, model: str) -> Floats:
     return coefficients
 
 
-def _flatten(value: list[Any]) -> list[Any]:
-    """Flatten a matrix of one row or one column; leave anything else as it is."""
-    if len(value) == 1 and isinstance(value[0], list):
-        return value[0]
-    if value and all(isinstance(item, list) and len(item) == 1 for item in value):
-        return [item[0] for item in value]
+def column_as_list(value: Any) -> Any:
+    """The numbers of a matrix of one column; anything else as it is."""
+    if isinstance(value, list) and all(isinstance(row, list) and len(row) == 1 for row in value):
+        return [row[0] for row in value]
     return value

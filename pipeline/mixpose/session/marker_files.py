@@ -29,7 +29,7 @@ from mixpose.records import Floats
 from mixpose.session.messages import BadKeyError, found, in_file, under
 from mixpose.session.setup import Unit, scale_between
 from mixpose.session.text_files import as_text, read_bytes
-from mixpose.session.values import is_number
+from mixpose.session.values import as_number, is_number
 
 _ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterTrack's .obj"
 
@@ -162,10 +162,7 @@ def read_astertrack(content: bytes) -> Markers:
 
 
 def _coordinates(cells: list[str], line: int) -> list[float]:
-    try:
-        values = [float(cell) for cell in cells[:3]]
-    except ValueError:
-        values = []
+    values = [as_number(cell) for cell in cells[:3]]
     if len(values) != 3 or not all(map(is_number, values)):
         raise BadKeyError(f"line {line}: {found(' '.join(cells), 'v x y z')}")
     return values
@@ -261,10 +258,7 @@ def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:
         raise BadKeyError(f"line {line}: found {len(row)} cells; allowed: {len(header)} as above")
     values = []
     for cell, column in zip(row[1:], header[1:], strict=True):
-        try:
-            value = float(cell)
-        except ValueError:
-            value = float("nan")
+        value = as_number(cell)
         if not is_number(value):
             raise BadKeyError(
                 f"line {line}, column {column}: {found(cell.strip(), 'a finite number')}"
@@ -274,12 +268,7 @@ def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:
 
 
 def _sigma_of(columns: Floats) -> list[Any] | None:
-    match columns.shape[1]:
-        case 0:
-            return None
-        case 1:
-            return [row[0] for row in columns.tolist()]
-        case 3:
-            return list(columns.tolist())
-        case _:
-            return list(columns.reshape(-1, 3, 3).tolist())
+    if not columns.shape[1]:
+        return None
+    shape = {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}[columns.shape[1]]
+    return list(columns.reshape(shape).tolist())

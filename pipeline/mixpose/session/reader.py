@@ -35,28 +35,14 @@ def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
 
 
 def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
-    """Read a session file and the calibration and marker files that it names.
+    """Read a session file, a TOML file, and the calibration and marker files that it names.
 
-    Recordings are not opened.
+    Recordings are not opened. Lengths are in the session's unit, rigid motions exactly rigid.
+    `allow_code` says whether functions that the file names (``method = "module:function"``) may be
+    run when features are extracted; reading a session runs none.
 
-    Parameters
-    ----------
-    path : str or Path
-        A TOML file; paths in it are relative to it.
-    allow_code : bool
-        Whether functions that the file names (``method = "module:function"``) may be run when
-        features are extracted; reading a session runs none.
-
-    Returns
-    -------
-    Session
-        Checked through: lengths in the session's unit, rigid motions exactly rigid.
-
-    Raises
-    ------
-    SessionError
-        If a file is missing or anything in it is wrong: one line with the file, the key, what
-        was found and what is allowed.
+    Raises SessionError if a file is missing or anything in it is wrong: one line with the file, the
+    key, what was found and what is allowed.
     """
     return _loaded(Path(path), allow_code=allow_code, bodies=True)
 

@@ -13,9 +13,6 @@ import tomlkit
 from mixpose.records import Floats
 from mixpose.session.setup import Session
 
-ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation")
-"""Keys of a rigid motion, which its matrix replaces."""
-
 
 def document_of(session: Session, target: Path) -> Any:
     """The TOML document of a session, with paths as they are from where it will be written."""
@@ -45,7 +42,7 @@ def put(table: Any, key: str, value: Any, said: str | None = None) -> None:
 
 def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits: int = 10) -> None:
     """Set a rigid motion (4, 4), in place of what says it otherwise."""
-    for other in ROTATIONS:
+    for other in ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation"):
         table.pop(other, None)
     put(table, key, plain(T, digits), said)
 

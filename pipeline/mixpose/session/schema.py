@@ -1,26 +1,25 @@
 """The tables and keys of a session file: what `docs/session.md` is made from.
 
-The description of a key is what is allowed, and what an error message says; the docstring below
-it is what the key means, in which unit, with an example.  Both are written for the user.
-What depends on several keys at once is checked where they are put together.
+The description of a key is what is allowed, and what an error message says, where its type does not
+say it; the docstring below it is what the key means, in which unit, with an example.  Both are
+written for the user.  What depends on several keys at once is checked where they are put together.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field
 
 from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
-from mixpose.session.messages import one_of
-from mixpose.session.schema_common import ExtractTable, Placement, Positive, Table, Text
+from mixpose.session.schema_common import ExtractTable, Motion, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import FREE_ALLOWED, RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, Free
 
 MOST_ALIKE = 1000
 """Identical bodies that a session may have."""
@@ -39,14 +38,10 @@ class GravityTable(Table):
 
     direction: Annotated[Floats, ArrayOf((3,), "a direction [x, y, z] in the world")]
     """Where gravity points in the world; its length does not matter.
-
-    Example: `direction = [0, 0, -1]`
-    """
-    sigma: Annotated[Positive, Field(description="a length greater than 0")]
+    Example: `direction = [0, 0, -1]`"""
+    sigma: Positive = Field(description="a length greater than 0")
     """Standard deviation of a feature's displacement along it, in `unit`.
-
-    Example: `sigma = 2.0`
-    """
+    Example: `sigma = 2.0`"""
 
 
 class StartTable(Placement):
@@ -54,36 +49,23 @@ class StartTable(Placement):
     searched for in all orientations. It needs `T_world_object`, or a rotation and `translation`.
     """
 
-    T_world_object: Annotated[
-        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
-    ] = None
+    T_world_object: Motion = None
     """The pose: maps coordinates of the body to coordinates of the world.
-
-    Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`
-    """
+    Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`"""
     euler_xyz_deg: Annotated[
         Floats | None, ArrayOf((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
     ] = None
     """The rotation as turns about the fixed axes, x first.
-
-    Example: `euler_xyz_deg = [0, 0, 45]`
-    """
-    rotation_deg: Annotated[
-        Positive | None,
-        Field(le=180, description="half-width in degrees, greater than 0, at most 180"),
-    ] = None
+    Example: `euler_xyz_deg = [0, 0, 45]`"""
+    rotation_deg: Positive | None = Field(
+        None, le=180, description="half-width in degrees, greater than 0, at most 180"
+    )
     """How far the orientation may be off; where it is left out, 5 degrees.
-
-    Example: `rotation_deg = 10`
-    """
-    distance: Annotated[
-        Positive | None, Field(description="half-width, a length greater than 0")
-    ] = None
+    Example: `rotation_deg = 10`"""
+    distance: Positive | None = Field(None, description="half-width, a length greater than 0")
     """How far the position may be off, in `unit`; where it is left out, a tenth of the body's
     radius.
-
-    Example: `distance = 10`
-    """
+    Example: `distance = 10`"""
 
 
 class ObjectTable(Table):
@@ -94,173 +76,117 @@ class ObjectTable(Table):
 
     name: Text
     """Name of the body, written into every pose.
-
-    Example: `name = "tracker"`
-    """
+    Example: `name = "tracker"`"""
     points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
     """Features in the body's own coordinates, in `unit`, in any order.
-
-    Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`
-    """
-    file: Annotated[
-        str | None,
-        Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"),
-    ] = None
+    Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`"""
+    file: str | None = Field(
+        None, min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"
+    )
     """A table of points in place of `points`: a row per point under the header `name,x,y,z`, with
     one, three or nine more columns for the spread of each. Or a body of another program: NDI's
     `.rom` and Vicon's `.vsk` (both in mm), AsterTrack's `.obj` (in m), converted to `unit`.
-
-    Example: `file = "markers.csv"`
-    """
-    sigma: Annotated[Any, Field(description=SIGMA_ALLOWED)] = None
+    Example: `file = "markers.csv"`"""
+    sigma: Any = Field(None, description=SIGMA_ALLOWED)
     """How far features may be off their places now and then, as markers on skin or cloth: standard
     deviation in `unit`, or covariance in `unit`². Left out, or 0: exact.
-
-    Example: `sigma = 0.5`
-    """
+    Example: `sigma = 0.5`"""
     segments: Annotated[
         Floats | None, ArrayOf((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
     ] = None
     """Straight lines as features, from end to end in `unit`; they may stand beside points.
-
-    Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`
-    """
+    Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`"""
     normals: Annotated[
         Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
     ] = None
     """Outward directions, one per feature (points first, then segments): a feature is seen only
     by sensors that it faces.
-
-    Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`
-    """
-    shape: Annotated[Shape, Field(description=one_of(get_args(Shape)))] = "point"
+    Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`"""
+    shape: Shape = "point"
     """What the markers are: points, or spheres or flat disks of a `radius`, the centres of whose
     images are not where their own centres are seen. Disks lie across their `normals`.
-
-    Example: `shape = "sphere"`
-    """
-    radius: Annotated[Any, Field(description=RADIUS_ALLOWED)] = None
+    Example: `shape = "sphere"`"""
+    radius: Any = Field(None, description=RADIUS_ALLOWED)
     """Radius of the spheres or disks, in `unit`; what shines or is dark counts, to its edge.
-
-    Example: `radius = 7.0`
-    """
-    spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
+    Example: `radius = 7.0`"""
+    spread: Spread = "gaussian"
     """Density of the displacements that `sigma` states.
-
-    Example: `spread = "uniform"`
-    """
+    Example: `spread = "uniform"`"""
     tip: Annotated[Floats | None, ArrayOf((3,), "a point [x, y, z] of the body")] = None
     """A point of the body that each pose line tells in the world, as `tip`, with its covariance:
     the tip of a tool. It need not be a feature; `mixpose pivot` finds it.
-
-    Example: `tip = [0.2, -1.4, -148.6]`
-    """
-    gravity: Annotated[
-        GravityTable | None, Field(description="a table with direction and sigma")
-    ] = None
+    Example: `tip = [0.2, -1.4, -148.6]`"""
+    gravity: GravityTable | None = Field(None, description="a table with direction and sigma")
     """See `[object.gravity]`.
-
-    Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`
-    """
-    count: Annotated[
-        int, Field(ge=1, le=MOST_ALIKE, description=f"an integer from 1 to {MOST_ALIKE}")
-    ] = 1
+    Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`"""
+    count: int = Field(1, ge=1, le=MOST_ALIKE, description=f"an integer from 1 to {MOST_ALIKE}")
     """How many identical ones there are. Their poses carry the key `instance`, from 0; which one
     is which is kept while they are tracked.
-
-    Example: `count = 4`
-    """
-    start: Annotated[StartTable | None, Field(description="a table [object.start]")] = None
+    Example: `count = 4`"""
+    start: StartTable | None = Field(None, description="a table [object.start]")
     """See `[start]`, which this replaces where there are several bodies; of identical ones the
     first is there.
-
-    Example: `start = { rotation_vector = [0, 0, 1], translation = [20, 10, 900] }`
-    """
+    Example: `start = { rotation_vector = [0, 0, 1], translation = [20, 10, 900] }`"""
 
 
 class EstimatorTable(Table):
     """How poses are estimated."""
 
-    objective: Annotated[ObjectiveName, Field(description=one_of(get_args(ObjectiveName)))] = (
-        "matched"
-    )
+    objective: ObjectiveName = "matched"
     """What is maximised: the normalised objective, the paper's product of the sensors inside the
     integral, or the product of one objective per sensor.
-
-    Example: `objective = "paper"`
-    """
-    free: Annotated[tuple[str, ...], PlainValidator(read_free), Field(description=FREE_ALLOWED)] = (
-        TWIST_NAMES
-    )
+    Example: `objective = "paper"`"""
+    free: Free = TWIST_NAMES
     """Directions of the world that are estimated; the others stay where `[start]` has them.
-
-    Example: `free = ["x", "y", "rz"]`
-    """
-    samples: Annotated[
-        int, Field(ge=2, le=1_000_000, description="an integer of at least 2, at most 1000000")
-    ] = 1000
+    Example: `free = ["x", "y", "rz"]`"""
+    samples: int = Field(
+        1000, ge=2, le=1_000_000, description="an integer of at least 2, at most 1000000"
+    )
     """Samples per feature where its density is integrated by sampling; an exact body needs none.
-
-    Example: `samples = 4000`
-    """
-    seed: Annotated[int, Field(ge=0, description="an integer of at least 0")] = 0
+    Example: `samples = 4000`"""
+    seed: int = Field(0, ge=0, description="an integer of at least 0")
     """Same seed, same poses.
-
-    Example: `seed = 1`
-    """
-    fuse: Annotated[bool, Field(description="true or false")] = True
+    Example: `seed = 1`"""
+    fuse: bool = True
     """Whether frames of single ranges without labels take the pose before them as a prior.
-
-    Example: `fuse = false`
-    """
-    search: Annotated[SearchName | None, Field(description=one_of(get_args(SearchName)))] = None
+    Example: `fuse = false`"""
+    search: SearchName | None = None
     """How a frame is searched in which no prediction convinces: to the end, or with a budget of
     guesses per frame (counted, so that results repeat), going on in the next frame from where it
     stopped.  Left out, recordings are searched thoroughly, cameras and streams live.
-
-    Example: `search = "live"`
-    """
-    confidence: Annotated[
-        float | None, Field(ge=0.5, lt=1, description="a number of at least 0.5, below 1")
-    ] = None
+    Example: `search = "live"`"""
+    confidence: float | None = Field(
+        None, ge=0.5, lt=1, description="a number of at least 0.5, below 1"
+    )
     """Probability of a pose, printed as `confidence`, from which its frame is `ok`.  Left out,
     0.999: one of a thousand may be wrong.
-
-    Example: `confidence = 0.99`
-    """
-    mirrors: Annotated[bool, Field(description="true or false")] = False
+    Example: `confidence = 0.99`"""
+    mirrors: bool = False
     """Whether windows, polished tables or screens show the body as in a mirror.  A flat body looks
     the same there, and is never `ok` then; of others the mirror image is as likely as the body.
-
-    Example: `mirrors = true`
-    """
+    Example: `mirrors = true`"""
 
 
 class SessionTable(Table):
     """What stands before the first table."""
 
-    unit: Annotated[Unit, Field(description=one_of(get_args(Unit)))]
+    unit: Unit
     """Unit of every length in this file, in the files of markers and recordings that it names,
     and in the poses.
-
-    Example: `unit = "mm"`
-    """
-    object: Annotated[
-        list[ObjectTable],
-        BeforeValidator(as_list),
-        Field(min_length=1, description="a table [object], or [[object]] for each of several"),
-    ]
+    Example: `unit = "mm"`"""
+    object: Annotated[list[ObjectTable], BeforeValidator(as_list)] = Field(
+        min_length=1, description="a table [object], or [[object]] for each of several"
+    )
     """See `[object]`; of several bodies `[[object]]`, one for each."""
-    start: Annotated[StartTable | None, Field(description="a table [start]")] = None
+    start: StartTable | None = Field(None, description="a table [start]")
     """See `[start]`."""
-    estimator: Annotated[EstimatorTable, Field(description="a table [estimator]")] = (
-        EstimatorTable()
+    estimator: EstimatorTable = Field(
+        EstimatorTable.model_validate({}), description="a table [estimator]"
     )
     """See `[estimator]`."""
-    extract: Annotated[ExtractTable, Field(description="a table [extract]")] = ExtractTable()
+    extract: ExtractTable = Field(ExtractTable.model_validate({}), description="a table [extract]")
     """See `[extract]`."""
-    sensor: Annotated[
-        list[AnySensorTable],
-        Field(min_length=1, description="at least one table [[sensor]], in double brackets"),
-    ]
+    sensor: list[AnySensorTable] = Field(
+        min_length=1, description="at least one table [[sensor]], in double brackets"
+    )
     """See `[[sensor]]`; one for each sensor."""

@@ -5,24 +5,30 @@ How keys are described is said in `schema`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field, PlainValidator
 
 from mixpose.records import Floats
 from mixpose.session.intrinsics import MATRIX_FORM
-from mixpose.session.messages import one_of
-from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
+from mixpose.session.schema_common import (
+    ExtractTable,
+    Motion,
+    NotNegative,
+    Number,
+    Placement,
+    Positive,
+    Table,
+    Text,
+)
 from mixpose.session.setup import Unit
 from mixpose.session.values import (
-    DELAY_ALLOWED,
     RESOLUTION_FORM,
-    SOURCE_ALLOWED,
     ArrayOf,
+    Delay,
+    SensorName,
+    Source,
     read_calibration_key,
-    read_delay,
-    read_sensor_name,
-    read_source,
 )
 from mixpose.session.values import resolution as resolution_of
 
@@ -38,36 +44,24 @@ class CalibrationTable(Table):
     """A file of OpenCV (YAML, XML or JSON), Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP,
     told apart by content. Where it says how cameras stand to each other, and `T_sensor_world` is
     left out, that is taken over; the world is then the one of the file.
-
-    Example: `file = "stereo.yml"`
-    """
-    camera_matrix: Annotated[
-        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
-    ] = None
+    Example: `file = "stereo.yml"`"""
+    camera_matrix: str | None = Field(
+        None, min_length=1, description="the name of a node of an OpenCV file"
+    )
     """Node of the camera matrix, where a file holds several cameras.
-
-    Example: `camera_matrix = "M2"`
-    """
-    distortion: Annotated[
-        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
-    ] = None
+    Example: `camera_matrix = "M2"`"""
+    distortion: str | None = Field(
+        None, min_length=1, description="the name of a node of an OpenCV file"
+    )
     """Node of the distortion coefficients.
-
-    Example: `distortion = "D2"`
-    """
-    camera: Annotated[
-        str | None, Field(min_length=1, description='a camera of the file, like "cam0"')
-    ] = None
+    Example: `distortion = "D2"`"""
+    camera: str | None = Field(None, min_length=1, description='a camera of the file, like "cam0"')
     """Camera to take where a file holds several.
-
-    Example: `camera = "cam1"`
-    """
-    unit: Annotated[Unit | None, Field(description=one_of(get_args(Unit)))] = None
+    Example: `camera = "cam1"`"""
+    unit: Unit | None = None
     """Unit of the file's translations, where its format does not fix it (Kalibr and caliscope work
     in metres).
-
-    Example: `unit = "mm"`
-    """
+    Example: `unit = "mm"`"""
 
 
 class CalibrationErrorTable(Table):
@@ -76,207 +70,134 @@ class CalibrationErrorTable(Table):
     bumped or a lens refocused, they are yours to guess (`docs/sensors-in-time.md`).
     """
 
-    focal: Annotated[Number, Field(ge=0, le=0.5, description="a share, from 0 to 0.5")] = 0.0
+    focal: float = Field(0.0, ge=0, le=0.5, description="a share, from 0 to 0.5")
     """Of the focal length, as a share of it; with parallel beams of `pixel_size`.
-
-    Example: `focal = 0.001`
-    """
-    principal_point: Annotated[Number, Field(ge=0, description="px, at least 0")] = 0.0
+    Example: `focal = 0.001`"""
+    principal_point: NotNegative = Field(0.0, description="px, at least 0")
     """Of the principal point along each axis, in px.
-
-    Example: `principal_point = 0.5`
-    """
-    rotation_deg: Annotated[Number, Field(ge=0, le=45, description="degrees, from 0 to 45")] = 0.0
+    Example: `principal_point = 0.5`"""
+    rotation_deg: float = Field(0.0, ge=0, le=45, description="degrees, from 0 to 45")
     """Of the orientation about each axis.
-
-    Example: `rotation_deg = 0.05`
-    """
-    position: Annotated[Number, Field(ge=0, description="a length, at least 0")] = 0.0
+    Example: `rotation_deg = 0.05`"""
+    position: NotNegative = Field(0.0, description="a length, at least 0")
     """Of where the sensor stands along each axis, in `unit`.
-
-    Example: `position = 0.5`
-    """
-    range_bias: Annotated[Number, Field(ge=0, description="a length, at least 0")] = 0.0
+    Example: `position = 0.5`"""
+    range_bias: NotNegative = Field(0.0, description="a length, at least 0")
     """Of `range_bias`, with `model = "lateration"`.
-
-    Example: `range_bias = 0.02`
-    """
+    Example: `range_bias = 0.02`"""
 
 
 class SensorTable(Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
-    name: Annotated[
-        str, AfterValidator(read_sensor_name), Field(description="a name for the sensor, as text")
-    ]
+    name: SensorName
     """Name of the sensor, a different one for each.
-
-    Example: `name = "left"`
-    """
-    source: Annotated[
-        str | tuple[str, ...], PlainValidator(read_source), Field(description=SOURCE_ALLOWED)
-    ] = ()
+    Example: `name = "left"`"""
+    source: Source = ()
     """The recording, relative to the session file: images, a video, a table of detections
     (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
     profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
     address of a stream, a named pipe.
-
-    Example: `source = "left*.png"`
-    """
-    times: Annotated[str | None, Field(min_length=1, description="a CSV file: frame,time_s")] = None
+    Example: `source = "left*.png"`"""
+    times: str | None = Field(None, min_length=1, description="a CSV file: frame,time_s")
     """When frames were taken, in seconds: a table with a row for each frame, beside the session
     file or relative to it.
-
-    Example: `times = "times.csv"`
-    """
-    fps: Annotated[Positive | None, Field(description="frames per second, greater than 0")] = None
+    Example: `times = "times.csv"`"""
+    fps: Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
-
-    Example: `fps = 25`
-    """
-    delay: Annotated[
-        float | Literal["estimate"], PlainValidator(read_delay), Field(description=DELAY_ALLOWED)
-    ] = 0.0
+    Example: `fps = 25`"""
+    delay: Delay = 0.0
     """Seconds by which this sensor's frames are taken later than their times say; negative where
     they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
     delay is known (`docs/sensors-in-time.md`).
-
-    Example: `delay = 0.006`
-    """
-    calibration_error: Annotated[
-        CalibrationErrorTable | None,
-        Field(description="a table like { rotation_deg = 0.05 }"),
-    ] = None
+    Example: `delay = 0.006`"""
+    calibration_error: CalibrationErrorTable | None = Field(
+        None, description="a table like { rotation_deg = 0.05 }"
+    )
     """How far off the calibration may be: standard deviations that covariances are to know of. Left
     out: what residuals show of it.
-
-    Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`
-    """
-    extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
+    Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`"""
+    extract: ExtractTable | None = Field(None, description="a table [sensor.extract]")
     """Keys of `[extract]` that differ for this sensor.
-
-    Example: `extract = { polarity = "dark" }`
-    """
+    Example: `extract = { polarity = "dark" }`"""
 
 
 class PlacedTable(SensorTable, Placement):
     """A sensor that stands somewhere and looks somewhere."""
 
-    T_sensor_world: Annotated[
-        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
-    ] = None
+    T_sensor_world: Motion = None
     """Maps coordinates of the world to those of the sensor, which looks along +z with x to the
     right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
     the origin of the world.
-
-    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`
-    """
-    resolution: Annotated[
-        tuple[int, int] | None, PlainValidator(resolution_of), Field(description=RESOLUTION_FORM)
-    ] = None
+    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""
+    resolution: Annotated[tuple[int, int] | None, PlainValidator(resolution_of)] = Field(
+        None, description=RESOLUTION_FORM
+    )
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
-
-    Example: `resolution = [640, 512]`
-    """
-    readout: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    Example: `resolution = [640, 512]`"""
+    readout: float = Field(0.0, ge=0, le=1, description=SPAN_ALLOWED)
     """Rolling shutter: seconds from when the first row of an image is read to when the last is. A
     frame's time is when its middle row is read. Left out: all rows at once.
-
-    Example: `readout = 0.020`
-    """
-    exposure: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    Example: `readout = 0.020`"""
+    exposure: float = Field(0.0, ge=0, le=1, description=SPAN_ALLOWED)
     """Seconds for which a row collects light. A frame's time is the middle of it, where a moving
     marker's streak has its middle; it matters to `check` and `simulate`, not to poses.
-
-    Example: `exposure = 0.004`
-    """
+    Example: `exposure = 0.004`"""
 
 
 class CameraTable(PlacedTable):
     """A camera with perspective. It needs `camera_matrix` or `calibration`."""
 
-    model: Annotated[Literal["pinhole", "fisheye"], Field(description='"pinhole", "fisheye"')]
+    model: Literal["pinhole", "fisheye"]
     """The lens: OpenCV's pinhole model, or its fisheye model.
-
-    Example: `model = "pinhole"`
-    """
+    Example: `model = "pinhole"`"""
     camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
     """Focal lengths and principal point in px; pixel centres have integer coordinates.
-
-    Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`
-    """
-    distortion: Annotated[
-        Any, Field(description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
-    ] = None
+    Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`"""
+    distortion: Any = Field(None, description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
     """OpenCV's distortion coefficients, in OpenCV's order. Left out: none.
-
-    Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`
-    """
-    calibration: Annotated[
-        CalibrationTable | None,
-        BeforeValidator(read_calibration_key),
-        Field(description='a file, or a table { file = "...", ... }'),
-    ] = None
+    Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`"""
+    calibration: Annotated[CalibrationTable | None, BeforeValidator(read_calibration_key)] = Field(
+        None, description='a file, or a table { file = "...", ... }'
+    )
     """A calibration file in place of `camera_matrix` and `distortion`.
-
-    Example: `calibration = "left.yml"`
-    """
+    Example: `calibration = "left.yml"`"""
 
 
 class ParallelTable(PlacedTable):
     """A camera without perspective: pixel = (x, y) / pixel_size + principal_point."""
 
-    model: Annotated[Literal["parallel"], Field(description='"parallel"')]
+    model: Literal["parallel"]
     """Parallel beams.
-
-    Example: `model = "parallel"`
-    """
-    pixel_size: Annotated[Positive, Field(description="length per px, a number greater than 0")]
+    Example: `model = "parallel"`"""
+    pixel_size: Positive = Field(description="length per px, a number greater than 0")
     """Length in the world, in `unit`, that one px shows.
-
-    Example: `pixel_size = 0.5`
-    """
+    Example: `pixel_size = 0.5`"""
     principal_point: Annotated[
         Floats, ArrayOf((2,), "[u, v], the px where the sensor's origin projects")
     ]
     """Where the sensor's origin is in the image, in px.
-
-    Example: `principal_point = [150, 160]`
-    """
+    Example: `principal_point = [150, 160]`"""
 
 
 class LaterationTable(SensorTable):
     """A sensor of distances: range = distance from `position` + `range_bias`."""
 
-    model: Annotated[Literal["lateration"], Field(description='"lateration"')]
+    model: Literal["lateration"]
     """Ranges, in `unit`.
-
-    Example: `model = "lateration"`
-    """
+    Example: `model = "lateration"`"""
     position: Annotated[Floats, ArrayOf((3,), "[x, y, z], the sensor's place in the world")]
     """Where ranges are measured from, in `unit`.
-
-    Example: `position = [0, -1000, 0]`
-    """
-    range_bias: Annotated[Number, Field(description="a length")] = 0.0
+    Example: `position = [0, -1000, 0]`"""
+    range_bias: Number = Field(0.0, description="a length")
     """What every reading is too long by, in `unit`.
-
-    Example: `range_bias = 0.15`
-    """
-    range_min: Annotated[
-        Number | None, Field(description="a length: range of a profile's first bin")
-    ] = None
+    Example: `range_bias = 0.15`"""
+    range_min: Number | None = Field(None, description="a length: range of a profile's first bin")
     """For range profiles: the range that their first bin stands for, in `unit`.
-
-    Example: `range_min = 700`
-    """
-    bin_size: Annotated[
-        Positive | None, Field(description="a length greater than 0: from bin to bin")
-    ] = None
+    Example: `range_min = 700`"""
+    bin_size: Positive | None = Field(None, description="a length greater than 0: from bin to bin")
     """For range profiles: length from one bin to the next, in `unit`.
-
-    Example: `bin_size = 1.0`
-    """
+    Example: `bin_size = 1.0`"""
 
 
 class CloudTable(SensorTable, Placement):
@@ -284,19 +205,13 @@ class CloudTable(SensorTable, Placement):
     source is a table with columns `x,y,z`, in `unit`.
     """
 
-    model: Annotated[Literal["cloud"], Field(description='"cloud"')]
+    model: Literal["cloud"]
     """Points in space.
-
-    Example: `model = "cloud"`
-    """
-    T_sensor_world: Annotated[
-        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
-    ] = None
+    Example: `model = "cloud"`"""
+    T_sensor_world: Motion = None
     """Maps coordinates of the world to the axes that the points are in; in place of a rotation with
     `translation`. Left out: the points are in the world's axes.
-
-    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`
-    """
+    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""
 
 
 AnySensorTable: TypeAlias = Annotated[

@@ -79,34 +79,19 @@ class SensorSetup:
 
 @dataclass(frozen=True)
 class Session:
-    """A whole set-up, as read from one session file.
+    """A whole set-up, as read from one session file."""
 
-    Attributes
-    ----------
-    path : Path
-        The session file, as it was named.
-    sha256 : str
-        Of the file's bytes, in hexadecimal.
-    unit : {"m", "cm", "mm", "um"}
-        Of every length; nothing is converted on reading.
-    body, start, count : Body, Start or None, int
-        The first body, where it is at first, and how many there are of it.
-    allow_code : bool
-        Whether functions that the file names may be run.
-    others : tuple of ObjectSetup
-        The bodies after the first, in the order of the file.
-    """
-
-    path: Path
-    sha256: str
-    unit: Unit
+    path: Path  # the session file, as it was named
+    sha256: str  # of the file's bytes, in hexadecimal
+    unit: Unit  # of every length; nothing is converted on reading
+    # the first body, where it is at first, and below how many there are of it
     body: Body
     start: Start | None
     estimator: EstimatorOptions
     sensors: tuple[SensorSetup, ...]
-    allow_code: bool = False
+    allow_code: bool = False  # whether functions that the file names may be run
     count: int = 1
-    others: tuple[ObjectSetup, ...] = ()
+    others: tuple[ObjectSetup, ...] = ()  # bodies after the first, in the order of the file
 
     @property
     def objects(self) -> tuple[ObjectSetup, ...]:

@@ -77,39 +77,39 @@ def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
             table = choices[0] if choices else table
             key.append(step)
             field = table.model_fields.get(step)
-            choices = list(_tables(field.annotation)) if field else []
+            choices = _tables(field.annotation) if field else []
     if field is None and len(choices) > 1:
         table = choices[0]
     return _Place(tuple(key), table, field)
 
 
-def _tables(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The tables that an annotation names, at any depth."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
+def _parts(annotation: Any) -> Iterator[Any]:
+    """An annotation, and all that it is made of, at any depth."""
+    yield annotation
     for part in get_args(annotation):
-        yield from _tables(part)
+        yield from _parts(part)
+
+
+def _tables(annotation: Any) -> list[type[BaseModel]]:
+    """The tables that an annotation names."""
+    parts = _parts(annotation)
+    return [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
 
 
 def _literals(field: FieldInfo | None) -> list[str]:
     """The words that a field's annotation lists."""
-
-    def words(annotation: Any) -> Iterator[str]:
-        for part in get_args(annotation):
-            if isinstance(part, str):
-                yield part
-            else:
-                yield from words(part)
-
-    return list(words(field.annotation)) if field else []
+    return [part for part in _parts(field and field.annotation) if isinstance(part, str)]
 
 
 def allowed_for(field: FieldInfo | None) -> str:
-    """What a key may be, for people; empty where nothing is said."""
+    """What a key may be, for people; what its type says where nothing else does."""
     if field is None:
         return ""
-    carried = (getattr(mark, "description", None) for mark in field.metadata)
-    return field.description or next((text for text in carried if text), "")
+    if field.annotation is bool:
+        return "true or false"
+    carried = [getattr(mark, "description", None) for mark in field.metadata]
+    said = (text for text in [field.description, *carried] if text)
+    return next(said, one_of(_literals(field)))
 
 
 def _tag_problem(place: _Place, value: Any) -> BadKeyError:
@@ -166,7 +166,7 @@ def _homes(root: type[BaseModel], key: str) -> list[str]:
 def _all_tables(table: type[BaseModel], path: str = _TOP) -> Iterator[tuple[str, type[BaseModel]]]:
     yield path, table
     for key, field in table.model_fields.items():
-        inside = list(_tables(field.annotation))
+        inside = _tables(field.annotation)
         for inner in inside:
             if len(inside) > 1:
                 name = f"[[{key}]] of model {' or '.join(_literals(inner.model_fields[_TAG]))}"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal, TypeAlias, TypeGuard
 
 import numpy as np
-from pydantic import GetCoreSchemaHandler
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler, PlainValidator
 from pydantic_core import core_schema
 
 from mixpose.limits import MOST_PIXELS
@@ -20,16 +20,16 @@ EXTRACT_METHODS = ("blobs", "corners", "intensity", "log")
 THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 
 _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
-METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
+_METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
 SIGMA_ALLOWED = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
 RADIUS_ALLOWED = "a length greater than 0, or a list with one per point"
-DELAY_ALLOWED = 'seconds from -1 to 1, or "estimate"'
-FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
-SOURCE_ALLOWED = (
+_DELAY_ALLOWED = 'seconds from -1 to 1, or "estimate"'
+_FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
+_SOURCE_ALLOWED = (
     "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
 )
 LONGEST_DELAY_S = 1.0
-THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
+_THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
 
 RESOLUTION_FORM = "[width, height], two positive integers"
 
@@ -55,7 +55,7 @@ class ArrayOf:
         return numbers(value, self.shape, self.description)
 
 
-def read_sensor_name(name: str) -> str:
+def _read_sensor_name(name: str) -> str:
     """A sensor's name: text that can stand in NAME=PATH."""
     if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
         raise BadKeyError(
@@ -64,51 +64,71 @@ def read_sensor_name(name: str) -> str:
     return name
 
 
-def read_method(value: Any) -> str:
+def _read_method(value: Any) -> str:
     """A method's name, or a function of one's own."""
     if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
         return value
-    raise BadKeyError(found(value, METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
+    raise BadKeyError(found(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
 
 
-def read_threshold(value: Any) -> str | float:
+def _read_threshold(value: Any) -> str | float:
     """A rule's name, or a grey level."""
     if isinstance(value, str) and value in THRESHOLDS:
         return value
     if is_number(value):
         return float(value)
-    raise BadKeyError(found(value, THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
+    raise BadKeyError(found(value, _THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
 
 
-def read_source(value: Any) -> str | tuple[str, ...]:
+def _read_source(value: Any) -> str | tuple[str, ...]:
     """Text, or a list of texts as a tuple; the number of a camera as text."""
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return f"camera:{value}"
     texts = value if isinstance(value, list) else [value]
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
-        raise BadKeyError(found(value, SOURCE_ALLOWED))
+        raise BadKeyError(found(value, _SOURCE_ALLOWED))
     return tuple(texts) if isinstance(value, list) else str(value)
 
 
-def read_delay(value: Any) -> float | Literal["estimate"]:
+def _read_delay(value: Any) -> float | Literal["estimate"]:
     """Seconds, or the word that asks for them."""
     if value == "estimate":
         return "estimate"
     if not is_number(value) or not -LONGEST_DELAY_S <= value <= LONGEST_DELAY_S:
-        raise BadKeyError(found(value, DELAY_ALLOWED))
+        raise BadKeyError(found(value, _DELAY_ALLOWED))
     return float(value)
 
 
-def read_free(value: Any) -> tuple[str, ...]:
+def _read_free(value: Any) -> tuple[str, ...]:
     """Directions in the order of the twist."""
     if not isinstance(value, list) or not value:
-        raise BadKeyError(found(value, FREE_ALLOWED))
+        raise BadKeyError(found(value, _FREE_ALLOWED))
     for i, name in enumerate(value):
         if name not in TWIST_NAMES:
             raise BadKeyError(found(name, one_of(TWIST_NAMES)), i)
         if name in value[:i]:
-            raise BadKeyError(found(value, FREE_ALLOWED) + f'; "{name}" stands there twice')
+            raise BadKeyError(found(value, _FREE_ALLOWED) + f'; "{name}" stands there twice')
     return tuple(name for name in TWIST_NAMES if name in value)
+
+
+SensorName: TypeAlias = Annotated[
+    str, AfterValidator(_read_sensor_name), Field(description="a name for the sensor, as text")
+]
+Method: TypeAlias = Annotated[
+    str | None, PlainValidator(_read_method), Field(description=_METHOD_ALLOWED)
+]
+Threshold: TypeAlias = Annotated[
+    str | float | None, PlainValidator(_read_threshold), Field(description=_THRESHOLD_ALLOWED)
+]
+Source: TypeAlias = Annotated[
+    str | tuple[str, ...], PlainValidator(_read_source), Field(description=_SOURCE_ALLOWED)
+]
+Delay: TypeAlias = Annotated[
+    float | Literal["estimate"], PlainValidator(_read_delay), Field(description=_DELAY_ALLOWED)
+]
+Free: TypeAlias = Annotated[
+    tuple[str, ...], PlainValidator(_read_free), Field(description=_FREE_ALLOWED)
+]
 
 
 def read_calibration_key(value: Any) -> Any:
@@ -121,6 +141,14 @@ def is_number(value: object) -> TypeGuard[int | float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64
+
+
+def as_number(text: str) -> float:
+    """A text as a number; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def limits(value: object) -> str:

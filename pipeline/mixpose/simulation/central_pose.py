@@ -203,12 +203,7 @@ def _middle(T_world_object: Floats, body: Body) -> Floats:
 
 
 def _aside(
-    session: Session,
-    T: Floats,
-    placed: Sequence[tuple[Floats, float]],
-    seed: int,
-    *,
-    turned: bool,
+    session: Session, T: Floats, placed: Sequence[tuple[Floats, float]], seed: int, *, turned: bool
 ) -> Floats:
     """A pose apart from all that are placed, as near as can be where most features are seen."""
     body = session.body

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+from numpy.random import Generator
 
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, from_parts, rotation_matrix
@@ -99,7 +100,7 @@ def plan_motion(
     )
 
 
-def _swing(amplitudes: Floats, period_s: float, rng: np.random.Generator) -> Swing:
+def _swing(amplitudes: Floats, period_s: float, rng: Generator) -> Swing:
     low, high = _FREQUENCIES[:, :1], _FREQUENCIES[:, 1:]
     first = np.arcsin(_FIRST) * rng.choice([-1.0, 1.0], 3)
     # rising or falling at first, each sinusoid for itself

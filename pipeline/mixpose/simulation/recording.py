@@ -16,11 +16,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import (
-    central_pose,
-    plan_companions,
-    swinging,
-)
+from mixpose.simulation.central_pose import central_pose, plan_companions, swinging
 from mixpose.simulation.channels import Channel, Planner, check_setup
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
@@ -221,11 +217,7 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
 
 
 def _record_frame(
-    plan: _Plan,
-    writers: Iterable[SensorWriter],
-    number: int,
-    T_world_object: Floats,
-    moment: float,
+    plan: _Plan, writers: Iterable[SensorWriter], number: int, T_world_object: Floats, moment: float
 ) -> bool:
     """Record one frame with every sensor; False if the body is away or all of them missed it."""
     options, body = plan.options, plan.session.body

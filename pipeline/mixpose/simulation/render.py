@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.special import erf
 
@@ -81,10 +82,7 @@ class ProfileFormat:
 
 
 def render_image(
-    visible: VisibleSpots,
-    form: ImageFormat,
-    options: SimulationOptions,
-    rng: np.random.Generator,
+    visible: VisibleSpots, form: ImageFormat, options: SimulationOptions, rng: Generator
 ) -> NDArray[np.uint8]:
     """The image (H, W) that a camera takes of spots in px; what is brighter than 255 is 255."""
     width, height = form.resolution
@@ -141,10 +139,7 @@ def draw_light(
 
 
 def render_profile(
-    visible: VisibleSpots,
-    form: ProfileFormat,
-    options: SimulationOptions,
-    rng: np.random.Generator,
+    visible: VisibleSpots, form: ProfileFormat, options: SimulationOptions, rng: Generator
 ) -> NDArray[np.float32]:
     """The profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
     profile = np.zeros(form.bins)
@@ -182,9 +177,7 @@ class ImageWriter:
     ) -> None:
         self._files, self._folder, self._options, self._form = files, folder, options, form
 
-    def write(
-        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
-    ) -> None:
+    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Draw and write one image."""
         image = render_image(visible, self._form, self._options, rng)
         path = self._folder / self._files.name(number)
@@ -225,9 +218,7 @@ class VideoWriter:
                 'video; write images, with a glob like "left*.png"'
             )
 
-    def write(
-        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
-    ) -> None:
+    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Draw one image and append it."""
         image = render_image(visible, self._form, self._options, rng)
         self._video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
@@ -252,9 +243,7 @@ class ProfileWriter:
             header = {"descr": "<f4", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(self._file, header)
 
-    def write(
-        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
-    ) -> None:
+    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Draw one profile and append it."""
         profile = render_profile(visible, self._form, self._options, rng)
         row = profile.astype("<f4").tobytes()
@@ -277,9 +266,7 @@ class DetectionWriter:
         self._file = _made(files, folder).open("w", encoding="ascii", newline="\n")
         self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
 
-    def write(
-        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
-    ) -> None:
+    def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Append the detections of one frame."""
         noise = self._noise * rng.standard_normal(visible.points.shape)
         shown = np.ones(len(noise), dtype=bool)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
 from mixpose.body import Body, PointFeature
 from mixpose.records import Floats
@@ -118,7 +119,7 @@ class _Stage:
     middle: Floats  # (3,)
     frame: Floats  # (3, 3), rows to the side, down and to the front, as cameras see it
     options: SimulationOptions
-    rng: np.random.Generator
+    rng: Generator
 
     def lamp(self) -> Actor:
         """A lamp behind the body that stays where it is."""

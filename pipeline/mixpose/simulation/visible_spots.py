@@ -13,6 +13,7 @@ from math import ceil
 from typing import Any, cast
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from mixpose.body import Body, SegmentFeature
@@ -75,7 +76,7 @@ def look(
     body: Body,
     T_world_object: Floats,
     options: SimulationOptions,
-    rng: np.random.Generator,
+    rng: Generator,
     *,
     offsets: Floats | None = None,
     pose_after: PoseAt | None = None,
@@ -219,12 +220,12 @@ def facing(
     return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)
 
 
-def brightness_levels(count: int, spread: float, rng: np.random.Generator) -> Floats:
+def brightness_levels(count: int, spread: float, rng: Generator) -> Floats:
     """Brightness (count,) about 1 with a standard deviation, never too dark to be seen."""
     return np.maximum(1.0 + spread * rng.standard_normal(count), _DIMMEST)
 
 
-def displacements(body: Body, T_world_object: Floats, rng: np.random.Generator) -> Floats:
+def displacements(body: Body, T_world_object: Floats, rng: Generator) -> Floats:
     """Displacements (N, 3) in the body's axes, drawn from its spread; gravity's by its pose."""
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
     pairs = zip(draws, body.features, strict=True)
@@ -235,7 +236,7 @@ def displacements(body: Body, T_world_object: Floats, rng: np.random.Generator) 
     return np.asarray(drawn + along @ T_world_object[:3, :3])
 
 
-def _hidden(count: int, options: SimulationOptions, rng: np.random.Generator) -> Mask:
+def _hidden(count: int, options: SimulationOptions, rng: Generator) -> Mask:
     """Which features (N,) something stands before in this view."""
     hidden = rng.random(count) < options.hidden
     hidden[rng.permutation(count)[: options.hidden_count]] = True

@@ -37,17 +37,8 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     plane, in which the origin and the first axis are as near to where they were as can be.  Of a
     body with a tip the tip is the point, of others the origin.
 
-    Parameters
-    ----------
-    up : {"x", "y", "z"}
-        The axis of the world that points up; of a body, its own.
-    sensors : (n, 3) array
-        Where sensors are in the old world: up is where they are.
-
-    Raises
-    ------
-    RecordingError
-        If the poses tell no floor.
+    `up` is the axis of the world that points up; of a body, its own. Up is where the sensors
+    (n, 3), in the old world, are. Raises RecordingError if the poses tell no floor.
     """
     bodies: dict[str, list[Estimate]] = {}
     for each in estimates:

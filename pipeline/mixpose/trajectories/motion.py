@@ -32,11 +32,7 @@ ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
 
 # [ω] of x -> ω × x is ω of these, row by row
 _ACROSS = np.array(
-    [
-        [0.0, 0, 0, 0, 0, -1, 0, 1, 0],
-        [0.0, 0, 1, 0, 0, 0, -1, 0, 0],
-        [0.0, -1, 0, 1, 0, 0, 0, 0, 0],
-    ]
+    [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
 )
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
@@ -98,13 +94,8 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
 def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, Floats, Floats]:
     """The states with measured poses, (4, 4) or (G, 4, 4), and their covariances.
 
-    Returns
-    -------
-    states : States
-    squared : (G,) float64
-        Mahalanobis distance squared of the pose from what was foretold.
-    log_likelihood : (G,) float64
-        Without the constant −3 log 2π.
+    Beside them the Mahalanobis distances squared (G,) of the poses from what was foretold, and the
+    log-likelihoods (G,) without the constant −3 log 2π.
     """
     rest = rigid.twist_between(states.poses, np.broadcast_to(pose, states.poses.shape))
     rest = rest.reshape(-1, 6)

@@ -66,20 +66,10 @@ def smooth_body(
 ) -> SmoothedBody:
     """Smooth the poses of one body, a line per frame.
 
-    Parameters
-    ----------
-    symmetries : (n, 4, 4) array or None
-        Of the body: poses that look the same are one.
-    fill_s : float
-        Gaps of at most so many seconds from pose to pose are filled.
-    motion : str or None
-        What takes white noise, of `mixpose.trajectories.motion.ORDERS`; else the likeliest.
-
-    Raises
-    ------
-    RecordingError
-        If a frame stands twice, a pose has no covariance, or gaps are to be filled and there are
-        no times.
+    Poses that look the same by the body's symmetries (n, 4, 4) are one. Gaps of at most `fill_s`
+    seconds from pose to pose are filled. `motion` says what takes white noise, of
+    `mixpose.trajectories.motion.ORDERS`; else the likeliest. Raises RecordingError if a frame
+    stands twice, a pose has no covariance, or gaps are to be filled and there are no times.
     """
     rules = rules or SmoothingRules()
     ordered = sorted(lines, key=lambda line: line.frame)

@@ -5,25 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Rig
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Rig, read_content
 from mixpose.session.calibration.colmap import COLMAP
-from mixpose.session.calibration.camera import Content, read_content
 from mixpose.session.calibration.kalibr import KALIBR
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
 from mixpose.session.calibration.pycalib import PYCALIB
-from mixpose.session.calibration.ros import ROS
-from mixpose.session.calibration.ros import ROS_INI
+from mixpose.session.calibration.ros import ROS, ROS_INI
+from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
 from mixpose.session.intrinsics import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
 
 __all__ = ["FORMATS", "CalibratedCamera", "Rig", "read_calibration", "read_rigs"]
 
-FORMATS: tuple[Format, ...] = (
-    *(KALIBR, OPENCV, PYCALIB, ROS),
-    *(ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP),
-)
+FORMATS = (KALIBR, OPENCV, PYCALIB, ROS, ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP)
 """In the order in which they are tried: Kalibr's files may begin like OpenCV's."""
 
 
@@ -80,10 +75,8 @@ def format_of(content: Content, also: str = "") -> Format:
         if each.recognises(content):
             return each
     known = ", ".join(each.shown for each in FORMATS)
-    keys = list(content.toml) or content.parsed()
-    shown = ", ".join(map(str, keys)) if isinstance(keys, dict | list) and keys else "no keys"
-    if isinstance(keys, list) and not content.toml:
-        shown = "no keys"
+    keys = content.toml or content.parsed()
+    shown = ", ".join(map(str, keys)) if isinstance(keys, dict) and keys else "no keys"
     raise BadKeyError(f"found {shown[:80]}; allowed: {known}{also}")
 
 

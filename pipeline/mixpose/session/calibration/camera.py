@@ -10,29 +10,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from mixpose.records import Floats
-from mixpose.rigid import from_parts
 from mixpose.session.intrinsics import CameraModel, Intrinsics
-from mixpose.session.messages import BadKeyError, found, in_file, one_of, under
-from mixpose.session.motion import rigid
+from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.setup import Unit
 from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_bytes
-from mixpose.session.values import numbers, resolution
 
 Group: TypeAlias = "Sequence[Content]"
-
-# Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
-MODELS: dict[str, CameraModel] = {
-    "radtan": "pinhole",
-    "plumb_bob": "pinhole",
-    "rational_polynomial": "pinhole",
-    "none": "pinhole",
-    "equidistant": "fisheye",
-    "fisheye": "fisheye",
-}
 
 # how a NumPy array, an archive of them, and a pickle of Python begin
 _NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
@@ -78,78 +62,6 @@ class Format:
     # files that belong together; None for formats whose files stand alone
     groups: Callable[[Group], list[Group]] | None = None
     holds_several: bool = True  # whether one file can hold several cameras
-
-
-def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floats:
-    """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists."""
-    with under("translation"):
-        t = numbers(_flat(translation), (3,), "[x, y, z]")
-    if isinstance(rotation, list) and rotation and isinstance(rotation[0], list | tuple):
-        rotation = _flat(rotation) if len(rotation[0]) == 1 else rotation
-    allowed = "a rotation, three rows of three numbers or [x, y, z], axis times angle in radians"
-    if isinstance(rotation, list) and len(rotation) == 9:
-        rotation = [rotation[k : k + 3] for k in (0, 3, 6)]
-    if isinstance(rotation, list) and rotation and isinstance(rotation[0], list):
-        with under(key):
-            R = numbers(rotation, (3, 3), allowed)
-        return rigid(from_parts(R, t), key)
-    with under(key):
-        vector = numbers(rotation, (3,), allowed)
-    return from_parts(Rotation.from_rotvec(vector).as_matrix(), t)
-
-
-def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) -> Floats:
-    """A rigid motion (4, 4) of a quaternion, real part first, and a translation.
-
-    Raises BadKeyError if the quaternion has no length.
-    """
-    w, x, y, z = wxyz
-    if not 0.5 < np.linalg.norm(wxyz) < 2:
-        raise BadKeyError(f"found a quaternion of length {np.linalg.norm(wxyz):.3g}; allowed: 1")
-    return from_parts(Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(translation))
-
-
-def _flat(value: Any) -> Any:
-    """A column of numbers as a list."""
-    if isinstance(value, list) and all(isinstance(v, list) and len(v) == 1 for v in value):
-        return [item[0] for item in value]
-    return value
-
-
-def model_of_distortion(name: object) -> CameraModel | None:
-    """The camera model that a distortion model of Kalibr or ROS belongs to.
-
-    None for the empty name, which ROS writes for a camera without distortion.
-    """
-    if name is None or name == "":
-        return None
-    if isinstance(name, str) and name in MODELS:
-        return MODELS[name]
-    raise BadKeyError(found(name, one_of(MODELS)))
-
-
-def present(content: dict[str, Any], key: str) -> Any:
-    """A key without which a camera would silently count as free of distortion."""
-    if key not in content:
-        raise BadKeyError(f"missing; keys in the file: {', '.join(map(str, content))[:80]}")
-    return content[key]
-
-
-def plain(value: Any) -> Any:
-    """Turn text such as 1e-05, which YAML does not take for a number, into numbers."""
-    if isinstance(value, list):
-        return [plain(item) for item in value]
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return value
-    return value
-
-
-def size_of(value: Any) -> tuple[int, int] | None:
-    """Width and height; None where they are missing or, as some drivers write, zero."""
-    return None if value in (None, [0, 0]) else resolution(value)
 
 
 @dataclass(frozen=True)

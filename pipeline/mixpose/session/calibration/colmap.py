@@ -13,17 +13,11 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.calibration.camera import (
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    motion_of_quaternion,
-    size_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import motion_of_quaternion, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
-from mixpose.session.values import LARGEST
+from mixpose.session.values import LARGEST, as_number
 
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
@@ -159,10 +153,7 @@ def _whole(cell: str) -> int:
 def _floats(cells: Sequence[str]) -> list[float]:
     values = []
     for cell in cells:
-        try:
-            value = float(cell)
-        except ValueError:
-            value = np.nan
+        value = as_number(cell)
         if not abs(value) < LARGEST:
             raise BadKeyError(found(cell, "a finite number"))
         values.append(value)

@@ -12,16 +12,8 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import (
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    model_of_distortion,
-    plain,
-    present,
-    size_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import model_of_distortion, plain, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid

@@ -20,14 +20,8 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import (
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    model_of_distortion,
-    motion_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import model_of_distortion, motion_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
@@ -60,9 +54,6 @@ class _Nodes:
     nodes: dict[str, cv2.FileNode]
     # nodes point into what was read: it must live as long as they
     storages: list[cv2.FileStorage] = field(default_factory=list)
-
-    def get(self, name: str) -> cv2.FileNode | None:
-        return self.nodes.get(name)
 
 
 def _recognises(content: Content) -> bool:
@@ -214,7 +205,7 @@ def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
 
 def _own_pose(own: _Nodes) -> Floats | None:
     """MC-Calib's pose of a camera in the coordinates of the first."""
-    node = own.get("camera_pose_matrix")
+    node = own.nodes.get("camera_pose_matrix")
     if node is None:
         return None
     with under("camera_pose_matrix"):
@@ -250,10 +241,10 @@ def _matrix(node: cv2.FileNode) -> list[Any]:
 def _stated_model(opened: _Nodes) -> CameraModel | None:
     """The camera model, where the file states one (OpenCV's calibration sample does)."""
     for key in ("fisheye_model", "distortion_type"):  # the latter is MC-Calib's
-        flag = opened.get(key)
+        flag = opened.nodes.get(key)
         if flag is not None and flag.isInt():
             return "fisheye" if flag.real() else "pinhole"
-    name = opened.get("distortion_model")
+    name = opened.nodes.get("distortion_model")
     if name is not None and name.isString():
         with under("distortion_model"):
             return model_of_distortion(name.string())
@@ -262,7 +253,7 @@ def _stated_model(opened: _Nodes) -> CameraModel | None:
 
 def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     for names in _SIZE_NODES:
-        nodes = [opened.get(name) for name in names]
+        nodes = [opened.nodes.get(name) for name in names]
         sizes = [
             int(node.real())
             for node in nodes

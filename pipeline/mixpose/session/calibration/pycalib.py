@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
+from mixpose.session.calibration.pieces import motion_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 

@@ -7,17 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from mixpose.session.calibration.camera import (
-    MODELS,
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    model_of_distortion,
-    plain,
-    present,
-    size_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import MODELS, model_of_distortion, plain, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, one_of, under
 

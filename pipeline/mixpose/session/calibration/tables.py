@@ -10,15 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from mixpose.session.calibration.camera import (
-    CalibratedCamera,
-    Content,
-    Format,
-    Group,
-    motion_of,
-    present,
-    size_of,
-)
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.pieces import motion_of, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.session.setup import Unit
