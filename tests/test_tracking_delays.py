@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
+from mixpose.matching import LEAST_VARIANCE
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.in_motion import delays_after, offsets_of
 
 K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
 MARKERS = np.array(
@@ -79,3 +82,32 @@ def test_clocks_that_have_nothing_in_common_are_not_believed() -> None:
     assert estimate.status == "ok"
     # all that it detects, where its frame was taken at the common time after all
     assert (estimate.sensors["other clock"].explained or 0.0) > 0.9
+
+
+def test_what_frames_tell_of_delays_leaves_out_what_pose_and_velocity_explain() -> None:
+    """The information on a delay is what is left of it beside all other unknowns."""
+    body = Body("tracker", tuple(PointFeature(point) for point in MARKERS))
+    tracker = Tracker.create(body, EstimatorOptions(), pose_at(0.0))
+    track, asked = tracker.begin(), tracker.rules.timing.asked
+    for number in range(asked):
+        views = views_at(number * INTERVAL, told=False)
+        views[1] = replace(views[1], delay=0.5 * LATE)  # told in part, so that the velocity matters
+        track, _ = tracker.advance(track, number, number * INTERVAL, views)
+    views = [replace(view, delay=LATE / 2 * k) for k, view in enumerate(views)]
+    frame = tracker.data(track, asked, asked * INTERVAL, views)
+    best = tracker.explain(frame)[0]
+    found, before = delays_after(frame, best), track.delays
+    assert found.names == ("side",)
+    met, expected = offsets_of(frame, best.used), frame.expected(best.T_world_object)
+    variance = max(float(met.offsets @ met.offsets) / (len(met.offsets) - 6), LEAST_VARIANCE)
+    late = np.where(met.sensor == 1, met.rows @ expected.velocity, 0.0)
+    ways = met.rows * met.late[:, None] * expected.deviation
+    known = np.hstack([np.zeros((6, 6)), np.eye(6), np.zeros((6, 1))])  # of the velocity
+    seen = np.column_stack([met.rows, ways, late]) / np.sqrt(variance)
+    all_rows = np.vstack([seen, known])
+    sizes = np.maximum(np.linalg.norm(all_rows, axis=0), 1e-300)
+    R = np.linalg.qr(all_rows / sizes, mode="r")
+    information = float(R[-1, -1] * sizes[-1]) ** 2  # R^T R are the normal equations
+    told = before.information[0, 0] if before.names else 0.0
+    assert found.information[0, 0] - told == pytest.approx(information, rel=1e-4)
+    assert information < 0.999 * float(late @ late) / variance

@@ -121,14 +121,16 @@ def diagnosis(
         and one.gain > rules.margin
         for one in tried
     ):
-        tried += _with_values(session, frames, before, is_late)
+        best = max((one for one in tried if one.change.values), key=lambda t: t.gain, default=None)
+        met = best.explained if best and best.gain > rules.margin else before
+        tried += _with_values(session, frames, before, is_late, met)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
         return found
     more = further()
     poses = before.poses + _as_it_is(session, more, is_late).poses
     before, frames = Explained(poses), [*frames, *more][: len(poses)]
-    return simplest([*_with_values(session, frames, before, is_late)], before, rules)
+    return simplest([*_with_values(session, frames, before, is_late, before)], before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -208,12 +210,16 @@ def _in_pairs(
 
 
 def _with_values(
-    session: Session, frames: Frames, before: Explained, is_late: Callable[[], bool]
+    session: Session,
+    frames: Frames,
+    before: Explained,
+    is_late: Callable[[], bool],
+    met: Explained,
 ) -> Iterator[Tried]:
-    """Values that suit the matches of all frames better than those given."""
+    """Values that suit the matches of all frames, as they are `met`, better than those given."""
     rules = DiagnosisRules()
-    known = [k for k, pose in enumerate(before.poses) if evidence_of(pose) > 0]
-    posed = [(frames[k][1], pose) for k in known if (pose := before.poses[k]) is not None]
+    known = [k for k, pose in enumerate(met.poses) if evidence_of(pose) > 0]
+    posed = [(frames[k][1], pose) for k in known if (pose := met.poses[k]) is not None]
     if not posed:
         return
     given = Adjustment(
