@@ -5,9 +5,9 @@ the count is off and the body is found with that change, doubts calibrations and
 bodies that could be taken for each other and recordings that are given twice, `placement` looks at
 where sensors stand and the body starts, `lookalikes` finds poses that the sensors could not tell
 apart. `geometry` takes a few frames all over the recording, and `trials` tries what else the
-session could have said: `changes` of it as a whole and two of them together, what cameras find
-`alone`, and `values` that are adjusted to what sensors met; `evidence` says what they met and how
-well frames are explained, `rules` when a change is told.
+session could have said: `changes` of it as a whole, by two of them, and `values` that are adjusted
+to what sensors met; `evidence` says what they met and how well frames are explained, `rules` when a
+change is told.
 """
 
 from mixpose.checking.keys import advice as advice, judge as judge, told_apart as told_apart

@@ -1,7 +1,7 @@
 """What a session may have said wrong as a whole: inverted, swapped, mirrored, in another unit.
 
 A change is of the body, of sensors, or of what they see; those with values to be found are in
-`alone` and `values`.
+`values`, but for what cameras tell that each find the body alone: they need no start for that.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, PointFeature
-from mixpose.checking.evidence import Views
+from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
+
+_OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
 
 
 @dataclass(frozen=True)
@@ -239,3 +241,58 @@ def _flipped(view: View, width: int) -> View:
     points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
     flipped = replace(pattern, points=np.asarray(points))
     return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))
+
+
+def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
+    """Another size of the body, and other places of cameras, by where each of them alone has it."""
+    found = list[dict[str, tuple[Any, Floats]]]()  # of each frame: cameras, T_world_object
+    for number, views in frames:
+        poses = [(view, _alone(session, number, view)) for view in views]
+        found.append({view.name: (view.sensor, T) for view, T in poses if T is not None})
+    if all(isinstance(feature, PointFeature) for feature in session.body.features):
+        yield from _other_sizes(session, found)
+    for setup in session.sensors:
+        name, seen = setup.name, [each for each in found if setup.name in each and len(each) > 1]
+        for each in seen[:1]:
+            sensor, T_own = each[name]
+            T_other = next(T for other, (_, T) in each.items() if other != name)
+            T = sensor.T_sensor_world @ T_own @ inverse(T_other)
+            moved = _of_sensors(
+                misplaced(setup),
+                moved_by(sensor.T_sensor_world, T, session.unit),
+                [name],
+                lambda view, T=T: with_sensor(view, replace(view.sensor, T_sensor_world=T)),  # type: ignore[misc]
+            )
+            yield replace(moved, cost=3 * math.log(2 * len(session.body) * len(found)), values=6)
+
+
+def _other_sizes(session: Session, found: Sequence[dict[str, Any]]) -> Iterator[Change]:
+    """A body of the size that cameras see.
+
+    Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
+    in two cameras that stand at (R, t) to each other.
+    """
+    middle, sizes = np.append(session.body.means.mean(axis=0), 1.0), list[float]()
+    for each in found:
+        for (a, T_a), (b, T_b) in combinations(each.values(), 2):
+            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)
+            p_a = (a.T_sensor_world @ T_a @ middle)[:3]
+            p_b = (b.T_sensor_world @ T_b @ middle)[:3]
+            apart = p_b - T_ba[:3, :3] @ p_a
+            sizes.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
+    size, (least, most) = float(np.median(sizes or [1.0])), _OTHER_SIZE
+    if abs(size - 1) > least and 1 / most < size < most:
+        yield Change(
+            OTHER_SIZE,
+            f"with points {times_as_large(size)}",
+            body=lambda body: of_size(body, size),
+            values=1,
+        )
+
+
+def _alone(session: Session, number: int, view: View) -> Floats | None:
+    """T_world_object (4, 4) that one camera finds by itself."""
+    if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
+        return None
+    pose = best_pose(anywhere(session), session.body, number, [view])
+    return None if pose is None else pose.T_world_object

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mixpose.checking.alone import by_cameras_alone
-from mixpose.checking.changes import Change, changes, of_points, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes, of_points, with_sensor
 from mixpose.checking.evidence import (
     Explained,
     Frames,
@@ -167,17 +166,11 @@ def _without_values(
             if is_late() and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
             runner.advance(session)
-        if k == 0:
-            for more in (_by_cameras_alone, _in_pairs):
-                begun = [runner for runner in runners if runner.poses]
-                ahead = max(begun, key=lambda r: r.gain(before), default=None)
-                if is_late() or (ahead and ahead.explains(rules)):
-                    break
-                for runner in more(session, frames, runners, before):
-                    if is_late():
-                        break
-                    runner.advance(session)
-                    runners.append(runner)
+        for runner in _less_simple(session, frames, runners, before) if k == 0 else ():
+            if is_late():
+                break
+            runner.advance(session)
+            runners.append(runner)
         tried = [runner for runner in runners if len(runner.poses) > k]
         tried.sort(key=lambda runner: -runner.gain(before))
         best = tried[0].gain(before) if tried else 0.0
@@ -188,25 +181,26 @@ def _without_values(
         yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
 
 
-def _by_cameras_alone(
-    session: Session, frames: Frames, _: Sequence[_Runner], __: Explained
-) -> list[_Runner]:
-    return [_Runner(change, frames) for change in by_cameras_alone(session, frames[:2])]
+def _less_simple(
+    session: Session, frames: Frames, runners: Sequence[_Runner], before: Explained
+) -> Iterator[_Runner]:
+    """Where the best of those so far do not explain the first frame: as cameras alone see it.
 
-
-def _in_pairs(
-    session: Session, frames: Frames, tried: Sequence[_Runner], before: Explained
-) -> list[_Runner]:
-    """Those that explain most, each with every other change."""
+    And, where that does not either, those that explain most with every other change.
+    """
     rules = DiagnosisRules()
-    ahead = [one for one in tried if one.poses and one.gain(before) > rules.margin]
-    ahead.sort(key=lambda one: -one.gain(before))
-    return [
-        _Runner(change.and_also(one.change), one.frames)
-        for one in ahead[: rules.leaders]
-        for change in changes(session)
-        if change.what != one.change.what
-    ]
+
+    def best() -> list[_Runner]:
+        ahead = [one for one in runners if one.poses and one.gain(before) > rules.margin]
+        ahead.sort(key=lambda one: -one.gain(before))
+        return [] if ahead and ahead[0].explains(rules) else ahead[: rules.leaders]
+
+    first = [one for one in runners if one.poses and one.explains(rules)]
+    if best() or not first:
+        yield from [_Runner(change, frames) for change in by_cameras_alone(session, frames[:2])]
+    for one in best():
+        others = [change for change in changes(session) if change.what != one.change.what]
+        yield from [_Runner(change.and_also(one.change), one.frames) for change in others]
 
 
 def _with_values(
