@@ -16,7 +16,6 @@ import numpy as np
 
 from mixpose.body import Body, PointFeature
 from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
-from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
@@ -50,13 +49,11 @@ class Change:
             values=self.values + other.values,
         )
 
-    def of(self, session: Session) -> Session:
+    def of(self, session: Session, views: Views) -> Session:
         """A session of one body as it should have been, but for what is in its recordings."""
-        nothing = PointPattern(np.zeros((0, 2)), np.zeros(0))
-        views = [View(s.name, s.sensor, Observation(nothing, 1.0)) for s in session.sensors]
         sensors = {view.name: view.sensor for view in self.views(views)}
-        setups = tuple(replace(s, sensor=sensors[s.name]) for s in session.sensors)
-        return replace(session, body=self.body(session.body), sensors=setups)
+        setups = [replace(s, sensor=sensors.get(s.name, s.sensor)) for s in session.sensors]
+        return replace(session, body=self.body(session.body), sensors=tuple(setups))
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:

@@ -41,7 +41,7 @@ class Doubts:
     """What frames tell of a session."""
 
     warnings: tuple[str, ...] = ()
-    change: Change | None = None  # that explains them: what else is odd may follow from it
+    mended: Session | None = None  # that explains them: what is odd without it may follow
     tried: str = ""  # what came of frames by the session as it is; empty where none was estimated
 
 
@@ -70,8 +70,9 @@ def geometry_doubts(
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
     found = diagnosis(session, frames, others, further)
-    if found.change:
-        return Doubts((f"{found.change}, {found.gain}",), found.likeliest)
+    if found.likeliest:
+        mended = found.likeliest.of(session, frames[0][1])
+        return Doubts((f"{found.change}, {found.gain}",), mended)
     if not found.good and len(sources) > 1:
         doubts = Doubts(_contradiction(session, frames))
     else:
@@ -164,7 +165,7 @@ def _at_the_start(recording: _Recording) -> Doubts:
         if evidence(change.body(session.body)) > rules.sure + rules.margin:
             what = "points and translation of [start] are in two units of length"
             where = f"the body is at [start] in frame {number}"
-            return Doubts((f"{what}: {change.remedy}, {where}",), change)
+            return Doubts((f"{what}: {change.remedy}, {where}",), change.of(session, views))
     return Doubts()
 
 

@@ -108,15 +108,16 @@ def check_session(
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     report.warnings += shared_source_warnings(session, replaced) + _pairing_warnings(opened)
-    sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
-    given, doubts = _of_geometry(sized), geometry_doubts(session, opened, surveys)
+    sizes = {name: each.size for name, each in surveys.items()}
+    given = _of_geometry(with_image_sizes(session, sizes))
+    doubts = geometry_doubts(session, opened, surveys)
     report.lines += given.lines
-    if doubts.change is None:
+    if doubts.mended is None:
         report.warnings = told_apart(report.of_counts) + report.warnings + given.warnings
         report.warnings += doubts.warnings
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings]
-        report.warnings += _of_geometry(doubts.change.of(sized)).warnings
+        report.warnings += _of_geometry(with_image_sizes(doubts.mended, sizes)).warnings
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
     report.write(doubts.tried or not_tried)
