@@ -26,6 +26,8 @@ from simulated_rigs import (
 )
 
 from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
+from mixpose.calibration.adjust import _climbed, _weighted
+from mixpose.calibration.bundle import Bundle, solved
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.matching import clock_of, interpolate, match
 from mixpose.calibration.recorded import held_back_with
@@ -62,6 +64,25 @@ def test_a_camera_off_by_2_degrees_and_20_mm_that_is_7_ms_late_is_put_right() ->
     assert found.noise == pytest.approx(0.02, rel=0.2)
     assert found.residuals[1].held < 0.05 < found.residuals[1].before
     assert len(found.used) == 40
+
+
+def test_a_step_is_as_large_as_the_deviations_of_what_it_moves() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 20, 0.02)
+    task = bumped(task_of(sensors, frames, free={1: ("pose",)}), 1, 0.01, 0.1)
+    blocks = blocks_of(task.rig, task.free, body=False, length=1.0, interval=1.0)
+    poses = np.array([motion(frame.number / FPS) for frame in frames])
+    known = np.zeros(6, np.bool_)
+    bundle = Bundle(
+        frames, blocks, known, lambda _: np.zeros((0, 6)), task.sigmas, CalibrationRules()
+    )
+    state, noise = State(task.rig, poses), np.full(2, 0.02)
+    weighted, _ = _weighted(bundle, state, 4 * noise, noise, last=True)
+    step = solved(bundle, state, weighted, 1e-9)
+    _, size = _climbed(bundle, state, weighted)
+    assert size == pytest.approx(np.abs(step.rig / np.sqrt(np.diag(step.covariance))).max())
+    # 0.1 mm and 0.01 degrees, known to some hundredths of a mm: it is not yet where it will stay
+    assert size > 1
 
 
 def test_marker_coordinates_2_mm_off_are_learnt_up_to_the_gauge() -> None:

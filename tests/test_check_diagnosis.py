@@ -10,102 +10,38 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnosed import (
+    bare,
+    enlarged,
+    frames_of,
+    inverted,
+    poses,
+    recorded,
+    told,
+    with_cameras,
+    with_points,
+)
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body
 from mixpose.checking import geometry_doubts, survey
 from mixpose.checking.changes import Change, of_units
 from mixpose.checking.evidence import Seen, best_pose
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
 from mixpose.checking.values import Adjustment, adjusted, promise, unknowns
-from mixpose.density import Observation
-from mixpose.objective import View
-from mixpose.records import PointPattern
-from mixpose.rigid import from_rotation_vector, inverse, perturb, transform
+from mixpose.rigid import perturb, transform
 from mixpose.runner import open_sources
-from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
 from mixpose.session.setup import Start
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
-SIGMA, NOISE = 1.5, 0.1
 MOVED = np.array([1.5, -2.0, 1.0, 0.004, -0.01, 0.006])
-Frames = list[tuple[int, list[View]]]
-
-
-def poses() -> list[np.ndarray]:
-    rng = np.random.default_rng(4)
-    return [
-        from_rotation_vector(rng.normal(0, 1, 3), rng.normal([10, -8, 5], 25)) for _ in range(4)
-    ]
 
 
 @pytest.fixture
 def right() -> Session:
     session = load_session(SYNTHETIC / "two_cameras" / "session.toml")
     return replace(session, start=None)
-
-
-def recorded(session: Session) -> dict[str, list[np.ndarray]]:
-    """What the cameras of a session see, shuffled."""
-    rng = np.random.default_rng(5)
-    seen: dict[str, list[np.ndarray]] = {}
-    for setup in session.sensors:
-        for T in poses():
-            y, visible = setup.sensor.project(transform(T, session.body.means))
-            if session.body.normals is not None:
-                world = transform(T, session.body.means)
-                towards = setup.sensor.towards(world)
-                facing = ((session.body.normals @ T[:3, :3].T) * towards).sum(axis=1) > 0
-                visible = visible & facing
-            y = y[visible] + rng.normal(0, NOISE, y[visible].shape)
-            seen.setdefault(setup.name, []).append(rng.permutation(y))
-    return seen
-
-
-def frames_of(session: Session, seen: dict[str, list[np.ndarray]]) -> Frames:
-    """The same as a session takes it for."""
-    count = len(next(iter(seen.values())))
-    return [
-        (
-            f,
-            [
-                View(setup.name, setup.sensor, Observation(of_points(seen[setup.name][f]), SIGMA))
-                for setup in session.sensors
-            ],
-        )
-        for f in range(count)
-    ]
-
-
-def of_points(points: np.ndarray) -> PointPattern:
-    return PointPattern(points, np.ones(len(points)))
-
-
-def with_points(session: Session, points: np.ndarray, normals: Any = None) -> Session:
-    body = Body(session.body.name, tuple(PointFeature(p) for p in points), normals)
-    return replace(session, body=body)
-
-
-def with_cameras(session: Session, change: Callable[[Any], Any]) -> Session:
-    setups = [replace(s, sensor=change(s.sensor)) for s in session.sensors]
-    return replace(session, sensors=tuple(setups))
-
-
-def enlarged(sensor: PinholeCamera) -> PinholeCamera:
-    return replace(sensor, camera_matrix=sensor.camera_matrix * [[0.5], [0.5], [1.0]])
-
-
-def inverted(sensor: PinholeCamera) -> PinholeCamera:
-    return replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world))
-
-
-def bare(sensor: PinholeCamera) -> PinholeCamera:
-    return replace(sensor, distortion=np.zeros(0))
-
-
-def told(session: Session, seen: dict[str, list[np.ndarray]]) -> str:
-    return diagnosis(session, frames_of(session, seen)).change
 
 
 def test_a_right_session_has_nothing_wrong(right: Session) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,3 +154,16 @@ def test_a_body_shows_the_features_that_face_whoever_looks_at_one_of_them(
     normals[: count // 2] *= -1
     two_sided = replace(unknown, body=replace(session.body, normals=normals))
     assert expected_count(session.sensors[0], two_sided) == count - count // 2
+
+
+@pytest.mark.parametrize(("unit", "is_told"), [("m", True), ("cm", False), ("mm", False)])
+def test_a_body_larger_than_any_is_in_another_unit(
+    unit: Any, is_told: bool, session: Session
+) -> None:
+    """210 mm across; 210 m are a ship, 2.1 m a car."""
+    found = [text for text in placement_warnings(replace(session, unit=unit)) if "across" in text]
+    assert (
+        found
+        == ["the body 'tracker' is 210 m across: is unit = \"m\" that of points and translations?"]
+        * is_told
+    )

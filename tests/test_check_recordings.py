@@ -70,7 +70,10 @@ def with_extract(recording: Path, line: str) -> Path:
 @pytest.mark.parametrize("name", ["two_cameras", "one_camera_video", "range_profiles"])
 def test_a_good_recording_has_no_warnings(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     report = report_on(SYNTHETIC / name / "session.toml", capsys, quick=True)
-    assert "warnings  none; whether the geometry fits the recording, mixpose run --stop 3" in report
+    assert "warnings  none; 4 of 4 frames that were estimated (0, " in report
+    # good recordings meet features to 0.65 sigma at most
+    met = float(report.rpartition("are explained, features met to ")[2].split(" sigma", 1)[0])
+    assert 0 < met < 0.65
 
 
 def test_frames_that_would_show_the_geometry_count_from_the_first(
@@ -79,7 +82,12 @@ def test_frames_that_would_show_the_geometry_count_from_the_first(
     for path in sorted(recording.glob("*0000.png")) + sorted(recording.glob("*0001.png")):
         path.unlink()
     report = report_on(recording / "session.toml", capsys, quick=True)
-    assert report.endswith("mixpose run --stop 5 shows, as far as it can be seen\n")
+    assert "none; 4 of 4 frames that were estimated (2, 4, 5, 7) are explained" in report
+
+
+def test_what_was_not_tried_is_not_said_to_fit(capsys: pytest.CaptureFixture[str]) -> None:
+    report = report_on(SYNTHETIC / "several_bodies" / "session.toml", capsys, quick=True)
+    assert "none; no frame was estimated, which mixpose run --stop 3 does\n" in report
 
 
 def test_corners_have_no_polarity(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,3 +59,20 @@ def test_what_the_page_about_trouble_quotes_is_in_the_code() -> None:
             left = left.replace(text, "")
         # names, numbers and short words stand between the texts
         assert len(left) < 0.7 * len(line), line
+
+
+def test_what_the_page_about_trouble_quotes_leads_to_where_it_is_quoted() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    table = page.partition("## By what is printed")[2].partition("## By what the poses do")[0]
+    rows = re.findall(r"^\| (`.*`) \| (.*) \|$", table, re.MULTILINE)
+    assert len(rows) > 50
+    printed = [(re.findall("`([^`]+)`", phrases), links) for phrases, links in rows]
+    for entry in re.split(r"^### ", page, flags=re.MULTILINE)[1:]:
+        heading = re.sub(r"[^\w\- ]", "", entry.partition("\n")[0].lower()).replace(" ", "-")
+        for line in QUOTED.findall(entry):
+            found = [
+                links
+                for phrases, links in printed
+                if any(all(part in line for part in one.split(" ... ")) for one in phrases)
+            ]
+            assert any(f"(#{heading})" in links for links in found), line

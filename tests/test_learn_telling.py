@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from mixpose.calibration import SeenFrame
 from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.growing import least_met
+from mixpose.learning.bodies import _is_chance
+from mixpose.learning.growing import Found, least_met
+from mixpose.learning.placing import Placement, Shape
+from mixpose.learning.points import _supported
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector
+from mixpose.sensors import PinholeCamera
 
 POINTS = np.array([[0, 0, 0], [60, 5, 0], [-15, 70, 10], [20, -30, 45], [-40, 10, 80.0]])
 RULES = LearningRules()
@@ -110,3 +117,30 @@ def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it(
 
 def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> None:
     assert [least_met(points) for points in (3, 4, 5, 9)] == [3, 3, 4, 4]
+
+
+@pytest.mark.parametrize(("more", "is_chance"), [(-1, True), (0, False)])
+def test_four_points_that_no_other_size_has_are_a_body_from_twice_the_least_frames(
+    more: int, is_chance: bool
+) -> None:
+    rules, points = LearningRules(), np.vstack([np.zeros(3), 50 * np.eye(3)])
+    one = Placement(np.eye(4), np.arange(4), 0.5)
+    places = [(k, one) for k in range(2 * rules.least_frames + more)]
+    body = Found(Shape(points, np.full(4, 0.1)), tuple(places))
+    assert _is_chance(body, [], rules) == is_chance
+
+
+def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:
+    """One is a ghost, but which is not known; only a point of three takes its detections."""
+    sensors = [PinholeCamera(np.eye(3) * [[900], [900], [1]], np.zeros(0), None, np.eye(4))] * 3
+    points = np.array([[0.0, 0, 900], [9.0, 0, 900]])
+    frame = SeenFrame(0, None, {k: np.full((2, 2), 1e6) for k in range(3)}, {})
+    gates = np.full(3, 1.0)
+
+    def kept(*detections: list[int]) -> Any:
+        both, gaps = np.array(detections), np.array([0.1, 0.2])
+        found = _supported(points, both, gaps, frame, sensors, gates)
+        return (found >= 0).any(axis=1).tolist()
+
+    assert kept([0, 0, -1], [0, 1, -1]) == [True, True]
+    assert kept([0, 0, 0], [0, 1, -1]) == [True, False]

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from detections import ALL_FREE
@@ -52,6 +54,35 @@ def test_rays_of_two_cameras_meet_in_the_point_that_both_see(kind: str) -> None:
     np.testing.assert_allclose(found.points[same], points[found.rays[same, 0]], atol=0.02)
     # rays of different points rarely meet
     assert (~same).sum() < 10
+
+
+def test_thousands_of_rays_are_not_all_held_against_each_other_at_once() -> None:
+    """Four million pairs, of which a number each would take 32 MB, and a point each 96 MB."""
+    rng = np.random.default_rng(6)
+    seen = [
+        camera.rays(rng.uniform([0, 0], [1280, 1024], (2000, 2))) for camera in cameras("pinhole")
+    ]
+    rays = [each for each in seen if each is not None]
+    tracemalloc.start()
+    try:
+        found = triangulate(rays, [0.3, 0.2], 0.02)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 2**24
+    a, b = (each.select(found.rays[:, k]) for k, each in enumerate(rays))
+    normal = np.cross(a.directions, b.directions)
+    between = np.abs(((b.origins - a.origins) * normal).sum(axis=1))
+    # lines pass at |(o_b - o_a) . (d_a x d_b)| / |d_a x d_b|; each pair within its gate, none twice
+    assert len(np.unique(found.rays, axis=0)) == len(found.rays) > 1000
+    assert found.gap.max() <= 1
+    np.testing.assert_allclose(found.gap * found.tolerance, between / (normal**2).sum(axis=1))
+    # of some rays of the first camera, none that meets is left out
+    some = rays[0].select(np.arange(1500, 1520))
+    again = triangulate([some, rays[1]], [0.3, 0.2], 0.02)
+    own = (found.rays[:, 0] >= 1500) & (found.rays[:, 0] < 1520)
+    np.testing.assert_array_equal(again.rays, found.rays[own] - np.array([1500, 0]))
+    np.testing.assert_allclose(again.points, found.points[own], atol=1e-6)
 
 
 def test_three_points_in_space_give_the_pose() -> None:

@@ -99,6 +99,7 @@ WRONG = [
     ("a.rom", rom(POINTS)[:300], "found 300 bytes; an NDI .rom file has 752"),
     ("a.rom", rom(POINTS)[:80] + b"\x01" + rom(POINTS)[81:], "checksum is wrong"),
     ("a.rom", rom(np.zeros((0, 3))), "found 0 markers"),
+    ("a.rom", rom(np.arange(63.0).reshape(21, 3)), "found 21 markers; allowed: 1 to 20"),
     ("a.rom", rom(np.full((3, 3), np.nan)), "finite coordinates"),
     ("a.csv", rom(POINTS), "rename it, to end in .rom"),
     ("a.vsk", "<KinematicModel", "not XML"),

@@ -126,3 +126,17 @@ def test_a_pose_that_is_sure_for_doubtful_ones_before_it_alone_is_in_doubt() -> 
         tracks, estimates = scene.advance(tracks, k, k / 10, views)
         statuses.append(estimates[1].status)
     assert "ok" not in statuses, statuses
+
+
+def test_what_is_known_of_a_companion_is_mean_and_variance_of_where_it_was() -> None:
+    tool = body("tool", TOOL)
+    places = np.random.default_rng(7).normal([150.0, 0, 0], 5.0, (12, 3))
+    known = None
+    for place in places:
+        beside = from_rotation_vector([0.5, 0, 0], place)
+        known = Companion.joined(known, at(40, turn=0.3) @ beside, at(40, turn=0.3), tool)
+    assert known is not None
+    assert known.count == 12
+    np.testing.assert_allclose(known.T_other_object[:3, 3], places.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(known.squares[:3], places.var(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(known.squares[3:], 0.0, atol=1e-18)

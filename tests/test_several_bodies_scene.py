@@ -109,6 +109,17 @@ def test_identical_bodies_found_from_nothing_are_numbered_along_x() -> None:
     assert [estimate.instance for estimate in estimates] == [0, 1, 2]
 
 
+def test_identical_bodies_that_are_looked_for_again_are_where_they_were_nearest() -> None:
+    one = body("rod", TOOL)
+    scene, poses = scene_of(one, one), [at(-120, 10), at(120, -20)]
+    tracks, _ = scene.advance(scene.begin(), 0, None, views_of([one] * 2, poses, 4))
+    views = views_of([one] * 2, poses, 5)
+    found = Sharing(scene.bodies, tracks, 1, None, views, scene.rules)._found_at_once()
+    # 0.2 px are 0.24 mm at this distance, 240 mm from each other
+    for k, T in enumerate(poses):
+        assert np.linalg.norm(found[k][0].T_world_object[:3, 3] - T[:3, 3]) < 2.0
+
+
 def followed(scene: Scene, one: Body, path: Sequence[Sequence[Floats]]) -> list[list[Estimate]]:
     tracks: Sequence[Track] = scene.begin()
     found = []

@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
+from mixpose.matching import LEAST_VARIANCE
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.in_motion import delays_after, offsets_of
 
 K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
 MARKERS = np.array(
@@ -79,3 +82,39 @@ def test_clocks_that_have_nothing_in_common_are_not_believed() -> None:
     assert estimate.status == "ok"
     # all that it detects, where its frame was taken at the common time after all
     assert (estimate.sensors["other clock"].explained or 0.0) > 0.9
+
+
+def test_what_frames_tell_of_delays_leaves_out_what_pose_and_velocity_explain() -> None:
+    """The information on a delay is what is left of it beside all other unknowns."""
+    body = Body("tracker", tuple(PointFeature(point) for point in MARKERS))
+    tracker, rng = Tracker.create(body, EstimatorOptions(), pose_at(0.0)), np.random.default_rng(0)
+
+    def seen_at(time_s: float) -> list[View]:
+        """With 0.3 px of noise, and half of the delay told."""
+        views = []
+        for k, view in enumerate(views_at(time_s, told=False)):
+            y, _ = view.sensor.project(transform(pose_at(time_s + k * LATE), MARKERS))
+            pattern = PointPattern(y + rng.normal(0, 0.3, y.shape), np.ones(len(y)))
+            views.append(replace(view, observation=Observation(pattern, 1.5), delay=k * LATE / 2))
+        return views
+
+    track, last = tracker.begin(), 6
+    for number in range(last):
+        track, _ = tracker.advance(track, number, number * INTERVAL, seen_at(number * INTERVAL))
+    frame = tracker.data(track, last, last * INTERVAL, seen_at(last * INTERVAL))
+    best = tracker.explain(frame)[0]
+    found, before = delays_after(frame, best), track.delays
+    assert found.names == ("side",)
+    met, expected = offsets_of(frame, best.used), frame.expected(best.T_world_object)
+    variance = max(float(met.offsets @ met.offsets) / (len(met.offsets) - 6), LEAST_VARIANCE)
+    late = np.where(met.sensor == 1, met.rows @ expected.velocity, 0.0)
+    ways = met.rows * met.late[:, None] * expected.deviation
+    known = np.hstack([np.zeros((6, 6)), np.eye(6), np.zeros((6, 1))])  # of the velocity
+    seen = np.column_stack([met.rows, ways, late]) / np.sqrt(variance)
+    all_rows = np.vstack([seen, known])
+    sizes = np.maximum(np.linalg.norm(all_rows, axis=0), 1e-300)
+    _, R = np.linalg.qr(all_rows / sizes)
+    information = float(R[-1, -1] * sizes[-1]) ** 2  # R^T R are the normal equations
+    told = float(found.information[0, 0] - before.information[0, 0])
+    assert told == pytest.approx(information, rel=1e-6)
+    assert 0 < information < 0.9 * float(late @ late) / variance

@@ -88,3 +88,12 @@ def test_a_pose_that_meets_few_markers_of_many_is_ambiguous(
     verdict = decided(tracker.data(tracker.begin(), 0, None, views), [pose])
     assert verdict.doubt == expected
     assert verdict.status == ("ambiguous" if expected else "ok")
+
+
+def test_of_one_camera_or_two_one_that_meets_a_marker_is_enough(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # five of eight by one camera alone; each of the other three is missed as often as it is in view
+    alike = 3 * (5 - 2) * np.log(1 / 20)
+    assert odds(pinhole_cameras, 5) == pytest.approx(alike + 3 * np.log(4))
+    assert odds(pinhole_cameras, 5, 0) == pytest.approx(alike + 2 * 3 * np.log(4))

@@ -25,7 +25,7 @@ from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker, predict
 from mixpose.tracking.frame import follow
-from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.motion import Course, MotionRules, RandomWalk
 from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
@@ -199,3 +199,27 @@ def test_a_start_may_be_as_far_off_as_is_said() -> None:
     unsaid = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     expected = np.repeat([0.1 * EIGHT.radius, np.radians(5.0)], 3)
     assert unsaid.start_uncertainty == pytest.approx(expected)
+
+
+def test_a_course_goes_on_by_its_derivatives_and_spreads_by_what_jerk_may_do() -> None:
+    """Place, velocity, acceleration and jerk by Taylor; a random walk of the jerk, integrated."""
+    course, seconds = Course.begun(np.ones(6), EIGHT, RULES), 0.3
+    state = np.array([1.0, 2.0, 3.0, 4.0])
+    course = replace(
+        course, means=course.means + state, covariances=np.zeros_like(course.covariances)
+    )
+    means, covariances = course._foretold(seconds)
+    t = seconds
+    taylor = [
+        1 + 2 * t + 3 * t**2 / 2 + 4 * t**3 / 6,
+        2 + 3 * t + 4 * t**2 / 2,
+        3 + 4 * t,
+        4.0,
+    ]
+    np.testing.assert_allclose(means, np.broadcast_to(taylor, means.shape), rtol=1e-12)
+    # shocks at s move a place at t by (t - s)^3 / 6, a velocity by (t - s)^2 / 2, and so on
+    s = (np.arange(20000) + 0.5) * t / 20000
+    moved = np.stack([(t - s) ** 3 / 6, (t - s) ** 2 / 2, t - s, np.ones_like(s)])
+    walked = moved @ moved.T * t / 20000
+    per_jerk = covariances / covariances[..., 3:, 3:] * t
+    np.testing.assert_allclose(per_jerk, np.broadcast_to(walked, per_jerk.shape), rtol=1e-6)

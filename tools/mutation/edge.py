@@ -149,8 +149,8 @@ _CHECKING = (
     Mutant(
         "checking-many-values-are-as-simple-as-one",
         "checking/trials.py",
-        "near.sort(key=lambda each: each[0].change.values)",
-        "near.sort(key=lambda each: -each[0].change.values)",
+        "near.sort(key=lambda each: (each[0].change.values, -each[0].gain))",
+        "near.sort(key=lambda each: (-each[0].change.values, -each[0].gain))",
         "a camera is said to stand elsewhere where the body is of another size",
         _DIAGNOSIS,
     ),

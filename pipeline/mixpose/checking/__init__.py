@@ -5,11 +5,13 @@ the count is off and the body is found with that change, doubts calibrations and
 bodies that could be taken for each other and recordings that are given twice, `placement` looks at
 where sensors stand and the body starts, `lookalikes` finds poses that the sensors could not tell
 apart. `geometry` takes a few frames all over the recording, and `trials` tries what else the
-session could have said: `changes` of it as a whole, and `values` that are adjusted to what sensors
-met; `evidence` says what they met and how well frames are explained, `rules` when a change is told.
+session could have said: `changes` of it as a whole, by two of them, and `values` that are adjusted
+to what sensors met; `evidence` says what they met and how well frames are explained, `rules` when a
+change is told.
 """
 
 from mixpose.checking.keys import advice as advice, judge as judge, told_apart as told_apart
+from mixpose.checking.changes import times_as_large as times_as_large
 from mixpose.checking.geometry import (
     CAUSES as CAUSES,
     Doubts as Doubts,

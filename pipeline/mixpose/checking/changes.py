@@ -1,11 +1,12 @@
 """What a session may have said wrong as a whole: inverted, swapped, mirrored, in another unit.
 
 A change is of the body, of sensors, or of what they see; those with values to be found are in
-`values`.
+`values`, but for what cameras tell that each find the body alone: they need no start for that.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -17,7 +18,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
-from mixpose.rigid import inverse
+from mixpose.rigid import inverse, rotation_angle_deg
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
 
@@ -36,6 +37,23 @@ class Change:
     cost: float = 0.0  # nats that the choice of its values costs
     values: int = 0  # how many are chosen
     feature: int | None = None  # the only one that is changed
+
+    def and_also(self, other: Change) -> Change:
+        """Both together."""
+        return Change(
+            f"{self.what}, and {other.what}",
+            f"{self.remedy}, and {other.remedy}",
+            views=lambda views: other.views(self.views(views)),
+            body=lambda body: other.body(self.body(body)),
+            cost=self.cost + other.cost,
+            values=self.values + other.values,
+        )
+
+    def of(self, session: Session, views: Views) -> Session:
+        """A session of one body as it should have been, but for what is in its recordings."""
+        sensors = {view.name: view.sensor for view in self.views(views)}
+        setups = [replace(s, sensor=sensors.get(s.name, s.sensor)) for s in session.sensors]
+        return replace(session, body=self.body(session.body), sensors=tuple(setups))
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
@@ -66,12 +84,14 @@ def changes(session: Session) -> Iterator[Change]:
     sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
-            lenses = {a: _with_lens(sensors[a], sensors[b]), b: _with_lens(sensors[b], sensors[a])}
+            lenses = {a: sensors[b], b: sensors[a]}
             yield _of_sensors(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
                 (a, b),
-                lambda view, lenses=lenses: with_sensor(view, lenses[view.name]),  # type: ignore[misc]
+                lambda view, lenses=lenses: with_sensor(  # type: ignore[misc]
+                    view, _with_lens(view.sensor, lenses[view.name])
+                ),
             )
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
     for names in _all_or_one(list(sized)):
@@ -148,6 +168,26 @@ OTHER_SIZE = (
 )
 
 
+def times_as_large(factor: float) -> str:
+    """A factor in words, to two digits of what it differs from 1 by."""
+    places = 1 - math.floor(math.log10(max(abs(factor - 1), 1e-9)))
+    return f"{round(factor, max(places, 2)):.9g} times as large"
+
+
+def misplaced(setup: SensorSetup) -> str:
+    """A sensor that stands elsewhere, as in `Change.what`."""
+    sensor: Any = setup.sensor
+    at_origin = np.array_equal(sensor.T_sensor_world, np.eye(4))
+    return f"T_sensor_world of {setup.name!r} {{is}} off{' or left out' if at_origin else ''}"
+
+
+def moved_by(before: Floats, after: Floats, unit: str) -> str:
+    """How another T_sensor_world (4, 4) differs, in words."""
+    away, turn = np.linalg.norm((after - before)[:3, 3]), rotation_angle_deg(before, after)
+    length, angle = (f"{float(f'{float(each):.2g}'):g}" for each in (away, turn))
+    return f"with it moved by {length} {unit} and turned by {angle} deg"
+
+
 def called(names: Sequence[str]) -> str:
     """Sensors in words."""
     return " and ".join(repr(name) for name in names)
@@ -200,31 +240,48 @@ def _flipped(view: View, width: int) -> View:
     return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))
 
 
-def other_sizes(session: Session, frames: Frames) -> Iterator[Change]:
-    """A body of the size that cameras see where each alone finds it.
+def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
+    """Another size of the body, and other places of cameras, by where each of them alone has it."""
+    found = list[dict[str, tuple[Any, Floats]]]()  # of each frame: cameras, T_world_object
+    for number, views in frames:
+        poses = [(view, _alone(session, number, view)) for view in views]
+        found.append({view.name: (view.sensor, T) for view, T in poses if T is not None})
+    if all(isinstance(feature, PointFeature) for feature in session.body.features):
+        yield from _other_sizes(session, found)
+    for setup in session.sensors:
+        name, seen = setup.name, [each for each in found if setup.name in each and len(each) > 1]
+        for each in seen[:1]:
+            sensor, T_own = each[name]
+            T_other = next(T for other, (_, T) in each.items() if other != name)
+            T = sensor.T_sensor_world @ T_own @ inverse(T_other)
+            moved = _of_sensors(
+                misplaced(setup),
+                moved_by(sensor.T_sensor_world, T, session.unit),
+                [name],
+                lambda view, T=T: with_sensor(view, replace(view.sensor, T_sensor_world=T)),  # type: ignore[misc]
+            )
+            yield replace(moved, cost=3 * math.log(2 * len(session.body) * len(found)), values=6)
+
+
+def _other_sizes(session: Session, found: Sequence[dict[str, Any]]) -> Iterator[Change]:
+    """A body of the size that cameras see.
 
     Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
     in two cameras that stand at (R, t) to each other.
     """
-    body = session.body
-    if not all(isinstance(feature, PointFeature) for feature in body.features):
-        return
-    middle = np.append(body.means.mean(axis=0), 1.0)
-    found = []
-    for number, views in frames:
-        places = [(view.sensor, _alone(session, number, view)) for view in views]
-        seen = [(each, T) for each, T in places if T is not None]
-        for (a, T_a), (b, T_b) in combinations(seen, 2):
-            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)  # type: ignore[attr-defined]
-            p_a = (a.T_sensor_world @ T_a @ middle)[:3]  # type: ignore[attr-defined]
-            p_b = (b.T_sensor_world @ T_b @ middle)[:3]  # type: ignore[attr-defined]
+    middle, sizes = np.append(session.body.means.mean(axis=0), 1.0), list[float]()
+    for each in found:
+        for (a, T_a), (b, T_b) in combinations(each.values(), 2):
+            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)
+            p_a = (a.T_sensor_world @ T_a @ middle)[:3]
+            p_b = (b.T_sensor_world @ T_b @ middle)[:3]
             apart = p_b - T_ba[:3, :3] @ p_a
-            found.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
-    size, (least, most) = float(np.median(found or [1.0])), _OTHER_SIZE
+            sizes.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
+    size, (least, most) = float(np.median(sizes or [1.0])), _OTHER_SIZE
     if abs(size - 1) > least and 1 / most < size < most:
         yield Change(
             OTHER_SIZE,
-            f"with points {size:.3g} times as large",
+            f"with points {times_as_large(size)}",
             body=lambda body: of_size(body, size),
             values=1,
         )

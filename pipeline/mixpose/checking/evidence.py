@@ -32,6 +32,7 @@ Frames: TypeAlias = Sequence[tuple[int, Views]]
 Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # as in `Seen`
 Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
 
+_FEW = 3  # features in view that tell of a pose
 _MISSED = 0.3  # of the body: a camera that meets less mostly misses it
 _REACH = 3.0  # times sigma, from a displaced feature to its detection
 _BESIDE = 10.0  # times sigma, from a feature that is missed to a detection that may be its own
@@ -90,8 +91,9 @@ def _columns(feature: int | None) -> slice:
 def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:
     """Whether a pose is sure, and no sensor sees much beside what it meets."""
     matches = pose.matches
-    # what a sensor sees of which the body is out of its view is no body, or the view is wrong
-    in_view = np.where(matches.expected > 0, matches.expected, matches.expected.max())
+    # what a sensor sees of which the body is out of its view is no body, or the view is wrong; a
+    # feature or two there are met by any change
+    in_view = np.where(matches.expected >= _FEW, matches.expected, matches.expected.max())
     could = np.minimum(matches.count, in_view)
     return bool(
         pose.log_evidence > rules.sure

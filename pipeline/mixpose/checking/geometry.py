@@ -41,7 +41,8 @@ class Doubts:
     """What frames tell of a session."""
 
     warnings: tuple[str, ...] = ()
-    explains: bool = False  # whether a change does: numbers of features are no more odd then
+    mended: Session | None = None  # that explains them: what is odd without it may follow
+    tried: str = ""  # what came of frames by the session as it is; empty where none was estimated
 
 
 def geometry_doubts(
@@ -69,11 +70,19 @@ def geometry_doubts(
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
     found = diagnosis(session, frames, others, further)
-    if found.change:
-        return Doubts((f"{found.change}, {found.gain}",), explains=True)
+    if found.likeliest:
+        mended = found.likeliest.of(session, frames[0][1])
+        return Doubts((f"{found.change}, {found.gain}",), mended)
     if not found.good and len(sources) > 1:
-        return Doubts(_contradiction(session, frames))
-    return _at_the_start(recording)
+        doubts = Doubts(_contradiction(session, frames))
+    else:
+        doubts = _at_the_start(recording)
+    numbers = ", ".join(str(number) for number in sorted(n for n, _ in frames[: found.count]))
+    met = f", features met to {found.rms:.2g} sigma in the median" if found.good else ""
+    explained = (
+        f"{found.good} of {found.count} frames that were estimated ({numbers}) are explained"
+    )
+    return replace(doubts, tried=f"{explained}{met}")
 
 
 @dataclass(frozen=True)
@@ -156,7 +165,7 @@ def _at_the_start(recording: _Recording) -> Doubts:
         if evidence(change.body(session.body)) > rules.sure + rules.margin:
             what = "points and translation of [start] are in two units of length"
             where = f"the body is at [start] in frame {number}"
-            return Doubts((f"{what}: {change.remedy}, {where}",), explains=True)
+            return Doubts((f"{what}: {change.remedy}, {where}",), change.of(session, views))
     return Doubts()
 
 

@@ -32,6 +32,7 @@ Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
 _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
 _LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
+_LARGEST_M = 20.0  # in metres: what is larger than a lorry is hardly seen as one rigid body
 _AVERTED = 0.2  # cosine: a feature that is turned away further is hardly seen
 _SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
 _TRIED = 64
@@ -54,7 +55,7 @@ def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
 
 def placement_warnings(session: Session) -> list[str]:
     """What is most likely wrong about where sensors and body are, a line each."""
-    warnings = _twins(session)
+    warnings = _twins(session) + _too_large(session)
     if session.start is None:
         return warnings + _no_common_view(session)
     T = session.start.T_world_object
@@ -109,6 +110,17 @@ def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
     return [
         f"sensors {a.name!r} and {b.name!r} stand {apart:.2g} {session.unit} apart, less than two "
         f"lenses need: are translations in {session.unit}? Kalibr, ROS and caliscope write metres"
+    ]
+
+
+def _too_large(session: Session) -> list[str]:
+    """Bodies larger than any: lengths in another unit than the session says."""
+    sizes = {one.body.name: 2 * one.body.radius for one in session.objects}
+    return [
+        f"the body {name!r} is {float(f'{across:.3g}'):g} {session.unit} across: is unit = "
+        f'"{session.unit}" that of points and translations?'
+        for name, across in sizes.items()
+        if across * session.metres_per_unit > _LARGEST_M
     ]
 
 

@@ -55,6 +55,9 @@ class DiagnosisRules:
         "ones would take 250,000",
     )
     behind: float = constant(0.5, "of the best gain so far, below which a change is tried no more")
+    leaders: int = constant(
+        3, "changes that explain most, though no frame, that are tried with each other one as well"
+    )
     patience_s: float = constant(20.0, "of processor time, for all trials together")
     as_it_is: float = constant(
         0.15,

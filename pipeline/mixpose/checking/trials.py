@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mixpose.checking.changes import Change, changes, of_points, other_sizes, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes, of_points, with_sensor
 from mixpose.checking.evidence import (
     Explained,
     Frames,
@@ -48,7 +48,11 @@ class Diagnosis:
     # what is wrong, and with what change frames are explained; empty where nothing is
     change: str = ""
     gain: str = ""  # what is explained by it
-    good: int = 0  # how many frames are explained as the session is
+    likeliest: Change | None = None  # of the changes that this may be
+    # by the session as it is: how many frames are explained, of how many, and what is met off there
+    good: int = 0
+    count: int = 0
+    rms: float = 0.0  # in sigma
 
 
 @dataclass
@@ -65,6 +69,11 @@ class _Runner:
         body = self.change.body(session.body)
         seen, guesses = self.change.views(views), DiagnosisRules().guesses
         self.poses.append(best_pose(session, body, number, seen, guesses))
+
+    def explains(self, rules: DiagnosisRules) -> bool:
+        """Whether it explains the last frame."""
+        pose = self.poses[-1]
+        return pose is not None and is_explained(pose, rules)
 
     def gain(self, before: Explained) -> float:
         """Nats by which it explains the frames that it tried better."""
@@ -111,14 +120,16 @@ def diagnosis(
         and one.gain > rules.margin
         for one in tried
     ):
-        tried += _with_values(session, frames, before, is_late)
+        best = max((one for one in tried if one.change.values), key=lambda t: t.gain, default=None)
+        met = best.explained if best and best.gain > rules.margin else before
+        tried += _with_values(session, frames, before, is_late, met)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
         return found
     more = further()
     poses = before.poses + _as_it_is(session, more, is_late).poses
     before, frames = Explained(poses), [*frames, *more][: len(poses)]
-    return simplest([*_with_values(session, frames, before, is_late)], before, rules)
+    return simplest([*_with_values(session, frames, before, is_late, before)], before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -155,13 +166,11 @@ def _without_values(
             if is_late() and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
             runner.advance(session)
-        firsts = [runner.poses[-1] for runner in runners if runner.poses]
-        is_ahead = any(pose is not None and is_explained(pose, rules) for pose in firsts)
-        if k == 0 and not is_late() and not is_ahead:
-            sizes = [_Runner(change, frames) for change in other_sizes(session, frames[:2])]
-            for runner in sizes:
-                runner.advance(session)
-            runners += sizes
+        for runner in _less_simple(session, frames, runners, before) if k == 0 else ():
+            if is_late():
+                break
+            runner.advance(session)
+            runners.append(runner)
         tried = [runner for runner in runners if len(runner.poses) > k]
         tried.sort(key=lambda runner: -runner.gain(before))
         best = tried[0].gain(before) if tried else 0.0
@@ -172,13 +181,39 @@ def _without_values(
         yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
 
 
-def _with_values(
-    session: Session, frames: Frames, before: Explained, is_late: Callable[[], bool]
-) -> Iterator[Tried]:
-    """Values that suit the matches of all frames better than those given."""
+def _less_simple(
+    session: Session, frames: Frames, runners: Sequence[_Runner], before: Explained
+) -> Iterator[_Runner]:
+    """Where the best of those so far do not explain the first frame: as cameras alone see it.
+
+    And, where that does not either, those that explain most with every other change.
+    """
     rules = DiagnosisRules()
-    known = [k for k, pose in enumerate(before.poses) if evidence_of(pose) > 0]
-    posed = [(frames[k][1], pose) for k in known if (pose := before.poses[k]) is not None]
+
+    def best() -> list[_Runner]:
+        ahead = [one for one in runners if one.poses and one.gain(before) > rules.margin]
+        ahead.sort(key=lambda one: -one.gain(before))
+        return [] if ahead and ahead[0].explains(rules) else ahead[: rules.leaders]
+
+    first = [one for one in runners if one.poses and one.explains(rules)]
+    if best() or not first:
+        yield from [_Runner(change, frames) for change in by_cameras_alone(session, frames[:2])]
+    for one in best():
+        others = [change for change in changes(session) if change.what != one.change.what]
+        yield from [_Runner(change.and_also(one.change), one.frames) for change in others]
+
+
+def _with_values(
+    session: Session,
+    frames: Frames,
+    before: Explained,
+    is_late: Callable[[], bool],
+    met: Explained,
+) -> Iterator[Tried]:
+    """Values that suit the matches of all frames, as they are `met`, better than those given."""
+    rules = DiagnosisRules()
+    known = [k for k, pose in enumerate(met.poses) if evidence_of(pose) > 0]
+    posed = [(frames[k][1], pose) for k in known if (pose := met.poses[k]) is not None]
     if not posed:
         return
     given = Adjustment(
@@ -250,7 +285,13 @@ def _fitted(
     unlikely = float(((values / unknown.deviations) ** 2).sum())
     cost = 0.5 * (count * math.log(max(2 * explained.met(), 2.0)) + unlikely)
     change = Change(
-        unknown.what, unknown.remedy(values), cost=cost, values=count, feature=unknown.feature
+        unknown.what,
+        unknown.remedy(values),
+        lambda views: _by(unknown, values, views),
+        lambda _: body,
+        cost=cost,
+        values=count,
+        feature=unknown.feature,
     )
     yield Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
 
@@ -262,16 +303,16 @@ def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
 
 def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
     """The simplest of the changes that explain most, and another that is as simple and good."""
-    good = before.good(rules)
+    as_it_is = Diagnosis(good=before.good(rules), count=len(before.poses), rms=before.rms())
     told = [(one, _gain(one, before, rules)) for one in tried]
     told = [(one, gain) for one, gain in told if gain and one.gain > rules.margin]
     if not told:
-        return Diagnosis(good=good)
+        return as_it_is
     most = max(one.gain for one, _ in told)
     near = [
         each for each in told if each[0].gain > most - max(rules.rival, rules.share * abs(most))
     ]
-    near.sort(key=lambda each: each[0].change.values)
+    near.sort(key=lambda each: (each[0].change.values, -each[0].gain))
     (best, gain), *others = near
     change = best.change
     # two values of the same are no two answers
@@ -283,7 +324,8 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
     words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
     told_of = [change, *(one.change for one in rivals[:1])]
     what = ", or ".join(each.what.format(**words) for each in told_of)
-    return Diagnosis(f"{what}: {', or '.join(each.remedy for each in told_of)}", gain, good)
+    remedies = ", or ".join(dict.fromkeys(each.remedy for each in told_of))
+    return replace(as_it_is, change=f"{what}: {remedies}", gain=gain, likeliest=change)
 
 
 def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
@@ -293,6 +335,8 @@ def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
     met, rms = before.met(feature), before.rms(feature)
     if after.met() < rules.fewer * before.met():
         return ""  # what meets less is near some detections, as a body that is far too small
+    if not now:
+        return ""  # what explains no frame explains one sensor of several
     if now > then:
         as_is = f", {then} as it is" if then else ""
         return f"{now} of {count} frames are explained{as_is}"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import PointFeature
-from mixpose.checking.changes import OTHER_SIZE, called
+from mixpose.checking.changes import OTHER_SIZE, called, misplaced, moved_by, times_as_large
 from mixpose.checking.evidence import Seen
 from mixpose.records import Floats
 from mixpose.rigid import perturb
@@ -180,7 +180,7 @@ def unknowns(session: Session) -> Iterator[Unknown]:
     if are_points and len(cameras) > 1:
         yield Unknown(
             OTHER_SIZE,
-            lambda v: f"with points {1 + v[0]:.3g} times as large",
+            lambda v: f"with points {times_as_large(1 + v[0])}",
             np.array([_SIZE]),
             points=lambda points, v: points + v[0] * (points - points.mean(axis=0)),
         )
@@ -195,11 +195,8 @@ def unknowns(session: Session) -> Iterator[Unknown]:
     for setup in cameras if len(cameras) > 1 else ():
         name, radius = setup.name, body.radius
         yield Unknown(
-            f"T_sensor_world of {name!r} {{is}} off",
-            lambda v: (
-                f"with it moved by {_length(v[:3]):.2g} {session.unit} and turned by "
-                f"{np.degrees(_length(v[3:])):.2g} deg"
-            ),
+            misplaced(setup),
+            lambda v: moved_by(np.eye(4), perturb(np.eye(4), v), session.unit),
             np.array([_MOVED * radius] * 3 + [_TURNED] * 3),
             sensor=lambda own, sensor, v, name=name: (  # type: ignore[misc]
                 replace(sensor, T_sensor_world=perturb(sensor.T_sensor_world, v))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from mixpose.checking import times_as_large
 from mixpose.objective import pose_jacobian
 from mixpose.records import Estimate, Floats
 from mixpose.session import Session
@@ -69,7 +70,7 @@ def size_warnings(sizes: Mapping[str, BodySize]) -> list[str]:
     """A line for each body, by its label, that fits better in another size."""
     factors = {label: size.factor() for label, size in sizes.items()}
     return [
-        f"the features of {label!r} are met as if it were {factor:.4g} times as large: were its "
+        f"the features of {label!r} are met as if it were {times_as_large(factor)}: were its "
         "points measured or entered wrong, or are the places of the sensors?"
         for label, factor in factors.items()
         if factor is not None

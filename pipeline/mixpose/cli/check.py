@@ -59,7 +59,6 @@ class _Report:
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     of_counts: list[str] = field(default_factory=list)  # of features
-    first: int = 0  # frame of the recording
     of: str = ""  # of several bodies, which one is spoken of
 
     def say(self, title: str, text: str) -> None:
@@ -68,16 +67,13 @@ class _Report:
     def warn(self, text: str) -> None:
         self.warnings.append(f"{self.of}{text}")
 
-    def write(self) -> None:
+    def write(self, tried: str) -> None:
+        """Print all; `tried` is what is known where nothing is warned of."""
         for warning in self.warnings:
             self.say("warning", warning)
         if not self.warnings:
-            # what takes estimates of a few frames to know, and how to have them
-            shown = f"mixpose run --stop {self.first + 3} shows, as far as it can be seen"
-            text = f"none; whether the geometry fits the recording, {shown}"
-            self.say("warnings", text)
+            self.say("warnings", f"none; {tried}")
         sys.stdout.write("\n".join(self.lines) + "\n")
-        self.lines, self.warnings = [], []
 
 
 def check_session(
@@ -112,24 +108,35 @@ def check_session(
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     report.warnings += shared_source_warnings(session, replaced) + _pairing_warnings(opened)
-    sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
-    report.warnings += key_warnings(sized) + placement_warnings(sized)
-    for one in session.objects:
-        report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
-        _say_accuracy(report, sized.alone(one.body.name))
-    report.of = ""
-    report.warnings += shared_part_warnings(sized)
+    sizes = {name: each.size for name, each in surveys.items()}
+    given = _of_geometry(with_image_sizes(session, sizes))
     doubts = geometry_doubts(session, opened, surveys)
-    report.warnings += doubts.warnings
-    if not doubts.explains:
-        report.warnings = told_apart(report.of_counts) + report.warnings
+    report.lines += given.lines
+    if doubts.mended is None:
+        report.warnings = told_apart(report.of_counts) + report.warnings + given.warnings
+        report.warnings += doubts.warnings
+    else:  # the cause first, then what is odd all the same
+        report.warnings = [*doubts.warnings, *report.warnings]
+        report.warnings += _of_geometry(with_image_sizes(doubts.mended, sizes)).warnings
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
-    report.first = first
-    report.write()
+    not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
+    report.write(doubts.tried or not_tried)
     damage = [text for each in surveys.values() for text in each.damage]
     if damage:
         more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
         raise RecordingError(f"{damage[0]}{more}")
+
+
+def _of_geometry(session: Session) -> _Report:
+    """What is said of where sensors stand and what they see of the bodies there."""
+    report = _Report()
+    report.warnings += key_warnings(session) + placement_warnings(session)
+    for one in session.objects:
+        report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
+        _say_accuracy(report, session.alone(one.body.name))
+    report.of = ""
+    report.warnings += shared_part_warnings(session)
+    return report
 
 
 def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from statistics import median
 
 import numpy as np
@@ -102,7 +103,7 @@ class Findings:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._places = -1
-        self._ok = 0
+        self._ok = self._lost = 0
         names = [setup.name for setup in session.sensors]
         self._no_frame = {name: Stretches() for name in names}
         self._no_feature = {name: Stretches() for name in names}
@@ -152,7 +153,9 @@ class Findings:
                 if name in seen and _is_same(self._images.get(name), data):
                     self._again.add(name)
                 self._images[name] = data
-        if estimate.status != "ok" and len(self._frames) < _KEPT and len(seen) > 1:
+        is_lost = estimate.status == "lost"
+        tells = (bool(seen) and not flooded) if is_lost else len(seen) > 1
+        if estimate.status != "ok" and len(self._frames) < _KEPT and tells:
             self._frames.append((frame_set.number, list(views)))
 
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
@@ -173,6 +176,7 @@ class Findings:
         if estimate.label == self._session.labels[0]:
             self._places += 1
         self._ok += estimate.status == "ok"
+        self._lost += estimate.status == "lost"
         if estimate.doubt:
             self._doubts.setdefault(estimate.doubt, Stretches()).add(estimate.frame, self._places)
             self._doubted.add(estimate.frame, self._places)
@@ -267,9 +271,8 @@ class Findings:
         return lines
 
     def _of_doubts(self) -> list[str]:
-        change = self._change()
-        if change is not None:
-            return [f"{change}, frames that are not ok would be"]
+        if self.change is not None:
+            return [f"{self.change}, frames that are not ok would be"]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         since = self._changed_since()
@@ -303,12 +306,13 @@ class Findings:
         first = self._doubted.found[-1][0]
         return first, f"{most} from frame {first} on: {asked[most]}"
 
-    def _change(self) -> str | None:
-        """What the session should have said, where few frames are ok and some are doubted."""
+    @cached_property
+    def change(self) -> str | None:
+        """What the session should have said, where few frames are ok, and some doubted or lost."""
         doubted = sum(each.count for each in self._doubts.values())
         frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
-        bad = self._places + 1 - self._ok if doubted else 0
+        bad = self._places + 1 - self._ok if doubted or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
         return explanation(self._session, self._frames)

@@ -53,6 +53,9 @@ EXAMPLES = {
 }
 """Two calls of each command."""
 
+DEBUG = "Show the traceback of an error; of run, also where each pose came from that was searched."
+"""What `--debug` does, which is no parameter of a single command."""
+
 VALUES = {"path": "FILE", "int": "NUMBER", "float": "NUMBER", "str": "TEXT"}
 """What a value is called, by the word that begins its type's name."""
 
@@ -79,6 +82,7 @@ class Command(TyperCommand):
             if (record := one.get_help_record(ctx)) is not None:
                 title = getattr(one, "rich_help_panel", None) or kind
                 sections.setdefault(title, []).append(record)
+        sections.setdefault("Options", []).append(("--debug", DEBUG))
         for title, records in sections.items():
             with formatter.section(title):
                 formatter.write_dl(records)

@@ -160,6 +160,8 @@ def summary(
     for finding in findings:
         lines += describe(finding, body, session.unit)
     if estimate.status == "lost":
-        stand = ", or check T_sensor_world" if len(session.sensors) > 1 else ""
-        lines.append(f"lost: once the counts are right, give [start]{stand}")
+        lines.append(
+            f"lost: once the counts are right, mixpose check {session.path} tries what else may be "
+            "wrong with calibrations, places, sources or the body"
+        )
     return lines

@@ -81,7 +81,7 @@ class Summary:
         from mixpose.judgement import MEETS_NOTHING  # noqa: PLC0415
 
         self.idle_for = MEETS_NOTHING
-        self.findings = Findings(session)
+        self.findings, self.path = Findings(session), session.path
         self.bodies = len(session.labels)
         self.statuses: Counter[Status] = Counter()
         self.posed: Counter[str] = Counter()
@@ -146,8 +146,8 @@ class Summary:
             warn(warning)
         for remark in self.late():
             say(remark)
-        if self.statuses["lost"] == sum(self.statuses.values()):
-            warn("every frame is lost: try mixpose check, then [start] and [extract]")
+        if self.statuses["lost"] == sum(self.statuses.values()) and not self.findings.change:
+            warn(f"every frame is lost: run mixpose check {self.path}, which says what is odd")
         say(f"{self.text()}{where}")
 
     def warnings(self) -> list[str]:

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.density import Atlas
@@ -54,7 +55,7 @@ _MARGIN = 4  # widest blurs around the body
 def features_picture(finding: Finding, room: Size) -> Picture:
     """The frame with a cross at every feature found."""
     picture, part = backdrop(finding.setup, finding.frame, room)
-    _mark(picture, part, finding.points)
+    _mark(picture, part, finding)
     count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
     text = f"{count} found" if finding.points is not None else f"light as of {count} points"
     return titled(picture, f"{finding.name}: {text}")
@@ -93,7 +94,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     if options.method != "blobs":
         picture = canvas.displayable(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     if options.method != "intensity":
-        _mark(picture, part, finding.points)
+        _mark(picture, part, finding)
     return titled(picture, title)
 
 
@@ -171,14 +172,22 @@ def fitted(box: tuple[Floats, Floats], room: Size) -> Part:
     return Part(zoom, (float(corner[0]), float(corner[1])))
 
 
-def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
+def _mark(picture: Picture, part: Part, finding: Finding) -> None:
+    """A cross at each point found, whose arms begin outside of what is seen of small spots."""
+    points = finding.points
     if points is None or not len(points):
         return
-    reach = min(
-        _MARK_PX * canvas.stroke(picture), max(0.45 * part.zoom * overlay.median_gap(points), 3.0)
-    )
-    for place in part.places(points):
-        canvas.cross(picture, place, reach / 3, reach, overlay.FOUND)
+    thin, zoom = canvas.stroke(picture), part.zoom
+    gaps = cKDTree(points).query(points, k=2)[0][:, 1]  # infinite of a lone one
+    reach = min(_MARK_PX * thin, max(0.45 * zoom * float(np.median(gaps)), 3.0))
+    pattern = None if finding.view is None else finding.view.observation.pattern
+    radii = pattern.radii if isinstance(pattern, PointPattern) else np.zeros(len(points))
+    # a pixel more, and half of a line
+    spots = zoom * (1.1 * radii + 1) + 1.5 * thin
+    for place, spot, gap in zip(part.places(points), spots, zoom * gaps, strict=True):
+        inner = spot if reach / 3 < spot < reach else reach / 3
+        outer = min(inner + 2 * reach / 3, max(gap - spot, inner + 2.0))
+        canvas.cross(picture, place, inner, outer, overlay.FOUND)
 
 
 def titled(picture: Picture, title: str) -> Picture:

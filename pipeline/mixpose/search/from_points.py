@@ -31,6 +31,8 @@ from mixpose.search.three_points import (
 )
 from mixpose.sensors import Rays
 
+_AT_ONCE = 40_000  # pairs of rays: their numbers stay in the cache of a processor
+
 
 class TriangulatedPoints(NamedTuple):
     """Points where a ray of one sensor comes close to a ray of another."""
@@ -67,38 +69,51 @@ def triangulate(
 
     That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
     """
-    meetings = []
-    for first, second in combinations(range(len(rays)), 2):
-        a, b = rays[first], rays[second]
-        apart = b.origins[None] - a.origins[:, None]
-        cosine = a.directions @ b.directions.T
-        along_a = (apart * a.directions[:, None]).sum(axis=-1)
-        along_b = (apart * b.directions[None]).sum(axis=-1)
+    meetings = [
+        met._replace(sensors=np.broadcast_to([first, second], met.rays.shape))
+        for first, second in combinations(range(len(rays)), 2)
+        for met in _meetings(rays[first], rays[second], (gates[first], gates[second]), min_sine)
+    ]
+    return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
+
+
+def _meetings(
+    a: Rays, b: Rays, gates: tuple[float, float], min_sine: float
+) -> Iterator[TriangulatedPoints]:
+    """Points where rays of sensors 0 and 1 meet, for some rays of the first after the other.
+
+    Lines a and b pass at |(o_b - o_a) . (d_a x d_b)| / |d_a x d_b|; the numerator is a product of
+    their Pluecker coordinates, so that only pairs that meet have to be looked at in space.
+    """
+    step = max(_AT_ONCE // max(len(b), 1), 1)
+    one = np.ones((len(b), 1))
+    origins_b = b.origins - a.origins[:1].sum(axis=0)  # near zero, lest products lose digits
+    of_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
+    along_b = np.hstack([(origins_b * b.directions).sum(axis=1, keepdims=True), -b.directions])
+    for start in range(0, max(len(a), 1), step):
+        u = a.directions[start : start + step]
+        o = a.origins[start : start + step] - a.origins[:1].sum(axis=0)
+        cosine = u @ b.directions.T
         sine2 = np.maximum(1 - cosine**2, 1e-300)
-        s = (along_a - cosine * along_b) / sine2
-        t = (cosine * along_a - along_b) / sine2
-        on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
-        on_b = b.origins[None] + t[..., None] * b.directions[None]
-        gap = np.linalg.norm(on_a - on_b, axis=-1)
+        to_a = np.hstack([u, -(o * u).sum(axis=1, keepdims=True)]) @ np.hstack([origins_b, one]).T
+        to_b = np.hstack([np.ones((len(o), 1)), o]) @ along_b.T
+        s = (to_a - cosine * to_b) / sine2
+        t = (cosine * to_a - to_b) / sine2
+        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ of_b.T) / np.sqrt(sine2)
         tolerance = np.hypot(
-            gates[first] * (a.offset + a.slope * np.abs(s)),
-            gates[second] * (b.offset + b.slope * np.abs(t)),
+            gates[0] * (a.offset + a.slope * np.abs(s)), gates[1] * (b.offset + b.slope * np.abs(t))
         )
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
         if a.cloud is not None and a.cloud is b.cloud:  # which belong together is known
-            good &= np.eye(*good.shape, dtype=np.bool_)
-        points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
-        meetings.append(
-            TriangulatedPoints(
-                points,
-                tolerance=allowed / np.sqrt(sine2[good]),
-                gap=gap[good] / allowed,
-                sensors=np.broadcast_to([first, second], pairs.shape),
-                rays=pairs,
-            )
-        )
-    return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
+            good &= np.eye(len(u), len(b), k=start, dtype=np.bool_)
+        pairs, allowed = np.argwhere(good) + np.array([start, 0]), tolerance[good]
+        i, j = pairs.T
+        on_a = a.origins[i] + s[good][:, None] * a.directions[i]
+        on_b = b.origins[j] + t[good][:, None] * b.directions[j]
+        points, fixed = (on_a + on_b) / 2, allowed / np.sqrt(sine2[good])
+        sensors = np.broadcast_to([0, 1], pairs.shape)
+        yield TriangulatedPoints(points, fixed, gap[good] / allowed, sensors, pairs)
 
 
 def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
