@@ -21,7 +21,7 @@ from mixpose.judgement import (
     is_sure,
     nearest_alike,
 )
-from mixpose.matching import pooled
+from mixpose.matching import log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -42,6 +42,7 @@ class Start:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
+    least: float = -math.inf  # log likelihood at σ_ε with which narrower blurs are worth a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +161,12 @@ class Frame(Setup):
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
+
+    def rival(self, best: ScoredPose, T_world_object: Floats, wide: Floats, **rest: Any) -> Start:
+        """A start of what there may be instead of a pose, as far as that leaves room for it."""
+        errors, count = self.rules.judgement.noise.errors, int(np.count_nonzero(self.free))
+        own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
+        return Start(T_world_object, wide, least=own - self.rules.look_alikes.behind, **rest)
 
     def nearness(self, T: Floats) -> float:
         """Log density of a pose where the body has moved on; of those of which nothing is known 0.

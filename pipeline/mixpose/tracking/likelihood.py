@@ -72,6 +72,7 @@ class MatchedLikelihood:
                 begun=begun,
                 climbed=climbed,
                 blur=start.blur,
+                least=start.least,
                 noise=seen.noise,
                 fields=seen.track.residuals.fields,
                 beside=max(beside, spread),

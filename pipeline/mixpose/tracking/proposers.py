@@ -191,7 +191,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
         least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
         if fewer[k] < rules.look_alikes.fewer * least:
-            yield Start(poses[1 + k], frame.close, T_moved=moved)
+            yield frame.rival(best, poses[1 + k], frame.close, T_moved=moved)
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
@@ -206,7 +206,8 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     if thickness(body) <= frame.rules.look_alikes.flat:
         away = views[0].sensor.towards(transform(T, body.means.mean(axis=0)[None]))[0]
         wide = frame.close * frame.rules.proposals.narrowing
-        yield Start(other_tilt(body, T, away), wide, T_moved=_moves_alike(frame, T))
+        tilted = other_tilt(body, T, away)
+        yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
