@@ -148,8 +148,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers.py",
-        "        if at is not judged:",
-        "        if at is judged:",
+        "        if T is not judged.T_world_object:",
+        "        if T is judged.T_world_object:",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
     ),

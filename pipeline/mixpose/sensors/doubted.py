@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse, perturb
 from mixpose.sensors.base import Sensor
+from mixpose.sensors.batch import SensorBatch, side_by_side
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
 from mixpose.sensors.parallel import ParallelBeam
@@ -63,15 +65,34 @@ def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
     return np.asarray(inverse(T_sensor_world) @ perturb(np.eye(4), twist) @ T_sensor_world)
 
 
-def with_another_lens(sensor: Sensor, k1: float) -> tuple[Sensor, ...]:
-    """A camera, and the same with a first radial coefficient that is larger; none of others."""
-    if not isinstance(sensor, PinholeCamera | FisheyeCamera):
-        return ()
-    given = np.ravel(sensor.distortion)
-    distortion = np.zeros(max(len(given), 4))
-    distortion[: len(given)] = given
-    distortion[0] += k1
-    return sensor, replace(sensor, distortion=distortion)
+def by_lenses(sensors: tuple[Sensor | None, ...], k1: float, points_world: Floats) -> Floats:
+    """By how much points (n, 3) are elsewhere (L, n, 2) in cameras with larger radial coefficients.
+
+    The first coefficient of each is larger by `k1`; nothing is elsewhere in what is no camera.
+    """
+    away, (cameras, both) = np.zeros((len(sensors), len(points_world), 2)), _lenses(sensors, k1)
+    if both is not None:
+        y, _, seen = both.linearise(points_world)
+        count = len(cameras)
+        are_seen = (seen[:count] & seen[count:])[..., None]
+        away[cameras] = np.where(are_seen, y[count:] - y[:count], 0.0)
+    return away
+
+
+@lru_cache(maxsize=64)
+def _lenses(sensors: tuple[Sensor | None, ...], k1: float) -> tuple[list[int], SensorBatch | None]:
+    """Which of sensors are cameras, and these side by side, followed by those of other lenses."""
+    numbers, own, others = list[int](), list[Sensor](), list[Sensor]()
+    for k, sensor in enumerate(sensors):
+        if isinstance(sensor, PinholeCamera | FisheyeCamera):
+            given = np.ravel(sensor.distortion)
+            distortion = np.zeros(max(len(given), 4))
+            distortion[: len(given)] = given
+            distortion[0] += k1
+            numbers.append(k)
+            own.append(sensor)
+            others.append(replace(sensor, distortion=distortion))
+    return numbers, side_by_side([*own, *others]) if own else None
 
 
 def by_calibration(doubts: tuple[Sensor, ...], points_world: Floats) -> Floats:

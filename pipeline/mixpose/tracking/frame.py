@@ -157,7 +157,7 @@ class Frame(Setup):
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
             weight = max((1 - surprise) * one.weight, 1e-12)
-            terms.append(math.log(weight) + one.log_density(T, self.free, rules))
+            terms.append(math.log(weight) + float(one.log_density(T, self.free, rules)))
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
@@ -168,19 +168,18 @@ class Frame(Setup):
         own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
         return Start(T_world_object, wide, least=own - self.rules.look_alikes.behind, **rest)
 
-    def nearness(self, T: Floats) -> float:
-        """Log density of a pose where the body has moved on; of those of which nothing is known 0.
+    def nearness(self, poses: Sequence[Floats]) -> Floats:
+        """Log densities (K,) of poses (4, 4) where the body moved on; 0 where nothing is known.
 
         Nothing tells identical bodies apart but that, however unlikely the motion.
         """
-        rules, body = self.rules.motion, self.body
-        return max(
-            [
-                one.log_density(nearest_alike(T, body, one.T_world_object), self.free, rules)
-                for one in self.predictions
-            ],
-            default=0.0,
-        )
+        if not self.predictions:
+            return np.zeros(len(poses))
+        rules, body, nearest = self.rules.motion, self.body, list[Floats]()
+        for one in self.predictions:
+            alike = [nearest_alike(T, body, one.T_world_object) for T in poses]
+            nearest.append(one.log_density(np.reshape(alike, (-1, 4, 4)), self.free, rules))
+        return np.asarray(np.max(nearest, axis=0))
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

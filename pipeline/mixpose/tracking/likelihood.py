@@ -29,10 +29,12 @@ from mixpose.judgement import (
     judge_together,
     nearest_alike,
 )
+from mixpose.matching import Matches, associate
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
+from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, given
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.rules import RangeRules
@@ -85,18 +87,32 @@ class MatchedLikelihood:
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
-        frame, motion = self.frame, fit.motion
-        if frame.together and fit is frame.together[1]:
-            return frame.together[2]
-        if frame.is_timed:
-            motion = motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
-            frame = frame.in_motion(motion)
+        if self.frame.together and fit is self.frame.together[1]:
+            return self.frame.together[2]
+        frame, motion = _as_moving(self.frame, fit)
         (judged,) = judge_together(
             [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
         )
         if frame.track.doubted:  # by errors that last: it tells nothing against other poses now
             judged = replace(judged, by_count=0.0)
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
+
+
+def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
+    """The frame as of the common time, and how the body moves, where sensors see moments."""
+    if not frame.is_timed:
+        return frame, fit.motion
+    motion = fit.motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
+    return frame.in_motion(motion), motion
+
+
+def met_at(frame: Frame, fit: Fit) -> tuple[Floats, Matches]:
+    """A pose that was fitted to all sensors, and what it meets, which is less than to judge it."""
+    T, rules = nearest_alike(fit.T_world_object, frame.body, frame.T_reference), frame.rules
+    if fit.matches and T is fit.T_world_object and not frame.is_timed:
+        return T, fit.matches
+    narrowest, seen = rules.judgement.noise.errors.narrowest, _as_moving(frame, fit)[0]
+    return T, associate(seen.finest, T, rules.judgement.association, narrowest)
 
 
 def case_of(frame: Frame, fit: Fit, start: Start) -> Case:

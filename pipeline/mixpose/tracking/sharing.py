@@ -42,11 +42,17 @@ class Explanation:
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
     rest: Sequence[View] = ()  # what no body has
+    told: Verdict | None = None  # `by_itself`, where it is at hand
+
+    @cached_property
+    def by_itself(self) -> Verdict:
+        """The decision about the frame, whatever is left of it."""
+        return self.told or decided(self.frame, self.ranked)
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return with_second(decided(self.frame, self.ranked), self.frame, self.rest)
+        return with_second(self.by_itself, self.frame, self.rest)
 
 
 @dataclass
@@ -76,7 +82,9 @@ class Sharing:
         rest = [view for view in left if not view.observation.is_empty]
         # of identical bodies another one is no surprise
         alone = [k for k in self.claimed if self.bodies[k].instance is None]
-        return self.found | {k: replace(self.found[k], rest=rest) for k in alone}
+        some = {k: self.found[k] for k in alone}
+        beside = {k: replace(one, rest=rest, told=one.by_itself) for k, one in some.items()}
+        return self.found | beside
 
     def _expected(self) -> dict[int, Starts]:
         """Where bodies are expected to within their own size: farther off there may be others."""
@@ -106,8 +114,9 @@ class Sharing:
             some = [one for one in copies if one.kind == number]
             group = [k for k in waiting if self.bodies[k].body is body]
             frames = [self._frame(k, self._nobody.left(k)) for k in group]
-            rows = [[c.evidence + one.nearness(c.T_world_object) for c in some] for one in frames]
-            likely = np.reshape(rows, (len(group), len(some)))
+            evidence = np.array([one.evidence for one in some])
+            there = [one.T_world_object for one in some]
+            likely = np.array([evidence + one.nearness(there) for one in frames])
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 poses = some[j].T_world_object, some[j].rival
                 found[group[i]] = tuple([Start(T, frames[i].close) for T in poses if T is not None])
