@@ -21,7 +21,7 @@ from mixpose.judgement import (
     is_sure,
     nearest_alike,
 )
-from mixpose.matching import log_likelihood, pooled
+from mixpose.matching import Matches, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -42,6 +42,7 @@ class Start:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
+    matches: Matches | None = None  # that it meets, where it is there already
     least: float = -math.inf  # log likelihood at σ_ε with which narrower blurs are worth a fit
 
 

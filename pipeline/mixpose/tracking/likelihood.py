@@ -29,14 +29,14 @@ from mixpose.judgement import (
     judge_together,
     nearest_alike,
 )
-from mixpose.matching import Matches, associate
+from mixpose.matching import Matches
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, given
-from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
+from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown
 from mixpose.tracking.rules import RangeRules
 
 
@@ -55,7 +55,7 @@ class MatchedLikelihood:
         if start.left_out:
             frame = frame.without(start.left_out)
         if uncertainty is None:
-            return Fit(T)
+            return Fit(T, matches=start.matches)
         if frame.together and start is frame.together[0]:
             return frame.together[1]
         timed, model = frame.is_timed, frame.rules.judgement
@@ -108,11 +108,10 @@ def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
 
 def met_at(frame: Frame, fit: Fit) -> tuple[Floats, Matches]:
     """A pose that was fitted to all sensors, and what it meets, which is less than to judge it."""
-    T, rules = nearest_alike(fit.T_world_object, frame.body, frame.T_reference), frame.rules
+    T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
     if fit.matches and T is fit.T_world_object and not frame.is_timed:
         return T, fit.matches
-    narrowest, seen = rules.judgement.noise.errors.narrowest, _as_moving(frame, fit)[0]
-    return T, associate(seen.finest, T, rules.judgement.association, narrowest)
+    return T, matches_at(_as_moving(frame, fit)[0], T)
 
 
 def case_of(frame: Frame, fit: Fit, start: Start) -> Case:

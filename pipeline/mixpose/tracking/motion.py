@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -215,7 +216,16 @@ class Course:
         return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)
 
     def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:
-        """Means and covariances of all filters some seconds later."""
+        """Means and covariances of all filters some seconds later, worked out once."""
+        if elapsed not in self._known:
+            self._known[elapsed] = self._after(elapsed)
+        return self._known[elapsed]
+
+    @cached_property
+    def _known(self) -> dict[float, tuple[Floats, Floats]]:
+        return {}
+
+    def _after(self, elapsed: float) -> tuple[Floats, Floats]:
         i, j = np.indices((4, 4))
         factorial, on, ahead = np.array([1.0, 1.0, 2.0, 6.0]), np.maximum(j - i, 0), 7 - i - j
         F = np.where(j >= i, elapsed**on / factorial[on], 0.0)

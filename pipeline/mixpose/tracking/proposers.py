@@ -312,7 +312,7 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
         # where all of a sensor are off it is out of step, and the others no better for it
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
-            yield Start(T)
+            yield Start(T, matches=seen)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
