@@ -15,7 +15,7 @@ _ERRORS = (
     Mutant(
         "matching-errors-of-all-detections-alike",
         "matching/matches.py",
-        "weights = matches.shares * alike * welsch(squared, blurs)",
+        "matches.shares * alike * matches.each_part[:, None]",
         "weights = matches.shares * alike",
         "a cut spot is noise of all others",
     ),

@@ -57,11 +57,13 @@ def overlaps(
     overlap = exponents > -DRAWING.negligible
     if not np.count_nonzero(overlap):
         return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
-    near = np.flatnonzero(overlap.any(axis=(0, 1)))
-    products = (weights[:, :, i] * weights[:, :, j])[..., near]
-    bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
-    norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
-    return norm, pairs[near], bells, away[:, :, near]
+    near = overlap.any(axis=(0, 1))
+    if np.count_nonzero(near) < len(near):
+        pairs, away = pairs[near], away[:, :, near]
+        overlap, exponents = overlap[..., near], exponents[..., near]
+    products = weights.take(pairs[:, 0], axis=2) * weights.take(pairs[:, 1], axis=2)
+    bells = overlap * products * np.exp(exponents) * tops[..., None]
+    return np.maximum(norm + 2 * bells.sum(axis=2), _NONE), pairs, bells, away
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:

@@ -166,7 +166,7 @@ class Sharing:
             frames |= climbed_together(alike, self._shared)
         found = dict[int, Explanation]()
         for k, one in frames.items():
-            is_near = self._is_near(one, one.starts[0])
+            is_near = one.together is not None or self._is_near(one, one.starts[0])
             ranked = self.bodies[k].explain(one, quickly=True) if is_near else []
             found[k] = Explanation(one, left[k], ranked)
         return found
