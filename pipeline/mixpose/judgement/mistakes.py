@@ -140,7 +140,9 @@ def _by_lenses(
 ) -> Floats:
     """How residuals change with lenses of another distortion (R, L), times its deviation."""
     found, points = pose.used, transform(pose.T_world_object, body.nodes.points)
-    shifts = by_lenses(tuple(map(sensors.get, found.names)), model.lens, points)
+    shifts = np.zeros(found.offsets.shape)
+    if sensors:
+        shifts = by_lenses(tuple([sensors[name] for name in found.names]), model.lens, points)
     shifts *= (found.weights > 0)[..., None] / found.sigmas[:, None, None]
     L = len(shifts)
     columns = np.zeros((*shifts.shape, L))

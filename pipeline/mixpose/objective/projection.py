@@ -185,10 +185,6 @@ def _across(directions: Floats) -> Floats:
     sign, across = np.copysign(1.0, z), np.empty((2, *directions.shape))
     a = -1 / (sign + z)
     b, turned = x * y * a, sign * x
-    across[0, ..., 0] = 1 + turned * x * a
-    across[0, ..., 1] = sign * b
-    across[0, ..., 2] = -turned
-    across[1, ..., 0] = b
-    across[1, ..., 1] = sign + y * y * a
-    across[1, ..., 2] = -y
+    for k, one in enumerate((1 + turned * x * a, sign * b, -turned, b, sign + y * y * a, -y)):
+        across[k // 3, ..., k % 3] = one
     return across

@@ -65,34 +65,24 @@ def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
     return np.asarray(inverse(T_sensor_world) @ perturb(np.eye(4), twist) @ T_sensor_world)
 
 
-def by_lenses(sensors: tuple[Sensor | None, ...], k1: float, points_world: Floats) -> Floats:
-    """By how much points (n, 3) are elsewhere (L, n, 2) in cameras with larger radial coefficients.
-
-    The first coefficient of each is larger by `k1`; nothing is elsewhere in what is no camera.
-    """
-    away, (cameras, both) = np.zeros((len(sensors), len(points_world), 2)), _lenses(sensors, k1)
-    if both is not None:
-        y, _, seen = both.linearise(points_world)
-        count = len(cameras)
-        are_seen = (seen[:count] & seen[count:])[..., None]
-        away[cameras] = np.where(are_seen, y[count:] - y[:count], 0.0)
-    return away
+def by_lenses(sensors: tuple[Sensor, ...], k1: float, points_world: Floats) -> Floats:
+    """By how much points (n, 3) are elsewhere (L, n, 2) with radial coefficients `k1` larger."""
+    L, (y, _, seen) = len(sensors), _with_other_lenses(sensors, k1).linearise(points_world)
+    return np.where((seen[:L] & seen[L:])[..., None], y[L:] - y[:L], 0.0)
 
 
 @lru_cache(maxsize=64)
-def _lenses(sensors: tuple[Sensor | None, ...], k1: float) -> tuple[list[int], SensorBatch | None]:
-    """Which of sensors are cameras, and these side by side, followed by those of other lenses."""
-    numbers, own, others = list[int](), list[Sensor](), list[Sensor]()
+def _with_other_lenses(sensors: tuple[Sensor, ...], k1: float) -> SensorBatch:
+    """Sensors, and these again, cameras with a first radial coefficient that is larger."""
+    others = list(sensors)
     for k, sensor in enumerate(sensors):
         if isinstance(sensor, PinholeCamera | FisheyeCamera):
             given = np.ravel(sensor.distortion)
             distortion = np.zeros(max(len(given), 4))
             distortion[: len(given)] = given
             distortion[0] += k1
-            numbers.append(k)
-            own.append(sensor)
-            others.append(replace(sensor, distortion=distortion))
-    return numbers, side_by_side([*own, *others]) if own else None
+            others[k] = replace(sensor, distortion=distortion)
+    return side_by_side((*sensors, *others))
 
 
 def by_calibration(doubts: tuple[Sensor, ...], points_world: Floats) -> Floats:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
@@ -123,7 +123,7 @@ class RollingBatch:
 
     def __init__(self, cameras: Sequence[RollingSensor]) -> None:
         motions = [camera.motion for camera in cameras]
-        self._still = _standing(tuple([camera.sensor for camera in cameras]))
+        self._still = batch.side_by_side(tuple([camera.sensor for camera in cameras]))
         self._origin = np.array([one.T_world_object[:3, 3] for one in motions])[:, None]
         self._velocity = np.array([one.velocity for one in motions])[:, None]
         self._acceleration = np.array([one.acceleration for one in motions])[:, None]
@@ -131,7 +131,6 @@ class RollingBatch:
         rows = [(rows_apart(one.sensor), middle_row(one.sensor)) for one in cameras]
         apart, self._middle = np.array(rows).T[..., None]
         self._per_row = np.array([[camera.readout] for camera in cameras]) / apart
-        self._at_middle = self._moved(self._delay)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`.
@@ -141,13 +140,12 @@ class RollingBatch:
         """
         L, per_row = len(self._delay), self._per_row
         x = np.broadcast_to(points_world, (L, *points_world.shape[-2:]))
-        at, speeds = self._there(x, *self._at_middle)
+        at, speeds, _ = self._moved(x, self._delay)
         y, J, visible = self._still.linearise(at)
         speed = (J[:, :, 1] * speeds).sum(axis=2)
         wanted = per_row * (y[..., 1] - self._middle)
         lag = np.where(visible, wanted / (1 - per_row * speed), 0.0)
-        _, _, R = moved = self._moved(self._delay + lag)
-        at, speeds = self._there(x, *moved)
+        at, speeds, R = self._moved(x, self._delay + lag)
         y, J, visible = self._still.linearise(at)
         by_time = (J @ speeds[..., None])[..., 0]
         J = J @ R
@@ -155,25 +153,19 @@ class RollingBatch:
         by_point = J[:, :, 1] * (per_row / (1 - per_row * by_time[..., 1]))[..., None]
         return y, J + by_time[..., None] * by_point[:, :, None], visible
 
-    def _moved(self, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Shifts (L, n, 3) of the body after seconds (L, n) or (L, 1), its rates, and turns."""
-        t = seconds[..., None]
-        twists = (self._velocity + 0.5 * t * self._acceleration) * t
-        return twists[..., :3], self._velocity + t * self._acceleration, _turns(twists[..., 3:])
-
-    def _there(self, x: Floats, shift: Floats, rates: Floats, R: Floats) -> tuple[Floats, Floats]:
-        """Points (L, n, 3) that moved so, and their velocities.
+    def _moved(self, x: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+        """Points (L, n, 3) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
 
         Velocities (L, n, 3) are those of points of the body, but for how far its origin moved.
         """
-        arms = ((x - self._origin)[..., None, :] @ R.swapaxes(2, 3))[..., 0, :] + shift
-        return self._origin + arms, rates[..., :3] + _crossed(rates[..., 3:], arms)
-
-
-@lru_cache(maxsize=64)
-def _standing(sensors: tuple[Sensor, ...]) -> batch.SensorBatch:
-    """Sensors side by side, which are the same objects however a body moves before them."""
-    return batch.side_by_side(sensors)
+        t = seconds[..., None]
+        twists = (self._velocity + 0.5 * t * self._acceleration) * t
+        rates = self._velocity + t * self._acceleration
+        R = _turns(twists[..., 3:])
+        arms = ((x - self._origin)[..., None, :] @ R.swapaxes(2, 3))[..., 0, :]
+        shift = twists[..., :3]
+        turning = _crossed(rates[..., 3:], arms + shift)
+        return self._origin + shift + arms, rates[..., :3] + turning, R
 
 
 def side_by_side(sensors: Sequence[Sensor]) -> batch.SensorBatch:
@@ -181,7 +173,7 @@ def side_by_side(sensors: Sequence[Sensor]) -> batch.SensorBatch:
     rolling = [one for one in sensors if isinstance(one, RollingSensor)]
     if rolling and len(rolling) == len(sensors):
         return RollingBatch(rolling)
-    return batch.side_by_side(sensors)
+    return batch.side_by_side(tuple(sensors))
 
 
 def rows_apart(sensor: Sensor) -> float:

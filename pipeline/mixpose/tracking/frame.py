@@ -174,13 +174,12 @@ class Frame(Setup):
 
         Nothing tells identical bodies apart but that, however unlikely the motion.
         """
-        if not self.predictions:
-            return np.zeros(len(poses))
-        rules, body, nearest = self.rules.motion, self.body, list[Floats]()
+        near = [np.zeros(len(poses))] if not self.predictions else []
         for one in self.predictions:
-            alike = [nearest_alike(T, body, one.T_world_object) for T in poses]
-            nearest.append(one.log_density(np.reshape(alike, (-1, 4, 4)), self.free, rules))
-        return np.asarray(np.max(nearest, axis=0))
+            alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
+            there = np.reshape(alike, (-1, 4, 4))
+            near.append(one.log_density(there, self.free, self.rules.motion))
+        return np.asarray(np.max(near, axis=0))
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

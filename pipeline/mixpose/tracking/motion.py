@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -151,7 +151,7 @@ class Expected(NamedTuple):
         return Motion(T_world_object, self.velocity, self.acceleration)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Course:
     """How fast a body goes at its last pose, to which states are relative, and how sure that is.
 
@@ -215,17 +215,9 @@ class Course:
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
         return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)
 
+    @lru_cache(maxsize=16)  # noqa: B019, as few courses are kept as that
     def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:
-        """Means and covariances of all filters some seconds later, worked out once."""
-        if elapsed not in self._known:
-            self._known[elapsed] = self._after(elapsed)
-        return self._known[elapsed]
-
-    @cached_property
-    def _known(self) -> dict[float, tuple[Floats, Floats]]:
-        return {}
-
-    def _after(self, elapsed: float) -> tuple[Floats, Floats]:
+        """Means and covariances of all filters some seconds later."""
         i, j = np.indices((4, 4))
         factorial, on, ahead = np.array([1.0, 1.0, 2.0, 6.0]), np.maximum(j - i, 0), 7 - i - j
         F = np.where(j >= i, elapsed**on / factorial[on], 0.0)

@@ -39,11 +39,7 @@ class LookAlikeRules:
         ("congruent", "tilted", "mirrored"), "features like others, other tilt, mirror image"
     )
     alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
-    behind: float = constant(
-        50.0,
-        "nats less likely at σ_ε than the best pose, which narrower blurs do not make up for "
-        "rivals: of 200 these gain 25 at most, and what is 25 behind then makes no odds",
-    )
+    behind: float = constant(50.0, "nats at σ_ε: rivals gain 25 by narrow blurs; 25 make no odds")
     fewer: float = constant(1.5, "features fewer that a rival may meet: each is e⁴ in odds, or so")
     flat: float = constant(0.15, "thickness by smaller width below which a body may be tilted")
     by_chance: float = constant(14.0, "coordinates beyond six met by chance: 5 points, 2 cameras")

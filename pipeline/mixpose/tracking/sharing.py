@@ -42,17 +42,12 @@ class Explanation:
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
     rest: Sequence[View] = ()  # what no body has
-    told: Verdict | None = None  # `by_itself`, where it is at hand
-
-    @cached_property
-    def by_itself(self) -> Verdict:
-        """The decision about the frame, whatever is left of it."""
-        return self.told or decided(self.frame, self.ranked)
+    told: Verdict | None = None  # the decision without `rest`, where it is at hand
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return with_second(self.by_itself, self.frame, self.rest)
+        return with_second(self.told or decided(self.frame, self.ranked), self.frame, self.rest)
 
 
 @dataclass
@@ -82,9 +77,8 @@ class Sharing:
         rest = [view for view in left if not view.observation.is_empty]
         # of identical bodies another one is no surprise
         alone = [k for k in self.claimed if self.bodies[k].instance is None]
-        some = {k: self.found[k] for k in alone}
-        beside = {k: replace(one, rest=rest, told=one.by_itself) for k, one in some.items()}
-        return self.found | beside
+        told = [(k, self.found[k]) for k in alone]
+        return self.found | {k: replace(one, rest=rest, told=one.verdict) for k, one in told}
 
     def _expected(self) -> dict[int, Starts]:
         """Where bodies are expected to within their own size: farther off there may be others."""
