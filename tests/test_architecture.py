@@ -211,7 +211,7 @@ def test_one_function_differentiates_a_projection_by_the_pose() -> None:
         "tracking/motion.py:followed",
     }
     chained = {name for name, node in FUNCTIONS if "pose_jacobian" in called(node)}
-    assert chained == {"objective/projection.py:project", "objective/paper.py:_model"}
+    assert chained == {"objective/projection.py:_project", "objective/paper.py:_model"}
 
 
 def test_one_function_climbs() -> None:

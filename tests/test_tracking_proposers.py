@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from detections import EIGHT, TRUTH, detect, random_start, view_of
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.fit import EstimatorOptions
+from mixpose.fit import EstimatorOptions, near
 from mixpose.judgement import RememberedNoise, ScoredPose
-from mixpose.objective import View
+from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.records import Estimate
 from mixpose.rigid import (
     from_parts,
@@ -25,7 +26,7 @@ from mixpose.rigid import (
     transform,
 )
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Tracker
+from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
@@ -171,6 +172,44 @@ def test_a_flat_body_followed_at_the_wrong_tilt_is_turned_over() -> None:
         turned.append(float(rotation_angle_deg(estimate.T_world_object, T)))
     # the wrong tilt meets all features, within a pixel or two: now and then nothing else is asked
     assert max(turned) > 40
+
+
+def test_a_tilt_that_is_far_less_likely_at_first_is_not_followed_to_narrow_blurs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    K = np.array([[900.0, 0, 640], [0, 900.0, 512], [0, 0, 1]])
+    camera = PinholeCamera(K, resolution=(1280, 1024))
+    T = from_rotation_vector([0.35, 0.25, 0.3], [10.0, -20.0, 600.0])
+    dots = 40.0 * np.stack(np.divmod(np.arange(12), 4), axis=1) - [40.0, 60.0]
+    dots += np.random.default_rng(0).uniform(-9.0, 9.0, dots.shape)
+    plate = Body("plate", tuple(PointFeature(np.array([*dot, 0.0])) for dot in dots))
+    drawn: list[Sequence[float]] = []
+
+    def recorded(views: Sequence[View], body: Body, sigmas: Sequence[float]) -> MatchedObjective:
+        drawn.append(sigmas)
+        return matched_objective(views, body, sigmas)
+
+    monkeypatch.setattr(near, "matched_objective", recorded)
+
+    def tilted(behind: float) -> tuple[int, float]:
+        """Blurs narrower than σ_ε, and how much less likely than the body the other tilt is."""
+        alike = replace(Rules().look_alikes, behind=behind)
+        tracker = Tracker.create(
+            plate, EstimatorOptions(), T, rules=replace(Rules(), look_alikes=alike)
+        )
+        data = tracker.data(tracker.begin(), 0, None, detect([camera], plate, T, noise=0.02))
+        likelihood, at = likelihood_of(data), Start(T)
+        best = likelihood.judge(likelihood.fit(at), at)
+        (start,) = look_alikes(data, [best])
+        drawn.clear()
+        tilt = likelihood.judge(likelihood.fit(start), start)
+        return len(drawn), best.log_evidence - tilt.log_evidence
+
+    # perspective tells so near by: with narrow blurs the tilt is as much less likely
+    blurs, less = tilted(np.inf)
+    assert blurs > 1
+    assert less > 100
+    assert tilted(50.0) == (0, less)
 
 
 def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body() -> None:

@@ -72,8 +72,9 @@ class PointPattern:
         weights = np.asarray(self.weights, dtype=np.float64)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "deviations", np.broadcast_to(self.deviations, weights.shape))
-        object.__setattr__(self, "radii", np.broadcast_to(self.radii, weights.shape))
+        for name in ("deviations", "radii"):
+            if (own := getattr(self, name)).shape != weights.shape:
+                object.__setattr__(self, name, np.broadcast_to(own, weights.shape))
         object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(

@@ -173,8 +173,8 @@ _MISTAKES = (
     Mutant(
         "judgement-lenses-are-those-that-are-told",
         "judgement/mistakes.py",
-        "/ found.sigmas[k]\n",
-        "* 1e-9\n",
+        "/ found.sigmas[:, None, None]",
+        "* 1e-9",
         "poses are ok whose cameras were given without their distortion",
         ("test_judgement_mistakes.py",),
     ),

@@ -15,8 +15,8 @@ _ERRORS = (
     Mutant(
         "matching-errors-of-all-detections-alike",
         "matching/matches.py",
-        "weights = matches.shares * alike * welsch(squared, blurs)",
-        "weights = matches.shares * alike",
+        "weights = counts * welsch(squared, blurs)",
+        "weights = counts",
         "a cut spot is noise of all others",
     ),
     Mutant(

@@ -39,8 +39,8 @@ _KERNEL = (
     Mutant(
         "objective-overlap-counted-twice",
         "objective/matched.py",
-        "half = -(scaled[:, :, None] @ (along_i - along_j))",
-        "half = -2 * (scaled[:, :, None] @ (along_i - along_j))",
+        "gradient[near] -= (level * half).sum(axis=0)",
+        "gradient[near] -= 2 * (level * half).sum(axis=0)",
         "the gradient is wrong where features overlap",
     ),
     Mutant(
@@ -81,8 +81,8 @@ _KERNEL = (
     Mutant(
         "objective-curvature-without-variance",
         "objective/matched.py",
-        "drawn = (strength / variances)[..., None] * (",
-        "drawn = strength[..., None] * (",
+        "drawn = (strength / variances)[..., None] * ",
+        "drawn = strength[..., None] * ",
         "steps depend on the unit of lengths",
     ),
 )

@@ -26,6 +26,14 @@ _PROPOSALS = (
         (_PROPOSERS,),
     ),
     Mutant(
+        "tracking-rivals-followed-however-far-behind",
+        "tracking/frame.py",
+        "least=own - self.rules.look_alikes.behind, ",
+        "",
+        "the other tilt of a flat body costs more than the body itself",
+        (_PROPOSERS,),
+    ),
+    Mutant(
         "tracking-starts-that-lead-to-nothing",
         "tracking/proposers.py",
         "[values[order] > frame.rules.fit.near * len(frame.views)]",
@@ -140,8 +148,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers.py",
-        "        if at is not judged:",
-        "        if at is judged:",
+        "        if T is not judged.T_world_object:",
+        "        if T is judged.T_world_object:",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
     ),
@@ -164,7 +172,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers.py",
-        "yield Start(poses[1 + k], frame.close, T_moved=moved)",
+        "yield frame.rival(best, poses[1 + k], frame.close, T_moved=moved)",
         "yield Start(poses[0], frame.close, T_moved=moved)",
         "a chessboard is followed a square off",
         (_STARTS,),

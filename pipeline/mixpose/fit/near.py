@@ -9,6 +9,7 @@ where all are met as closely as the detections' noise lets them, it ends there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -140,6 +141,7 @@ def fit_near(
     begun: Ascent | None = None,  # from the start, on that, where it is at hand
     climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
     blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
+    least: float = -math.inf,  # log likelihood at σ_ε; with less it ends there
     noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
     fields: float = 1.0,  # share of it that is errors of calibration, in no sensor's own noise
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
@@ -175,7 +177,7 @@ def fit_near(
     for fit in known:
         if fit.begins_at(ascent, rules.sharp.tolerance):
             return fit
-    rest = finest, free, noise, fields, beside, errors, association, rules
+    rest = finest, free, least, noise, fields, beside, errors, association, rules
     known.append(_to_the_noise(ascent, [*levels, begins], blur, first, *rest))
     return known[-1]
 
@@ -216,6 +218,7 @@ def _to_the_noise(
     objective: MatchedObjective,  # that was climbed
     finest: MatchedObjective,
     free: Mask,
+    least: float,
     known: Floats,
     fields: float,
     beside: float,
@@ -251,7 +254,7 @@ def _to_the_noise(
         likelihood = np.inf if is_only else log_likelihood(narrow, matches, count, errors)
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit
-        if is_end:
+        if is_end or likeliest < least:
             return best
         if not is_noise:
             blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]

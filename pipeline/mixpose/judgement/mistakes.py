@@ -33,7 +33,7 @@ from mixpose.judgement.noise import NoiseModel, fields_of_sensors
 from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
-from mixpose.sensors import Sensor, by_calibration, with_another_lens
+from mixpose.sensors import Sensor, by_lenses
 
 APART = "sensors contradict each other"
 SIZE = "the body seems to be of another size"
@@ -140,13 +140,14 @@ def _by_lenses(
 ) -> Floats:
     """How residuals change with lenses of another distortion (R, L), times its deviation."""
     found, points = pose.used, transform(pose.T_world_object, body.nodes.points)
-    columns = np.zeros((*found.offsets.shape, len(found.names)))
-    for k, name in enumerate(found.names):
-        others = with_another_lens(sensors[name], model.lens) if name in sensors else ()
-        if others:
-            shifts = by_calibration(others, points)[..., 0] / found.sigmas[k]
-            columns[k, ..., k] = shifts * (found.weights[k, :, None] > 0)
-    return columns.reshape(-1, len(found.names))
+    shifts = np.zeros(found.offsets.shape)
+    if sensors:
+        shifts = by_lenses(tuple([sensors[name] for name in found.names]), model.lens, points)
+    shifts *= (found.weights > 0)[..., None] / found.sigmas[:, None, None]
+    L = len(shifts)
+    columns = np.zeros((*shifts.shape, L))
+    columns[range(L), ..., range(L)] = shifts
+    return columns.reshape(-1, L)
 
 
 def _widened(columns: Floats, more: Floats) -> Floats:

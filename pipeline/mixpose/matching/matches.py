@@ -220,7 +220,11 @@ def errors_seen(
     `known` (2, L) has the squares and degrees of freedom of each sensor's noise so far.
     """
     before = _blurs(pooled(known, rules, rules.typical_degrees), matches, rules)
-    given = before, matches, free, known, rules
+    # what errs by more counts less
+    expected = ((before / rules.blur) ** 2)[:, None]
+    alike = expected / (expected + matches.extra)
+    squared, counts = matches.squared * alike, matches.shares * alike * matches.each_part[:, None]
+    given = before, squared, counts, matches, free, known, rules
     at = np.ones(len(before))
     wide = _seen_at(at, *given)
     while np.count_nonzero(wide[2] <= 0.9 * at):
@@ -242,14 +246,17 @@ def _blurs(variances: Floats, matches: Matches, rules: ErrorRules) -> Floats:
 
 
 def _seen_at(
-    blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
+    blurs: Floats,
+    before: Floats,
+    squared: Floats,
+    counts: Floats,
+    matches: Matches,
+    free: int,
+    known: Floats,
+    rules: ErrorRules,
 ) -> NoiseEstimate:
-    """The same, as seen at one blur (L,) for each sensor."""
-    # what errs by more counts less
-    expected = ((before / rules.blur) ** 2)[:, None]
-    alike = expected / (expected + matches.extra)
-    squared = matches.squared * alike
-    weights = matches.shares * alike * welsch(squared, blurs) * matches.each_part[:, None]
+    """The same, of squared offsets (L, N) that count so much, as seen at a blur (L,) for each."""
+    weights = counts * welsch(squared, blurs)
     sums = map(sum, weights.tolist()), np.vecdot(weights, squared).tolist()
     coordinates, squares, degrees = [], [], []
     for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):

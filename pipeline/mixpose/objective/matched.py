@@ -57,11 +57,13 @@ def overlaps(
     overlap = exponents > -DRAWING.negligible
     if not np.count_nonzero(overlap):
         return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
-    near = np.flatnonzero(overlap.any(axis=(0, 1)))
-    products = (weights[:, :, i] * weights[:, :, j])[..., near]
-    bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
-    norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
-    return norm, pairs[near], bells, away[:, :, near]
+    near = overlap.any(axis=(0, 1))
+    if np.count_nonzero(near) < len(near):
+        pairs, away = pairs[near], away[:, :, near]
+        overlap, exponents = overlap[..., near], exponents[..., near]
+    products = weights.take(pairs[:, 0], axis=2) * weights.take(pairs[:, 1], axis=2)
+    bells = overlap * products * np.exp(exponents) * tops[..., None]
+    return np.maximum(norm + 2 * bells.sum(axis=2), _NONE), pairs, bells, away
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
@@ -70,29 +72,31 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
     L, H, n = match.weights.shape
-    pull = (match.sampled[..., 1:] * match.weights[..., None]).reshape(L, H, 1, 2 * n)
+    weighed = match.sampled * match.weights[..., None]
+    pull = weighed[..., 1:].reshape(L, H, 1, 2 * n)
     rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
     product = np.vecdot(match.sampled[..., 0], match.weights)
     amplitude = product / match.norm
     strength = 2 * scales * amplitude
     value = 0.5 * np.vecdot(strength.T, product.T)
     gradient = (strength[..., None] * rest).sum(axis=0)
-    drawn = (strength / variances)[..., None] * (match.sampled[..., 0] * match.weights)
+    drawn = (strength / variances)[..., None] * weighed[..., 0]
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
     if not len(match.pairs):
         return Quadratic(value, gradient, curvature)
     near = np.flatnonzero(match.bells.any(axis=(0, 2)))
-    some = match.of(near)
-    i, j = some.pairs.T
-    J_i, J_j = some.J[:, :, i], some.J[:, :, j]
-    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", some.away, each) for each in (J_i, J_j))
-    scaled = some.bells / variances[..., None]
+    some = match if len(near) == H else match.of(near)
+    J_i, J_j = (some.J.take(one, axis=2) for one in some.pairs.T)
+    scaled = (some.bells / variances[..., None])[..., None]
+    apart = scaled * some.away
     # ⟨h, ∂h⟩ (L, h, 6) and ⟨∂h, ∂hᵀ⟩ (L, h, 6, 6): of each feature with itself, and of pairs
-    half = -(scaled[:, :, None] @ (along_i - along_j))[:, :, 0]
+    rows = L, len(near), 2 * len(some.pairs)
+    half = (apart.reshape(*rows, 1).swapaxes(2, 3) @ (J_j - J_i).reshape(*rows, 6))[:, :, 0]
+    along_j = some.away[..., None, :] @ J_j
     own = some.J * some.weights[..., None, None]
     gram = _gram(own, own) * (tops / variances)[..., None, None]
-    cross = _gram(scaled[..., None, None] * J_i, J_j)
-    cross -= ((scaled / variances[..., None])[..., None] * along_i).swapaxes(2, 3) @ along_j
+    bent = (apart / variances[..., None, None])[..., None] * along_j
+    cross = _gram(J_i, scaled[..., None] * J_j - bent)
     gram += cross + cross.swapaxes(2, 3)
     level = (strength * amplitude)[:, near, None]
     gradient[near] -= (level * half).sum(axis=0)

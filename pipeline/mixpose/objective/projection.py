@@ -84,9 +84,16 @@ class BodyProjection:
         self._normals, radii = body.node_normals, body.node_radii
         self._radii = radii if radii is not None and radii.any() else None
         self._batch = side_by_side(sensors)
+        self._last = np.zeros((0, 4, 4)), Match(*[_NOTHING] * 5)  # poses, and what they look like
 
     def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
+        # where a body is expected it is looked for, weighed and fitted from
+        if not np.array_equal(poses, self._last[0]):
+            self._last = poses.copy(), self._project(poses)
+        return self._last[1]
+
+    def _project(self, poses: Floats) -> Match:
         H, n, L = len(poses), self._points.shape[-2], len(self.sensors)
         arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
         world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
@@ -110,20 +117,22 @@ class BodyProjection:
         normals = self._normals if self.body.shape == "disk" else None
         if normals is not None:
             turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
-            middle, axes = world[None], turned.reshape(2, 1, count, 3)
+            middle, axes = world[None, None], turned.reshape(2, 1, count, 3)
         else:
             towards = np.array([sensor.towards(world) for sensor in self.sensors])
-            squared = np.einsum("lni,lni->ln", towards, towards)[..., None]
+            squared = np.vecdot(towards, towards)[..., None]
             share = np.minimum(radii**2 / squared, 0.81)  # no sensor is within a sphere
-            middle = world + share * towards
-            radii = radii * np.sqrt(1 - share)
-            axes = _across(towards / np.sqrt(squared))
-        steps = np.sqrt(0.5) * radii * axes  # where the four points are
-        nodes = middle + np.concatenate([steps[:1], -steps[:1], steps[1:], -steps[1:]])
-        y, J, seen = self._batch.linearise(nodes.swapaxes(0, 1).reshape(-1, 4 * count, 3))
+            middle = (world + share * towards)[:, None]
+            axes, radii = _across(towards / np.sqrt(squared)), radii * np.sqrt(1 - share)[:, None]
+        axes = axes.swapaxes(0, 1)  # (L, 2, count, 3), with one in place of L where all are alike
+        steps = np.sqrt(0.5) * radii * axes
+        # four points, by twos on either side
+        nodes = np.concatenate([middle + steps, middle - steps], axis=1)
+        y, J, seen = self._batch.linearise(nodes.reshape(-1, 4 * count, 3))
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
-        a, b = (np.einsum("lknij,lnj->lkni", J, axis) for axis in axes + np.zeros((1, L, 1, 1)))
-        weights = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        by_axes = J @ axes.transpose(0, 2, 3, 1)[:, None]
+        weights = by_axes[..., 0, 0] * by_axes[..., 1, 1] - by_axes[..., 0, 1] * by_axes[..., 1, 0]
+        weights = np.abs(weights)
         total = weights.sum(axis=1)
         visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
         weights /= np.where(visible, total, 1.0)[:, None]
@@ -172,9 +181,10 @@ def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
 
 def _across(directions: Floats) -> Floats:
     """Two unit vectors (2, ..., 3) across unit vectors (..., 3): Duff and others, JCGT 6 (2017)."""
-    x, y, z = np.moveaxis(directions, -1, 0)
-    sign = np.copysign(1.0, z)
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    sign, across = np.copysign(1.0, z), np.empty((2, *directions.shape))
     a = -1 / (sign + z)
-    b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=-1)
-    return np.stack([first, np.stack([b, sign + y * y * a, -y], axis=-1)])
+    b, turned = x * y * a, sign * x
+    for k, one in enumerate((1 + turned * x * a, sign * b, -turned, b, sign + y * y * a, -y)):
+        across[k // 3, ..., k % 3] = one
+    return across

@@ -196,8 +196,8 @@ class _Climb:
                     continue
                 share = min((1 - self._options.least_seen) * along / max(along - seen, _TINY), 1.0)
                 blend = share * change + (1 - share) * expected
-                curvature[row] += np.outer(blend, blend / (step @ blend))
-                curvature[row] -= np.outer(expected, expected / along)
+                curvature[row] += blend[:, None] * (blend / (step @ blend))
+                curvature[row] -= expected[:, None] * (expected / along)
         return there._replace(curvature=curvature)
 
     def ended(self, move: Callable[[Any, Floats], Any]) -> Ascent:

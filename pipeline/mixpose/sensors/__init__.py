@@ -18,8 +18,8 @@ from mixpose.sensors.cloud import (
 from mixpose.sensors.doubted import (
     CalibrationError as CalibrationError,
     by_calibration as by_calibration,
+    by_lenses as by_lenses,
     doubted as doubted,
-    with_another_lens as with_another_lens,
 )
 from mixpose.sensors.facing import facing as facing
 from mixpose.sensors.fisheye import FisheyeCamera as FisheyeCamera

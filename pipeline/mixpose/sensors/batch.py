@@ -7,6 +7,7 @@ cameras costs hardly more than for one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -30,8 +31,9 @@ class SensorBatch(Protocol):
         ...
 
 
-def side_by_side(sensors: Sequence[Sensor]) -> SensorBatch:
-    """Put sensors of any kinds side by side."""
+@lru_cache(maxsize=64)
+def side_by_side(sensors: tuple[Sensor, ...]) -> SensorBatch:
+    """Put sensors of any kinds side by side; once, where they are the same objects."""
     cameras = [sensor for sensor in sensors if isinstance(sensor, PinholeCamera)]
     if len(cameras) == len(sensors) and not any(_is_tilted(camera) for camera in cameras):
         return PinholeBatch(cameras)

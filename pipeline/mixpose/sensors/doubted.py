@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse, perturb
 from mixpose.sensors.base import Sensor
+from mixpose.sensors.batch import SensorBatch, side_by_side
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
 from mixpose.sensors.parallel import ParallelBeam
@@ -63,15 +65,24 @@ def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
     return np.asarray(inverse(T_sensor_world) @ perturb(np.eye(4), twist) @ T_sensor_world)
 
 
-def with_another_lens(sensor: Sensor, k1: float) -> tuple[Sensor, ...]:
-    """A camera, and the same with a first radial coefficient that is larger; none of others."""
-    if not isinstance(sensor, PinholeCamera | FisheyeCamera):
-        return ()
-    given = np.ravel(sensor.distortion)
-    distortion = np.zeros(max(len(given), 4))
-    distortion[: len(given)] = given
-    distortion[0] += k1
-    return sensor, replace(sensor, distortion=distortion)
+def by_lenses(sensors: tuple[Sensor, ...], k1: float, points_world: Floats) -> Floats:
+    """By how much points (n, 3) are elsewhere (L, n, 2) with radial coefficients `k1` larger."""
+    L, (y, _, seen) = len(sensors), _with_other_lenses(sensors, k1).linearise(points_world)
+    return np.where((seen[:L] & seen[L:])[..., None], y[L:] - y[:L], 0.0)
+
+
+@lru_cache(maxsize=64)
+def _with_other_lenses(sensors: tuple[Sensor, ...], k1: float) -> SensorBatch:
+    """Sensors, and these again, cameras with a first radial coefficient that is larger."""
+    others = list(sensors)
+    for k, sensor in enumerate(sensors):
+        if isinstance(sensor, PinholeCamera | FisheyeCamera):
+            given = np.ravel(sensor.distortion)
+            distortion = np.zeros(max(len(given), 4))
+            distortion[: len(given)] = given
+            distortion[0] += k1
+            others[k] = replace(sensor, distortion=distortion)
+    return side_by_side((*sensors, *others))
 
 
 def by_calibration(doubts: tuple[Sensor, ...], points_world: Floats) -> Floats:

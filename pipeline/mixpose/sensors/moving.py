@@ -89,12 +89,12 @@ class RollingSensor:
 
     def towards(self, points_world: Floats) -> Floats:
         """Directions (..., 3) from world points (..., 3) to the sensor, as of the middle row."""
-        T = self.motion.after(self.delay)
+        T = self._at_middle
         return self.sensor.towards(points_world @ T[:3, :3].T + T[:3, 3]) @ T[:3, :3]
 
     def rays(self, y: Floats) -> Rays | None:
         """Lines of sight of detections (M, 2), as of the middle row."""
-        return self.sensor.moved(self.motion.after(self.delay)).rays(y)
+        return self.sensor.moved(self._at_middle).rays(y)
 
     def moved(self, motion: Floats) -> Self:
         """The sensor that sees points x where this one sees ``motion @ x``."""
@@ -109,6 +109,11 @@ class RollingSensor:
         )
 
     @cached_property
+    def _at_middle(self) -> Floats:
+        """Where points are when the middle row is read, as a motion (4, 4) of the world."""
+        return self.motion.after(self.delay)
+
+    @cached_property
     def _batch(self) -> RollingBatch:
         return RollingBatch([self])
 
@@ -118,7 +123,7 @@ class RollingBatch:
 
     def __init__(self, cameras: Sequence[RollingSensor]) -> None:
         motions = [camera.motion for camera in cameras]
-        self._still = batch.side_by_side([camera.sensor for camera in cameras])
+        self._still = batch.side_by_side(tuple([camera.sensor for camera in cameras]))
         self._origin = np.array([one.T_world_object[:3, 3] for one in motions])[:, None]
         self._velocity = np.array([one.velocity for one in motions])[:, None]
         self._acceleration = np.array([one.acceleration for one in motions])[:, None]
@@ -168,7 +173,7 @@ def side_by_side(sensors: Sequence[Sensor]) -> batch.SensorBatch:
     rolling = [one for one in sensors if isinstance(one, RollingSensor)]
     if rolling and len(rolling) == len(sensors):
         return RollingBatch(rolling)
-    return batch.side_by_side(sensors)
+    return batch.side_by_side(tuple(sensors))
 
 
 def rows_apart(sensor: Sensor) -> float:

@@ -180,7 +180,7 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
         theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
         if asked or theirs > value / 16:
             # fitted, which may end at clutter, and where it is asked for as it stands
-            starts = [Start(T, data.close), *([Start(T)] if asked else [])]
+            starts = [data.rival(judged, T, data.close), *([Start(T)] if asked else [])]
             near = max([_evidence(there, one) for one in starts]) - own
             if near > likely:
                 return near
@@ -207,7 +207,7 @@ def look_alikes_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> It
         for part in like_features(data.body, met, other.body, tolerance):
             if len(part.features) == len(met):
                 T = best.T_world_object @ part.T_body_other
-                start = Start(T, other.close, left_out=best.left_out)
+                start = other.rival(best, T, other.close, left_out=best.left_out)
                 yield Alternative(part.reason, _evidence(seen, start) - best.log_evidence)
 
 

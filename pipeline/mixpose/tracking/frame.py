@@ -21,7 +21,7 @@ from mixpose.judgement import (
     is_sure,
     nearest_alike,
 )
-from mixpose.matching import pooled
+from mixpose.matching import Matches, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -42,6 +42,8 @@ class Start:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
+    matches: Matches | None = None  # that it meets, where it is there already
+    least: float = -math.inf  # log likelihood at σ_ε with which narrower blurs are worth a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,24 +158,28 @@ class Frame(Setup):
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
             weight = max((1 - surprise) * one.weight, 1e-12)
-            terms.append(math.log(weight) + one.log_density(T, self.free, rules))
+            terms.append(math.log(weight) + float(one.log_density(T, self.free, rules)))
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
 
-    def nearness(self, T: Floats) -> float:
-        """Log density of a pose where the body has moved on; of those of which nothing is known 0.
+    def rival(self, best: ScoredPose, T_world_object: Floats, wide: Floats, **rest: Any) -> Start:
+        """A start of what there may be instead of a pose, as far as that leaves room for it."""
+        errors, count = self.rules.judgement.noise.errors, int(np.count_nonzero(self.free))
+        own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
+        return Start(T_world_object, wide, least=own - self.rules.look_alikes.behind, **rest)
+
+    def nearness(self, poses: Sequence[Floats]) -> Floats:
+        """Log densities (K,) of poses (4, 4) where the body moved on; 0 where nothing is known.
 
         Nothing tells identical bodies apart but that, however unlikely the motion.
         """
-        rules, body = self.rules.motion, self.body
-        return max(
-            [
-                one.log_density(nearest_alike(T, body, one.T_world_object), self.free, rules)
-                for one in self.predictions
-            ],
-            default=0.0,
-        )
+        near = [np.zeros(len(poses))] if not self.predictions else []
+        for one in self.predictions:
+            alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
+            there = np.reshape(alike, (-1, 4, 4))
+            near.append(one.log_density(there, self.free, self.rules.motion))
+        return np.asarray(np.max(near, axis=0))
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

@@ -93,10 +93,11 @@ def identify(
     data = [found[k].frame for k in known]
     # by body (rows) and pose; in the last column none, as it is of one in view now and then
     rules, rows = found[group[0]].frame.rules, list[list[float]]()
+    there = [pose.T_world_object for pose in poses]
     for one in data:
         hidden = 0.5 if one.track.misses else rules.motion.hidden
-        logs = [math.log1p(-hidden) + one.nearness(pose.T_world_object) for pose in poses]
-        rows.append([*logs, math.log(hidden)])
+        logs = math.log1p(-hidden) + one.nearness(there)
+        rows.append([*logs.tolist(), math.log(hidden)])
     places = np.array([*(pose.T_world_object[:3, 3] for pose in poses), np.full(3, np.nan)])
     chosen = [group.index(k) for k in known]
     assignment = Assignment(

@@ -79,10 +79,15 @@ def fit_in_motion(
     errors = frame.rules.judgement.noise.errors
     for _ in range(6):
         seen = frame.in_motion(motion)
+        expected, matches = frame.expected(T), None
         if moved > timing.linear:
-            fit = climb(seen, T, offsets_at(seen, T).beside)
+            beside = offsets_of(seen, matches_at(seen, T), expected).beside
+            fit = climb(seen, T, beside)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
-        met, expected, variance = offsets_at(seen, T), frame.expected(T), errors.typical**2
+            matches = fit.matches if T is fit.T_world_object else None
+            expected = frame.expected(T)
+        met = offsets_of(seen, matches or matches_at(seen, T), expected)
+        variance = errors.typical**2
         for _ in range(2):  # the second time with the variance that the first leaves
             x, _, rest = met.least_squares(motion.velocity, expected, frame.free, variance)
             total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
@@ -116,11 +121,10 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     return replace(judged, covariance=covariance)
 
 
-def offsets_at(frame: Frame, T_world_object: Floats) -> Offsets:
+def matches_at(frame: Frame, T_world_object: Floats) -> Matches:
     """What is met at a pose."""
     rules, narrowest = frame.rules.judgement, frame.rules.judgement.noise.errors.narrowest
-    matches = associate(frame.finest, T_world_object, rules.association, narrowest)
-    return offsets_of(frame, matches, frame.expected(T_world_object))
+    return associate(frame.finest, T_world_object, rules.association, narrowest)
 
 
 def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:

@@ -29,12 +29,14 @@ from mixpose.judgement import (
     judge_together,
     nearest_alike,
 )
+from mixpose.matching import Matches
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
+from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, given
-from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
+from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown
 from mixpose.tracking.rules import RangeRules
 
 
@@ -53,7 +55,7 @@ class MatchedLikelihood:
         if start.left_out:
             frame = frame.without(start.left_out)
         if uncertainty is None:
-            return Fit(T)
+            return Fit(T, matches=start.matches)
         if frame.together and start is frame.together[0]:
             return frame.together[1]
         timed, model = frame.is_timed, frame.rules.judgement
@@ -72,6 +74,7 @@ class MatchedLikelihood:
                 begun=begun,
                 climbed=climbed,
                 blur=start.blur,
+                least=start.least,
                 noise=seen.noise,
                 fields=seen.track.residuals.fields,
                 beside=max(beside, spread),
@@ -84,18 +87,31 @@ class MatchedLikelihood:
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
-        frame, motion = self.frame, fit.motion
-        if frame.together and fit is frame.together[1]:
-            return frame.together[2]
-        if frame.is_timed:
-            motion = motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
-            frame = frame.in_motion(motion)
+        if self.frame.together and fit is self.frame.together[1]:
+            return self.frame.together[2]
+        frame, motion = _as_moving(self.frame, fit)
         (judged,) = judge_together(
             [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
         )
         if frame.track.doubted:  # by errors that last: it tells nothing against other poses now
             judged = replace(judged, by_count=0.0)
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
+
+
+def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
+    """The frame as of the common time, and how the body moves, where sensors see moments."""
+    if not frame.is_timed:
+        return frame, fit.motion
+    motion = fit.motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
+    return frame.in_motion(motion), motion
+
+
+def met_at(frame: Frame, fit: Fit) -> tuple[Floats, Matches]:
+    """A pose that was fitted to all sensors, and what it meets, which is less than to judge it."""
+    T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+    if fit.matches and T is fit.T_world_object and not frame.is_timed:
+        return T, fit.matches
+    return T, matches_at(_as_moving(frame, fit)[0], T)
 
 
 def case_of(frame: Frame, fit: Fit, start: Start) -> Case:

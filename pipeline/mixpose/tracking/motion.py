@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -150,7 +151,7 @@ class Expected(NamedTuple):
         return Motion(T_world_object, self.velocity, self.acceleration)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Course:
     """How fast a body goes at its last pose, to which states are relative, and how sure that is.
 
@@ -214,6 +215,7 @@ class Course:
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
         return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)
 
+    @lru_cache(maxsize=16)  # noqa: B019, as few courses are kept as that
     def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:
         """Means and covariances of all filters some seconds later."""
         i, j = np.indices((4, 4))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
-from mixpose.fit import blur_schedule
+from mixpose.fit import Fit, blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
@@ -26,7 +26,7 @@ from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
-from mixpose.tracking.likelihood import Likelihood
+from mixpose.tracking.likelihood import Likelihood, met_at
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -191,7 +191,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
         least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
         if fewer[k] < rules.look_alikes.fewer * least:
-            yield Start(poses[1 + k], frame.close, T_moved=moved)
+            yield frame.rival(best, poses[1 + k], frame.close, T_moved=moved)
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
@@ -206,7 +206,8 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     if thickness(body) <= frame.rules.look_alikes.flat:
         away = views[0].sensor.towards(transform(T, body.means.mean(axis=0)[None]))[0]
         wide = frame.close * frame.rules.proposals.narrowing
-        yield Start(other_tilt(body, T, away), wide, T_moved=_moves_alike(frame, T))
+        tilted = other_tilt(body, T, away)
+        yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
@@ -244,22 +245,22 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     """
     rules, before = frame.rules.judgement.association, 0
     for most in (1, len(frame.body)):
-        at, seen = judged, _paired(judged.matches, rules.reach_squared, rules.middle, most)
+        T, seen = judged.T_world_object, judged.matches
+        seen = _paired(seen, rules.reach_squared, rules.middle, most)
         if (pairs := int(seen.merged.sum())) == before:
             return
         before = pairs
-        for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
+        for is_second in (False, True):  # which starts within 0.01 σ_ε of the first's end
+            if is_second:
+                T, seen = met_at(frame, Fit(T))
             if not np.count_nonzero(seen.merged):
                 break
             blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
             J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
             rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-            moved = least_squares(rest, free=frame.free).states[0]
-            start = Start(perturb(at.T_world_object, moved))
-            at = likelihood.judge(likelihood.fit(start), start)
-            seen = at.matches
-        if at is not judged:
-            yield Start(at.T_world_object)
+            T = perturb(T, least_squares(rest, free=frame.free).states[0])
+        if T is not judged.T_world_object:
+            yield Start(T)
 
 
 def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
@@ -307,12 +308,11 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
     for one, blur in product(predicted(frame, [])[: max(len(frame.predictions), 1)], blurs):
         start = replace(one, blur=blur)
-        found = likelihood.judge(likelihood.fit(start), start)
+        T, seen = met_at(frame, likelihood.fit(start))
         # where all of a sensor are off it is out of step, and the others no better for it
-        seen = found.matches
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
-            yield Start(found.T_world_object)
+            yield Start(T, matches=seen)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)

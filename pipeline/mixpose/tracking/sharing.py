@@ -42,11 +42,12 @@ class Explanation:
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
     rest: Sequence[View] = ()  # what no body has
+    told: Verdict | None = None  # the decision without `rest`, where it is at hand
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return with_second(decided(self.frame, self.ranked), self.frame, self.rest)
+        return with_second(self.told or decided(self.frame, self.ranked), self.frame, self.rest)
 
 
 @dataclass
@@ -76,7 +77,8 @@ class Sharing:
         rest = [view for view in left if not view.observation.is_empty]
         # of identical bodies another one is no surprise
         alone = [k for k in self.claimed if self.bodies[k].instance is None]
-        return self.found | {k: replace(self.found[k], rest=rest) for k in alone}
+        told = [(k, self.found[k]) for k in alone]
+        return self.found | {k: replace(one, rest=rest, told=one.verdict) for k, one in told}
 
     def _expected(self) -> dict[int, Starts]:
         """Where bodies are expected to within their own size: farther off there may be others."""
@@ -106,8 +108,9 @@ class Sharing:
             some = [one for one in copies if one.kind == number]
             group = [k for k in waiting if self.bodies[k].body is body]
             frames = [self._frame(k, self._nobody.left(k)) for k in group]
-            rows = [[c.evidence + one.nearness(c.T_world_object) for c in some] for one in frames]
-            likely = np.reshape(rows, (len(group), len(some)))
+            evidence = np.array([one.evidence for one in some])
+            there = [one.T_world_object for one in some]
+            likely = np.array([evidence + one.nearness(there) for one in frames])
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 poses = some[j].T_world_object, some[j].rival
                 found[group[i]] = tuple([Start(T, frames[i].close) for T in poses if T is not None])
@@ -157,7 +160,7 @@ class Sharing:
             frames |= climbed_together(alike, self._shared)
         found = dict[int, Explanation]()
         for k, one in frames.items():
-            is_near = self._is_near(one, one.starts[0])
+            is_near = one.together is not None or self._is_near(one, one.starts[0])
             ranked = self.bodies[k].explain(one, quickly=True) if is_near else []
             found[k] = Explanation(one, left[k], ranked)
         return found

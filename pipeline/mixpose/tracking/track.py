@@ -36,17 +36,18 @@ class Branch:
     deviation: Floats | None = None  # (6,), the same, where anybody asks for velocities at moments
     course: Course | None = None  # for its velocity at a moment, there
 
-    def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> float:
-        """Of a pose before the frame that this predicts, in the directions that are free."""
+    def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
+        """Of poses (..., 4, 4) before the frame that this predicts, in directions that are free."""
         u = self.uncertainty[free]
-        scaled = twist_between(self.T_world_object, T_world_object)[free] / u
+        squares = (twist_between(self.T_world_object, T_world_object)[..., free] / u) ** 2
         count, volume = len(u), float(sum(np.log(u).tolist()))
         if self.spread is not None:
-            return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
+            exponents = -0.5 * squares.sum(axis=-1)
+            return np.asarray(exponents - 0.5 * count * math.log(2 * math.pi) - volume)
         n = rules.known_from  # from a step or two: errors are Student's
         peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-        tails = 0.5 * (n + 1) * sum(math.log1p(one * one / n) for one in scaled.tolist())
-        return count * peak - tails - volume
+        tails = 0.5 * (n + 1) * np.log1p(squares / n).sum(axis=-1)
+        return np.asarray(count * peak - tails - volume)
 
 
 @dataclass(frozen=True)
