@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -75,6 +77,9 @@ def test_an_ellipse_beside_the_light_that_it_is_of_seems_off_by_as_much() -> Non
     off = off_centre([(scene, right), (scene, beside)], 3, 0.1, 2.0)
     assert off[0] < 0.03
     assert off[1] == pytest.approx(0.5, rel=0.1)
+    flat = replace(scene, grey=np.full((40, 40), 20.0, np.float32))
+    assert off_centre([(flat, right)], 3, 0.1, 2.0).tolist() == [0.0]
+    assert not off_centre([], 3, 0.1, 2.0).size
 
 
 @pytest.mark.parametrize("radius", [3.5, 4.3])

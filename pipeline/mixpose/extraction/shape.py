@@ -67,7 +67,7 @@ def off_centre(
     """How far the centres of ellipses (K,) may be off, px: from their grey values and of these.
 
     Up to `beside` px outside of an ellipse, what is brighter than a share of the peak counts, above
-    the background `margin` px around it.
+    the background `margin` px around it.  0 where nothing is, so that nothing is told.
     """
     if not disks:
         return np.zeros(0)
@@ -88,7 +88,7 @@ def off_centre(
     scaled = (places - centres[:, None]) @ axes
     weights[(np.vecdot(scaled, scaled) > 1).reshape(weights.shape)] = 0
     found, off = centroids(weights)
-    return np.asarray(np.hypot(off, np.linalg.norm(found - centres, axis=1)))
+    return np.asarray(np.nan_to_num(np.hypot(off, np.linalg.norm(found - centres, axis=1))))
 
 
 def _box(ellipse: Ellipse) -> Box:
