@@ -103,14 +103,7 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
         return twist
     if R_difference.shape == (1, 3, 3):
         return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]
-    R = R_difference.reshape(-1, 3, 3)
-    vectors = R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]
-    lengths, cosines = np.sqrt(np.vecdot(vectors, vectors)), np.einsum("kii->k", R) - 1
-    if (cosines + lengths > 0).all():  # no angle above 135°, from which on a sine tells little
-        angles = np.arctan2(lengths, cosines)
-        vectors *= (np.where(lengths > 0, angles, 0.5) / np.where(lengths > 0, lengths, 1))[:, None]
-    else:
-        vectors = Rotation.from_matrix(R).as_rotvec()
+    vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
 

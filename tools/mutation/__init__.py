@@ -16,6 +16,7 @@ from mutation import (
     matching,
     objectives,
     planning,
+    proposing,
     recordings,
     searching,
 )
@@ -32,6 +33,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *matching.MUTANTS,
     *judging.MUTANTS,
     *following.MUTANTS,
+    *proposing.MUTANTS,
     *searching.MUTANTS,
     *many_bodies.MUTANTS,
     *files.MUTANTS,

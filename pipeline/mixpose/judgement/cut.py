@@ -50,7 +50,8 @@ def with_cut_spots(
     G, r = axes @ G, (axes @ r[..., None])[..., 0]
     m, s2 = found.dimensions[met[0]], variances[met]
     # a little or much, or as its size tells; what is somebody else's may be anywhere
-    own, is_sized = found.cut[met], np.isfinite(found.cut[met][:, 0])
+    own = found.cut[met]
+    is_sized = np.isfinite(own[:, 0])
     wide = np.where(is_sized, own[:, 1], np.square(errors.cuts)[:, None])
     v = np.maximum(np.vstack([wide, np.full(len(own), 1e9)]) / s2, 1.0)
     # of those whose sizes tell it is one case
