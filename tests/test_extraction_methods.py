@@ -45,6 +45,24 @@ def test_intensity_keeps_the_grey_of_features_without_the_background(
     assert not outside.any()
 
 
+def test_intensity_of_spots_keeps_their_tails() -> None:
+    image = np.random.default_rng(0).integers(19, 22, (100, 120), dtype=np.uint8)
+    rows, columns = np.mgrid[:100, :120]
+    width = np.zeros(2)
+    spot = 100 * np.exp(-((rows - 50) ** 2 + (columns - 60) ** 2) / (2 * 5.0**2))
+    for k, spot_sigma in enumerate((0.0, 5.0)):
+        options = ExtractOptions(method="intensity", spot_sigma=spot_sigma)
+        pattern = extract(np.rint(image + spot).astype(np.uint8), options)
+        assert isinstance(pattern, GridPattern)
+        squares = pattern.values * (columns - 60) ** 2
+        width[k] = np.sqrt(squares.sum() / pattern.total)
+        assert not pattern.values[:20].any()
+    # cut off at 8 % of its height a spot has lost a tenth of its width
+    assert width[0] < 4.5
+    # of the noise around it what is above zero is left, and adds a little
+    assert width[1] == pytest.approx(5.1, abs=0.2)
+
+
 def test_intensity_of_dark_features_is_how_much_darker_they_are() -> None:
     image = np.asarray(255 - lit_square(), dtype=np.uint8)
     for threshold in ("auto", 200.0):

@@ -88,7 +88,8 @@ def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
     y = np.array([[10.0, 10.0], [13.0, 10.0], [40.0, 40.0]])
 
     def seen(centres: Floats) -> tuple[Floats, Floats]:
-        return _residuals(y, np.ones(3), VARIANCE, 0.2 * mixture(centres, y), 0.2, RULES, True)
+        values = 0.2 * mixture(centres, y)
+        return _residuals(y, np.ones(3), VARIANCE, values, np.ones((3, 2, 6)), 0.2, RULES, True)[:2]
 
     shares, offsets = seen(y)
     np.testing.assert_allclose(shares, 1.0, atol=1e-9)
@@ -96,6 +97,33 @@ def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
     # one is 0.1 off: the others stay where they are, but for what is second order, 0.1²
     off = y + np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0]])
     np.testing.assert_allclose(seen(off)[1], off - y, atol=0.01)
+
+
+def test_features_of_a_noisy_profile_that_overlap_are_off_independently_of_each_other() -> None:
+    """White noise of cells, seen through features of deviation σ, of which C has the variance 2σ².
+
+    Of a feature by itself the offset then has the variance noise² / Σ (∂h)²; of a pair 1.2 σ apart
+    the same, as of the Jacobians, whose least squares are as far off as they say.
+    """
+    rng, y = (
+        np.random.default_rng(3),
+        np.array([[0.0], [1.2], [10.0], [20.0]]) * np.sqrt(VARIANCE / 2),
+    )
+    x = np.arange(-10.0, 50.0, 0.25) * np.sqrt(VARIANCE / 2)
+    away = x - y
+    h = np.exp(-(away**2) / VARIANCE)
+    slopes = 2 * h * away / VARIANCE
+    both = np.stack([h, slopes], axis=2) * peak(VARIANCE, 1) / np.vecdot(h, h)[:, None, None]
+    J, noise = rng.standard_normal((4, 1, 6)), 1e-4
+    g = h.sum(axis=0) + noise * rng.standard_normal((4000, len(x)))
+    each = [_residuals(y, np.ones(4), VARIANCE, v @ both, J, 1.0, RULES, True) for v in g]
+    offsets, rows = np.array([one[1][:, 0] for one in each]), each[0][2][:, 0, :2]
+    variance = noise**2 / (slopes[2] @ slopes[2])
+    # 4000 draws tell variances to 2.2 %
+    np.testing.assert_allclose(np.cov(offsets.T) / variance, np.eye(4), atol=0.09)
+    moved = np.linalg.lstsq(rows, offsets.T, rcond=None)[0]
+    told = variance * np.linalg.inv(rows.T @ rows)
+    np.testing.assert_allclose(np.linalg.solve(told, np.cov(moved)), np.eye(2), atol=0.09)
 
 
 def test_clutter_is_as_dense_as_detections_around_the_body_where_they_are_denser() -> None:

@@ -44,6 +44,9 @@ class ThresholdRules:
     min_margin: int = constant(
         64, "px around a window that are looked at at least, to know its background: four tiles"
     )
+    tail: float = constant(
+        2.0, "widths of a spot beside the level that grey values are kept: 4 from its centre"
+    )
     noise_factor: float = constant(
         5.0, "of the noise, the level at least: three pixels in ten million are above by chance"
     )
@@ -136,7 +139,11 @@ def feature_values(
     window: Window,
     rules: ThresholdRules = ThresholdRules(),
 ) -> NDArray[np.float32]:
-    """Grey values (v1 - v0, u1 - u0) of the features in a window without the background, else 0."""
+    """Grey values (v1 - v0, u1 - u0) of the features in a window without the background, else 0.
+
+    Down to zero as far beside the level as spots of `spot_sigma` reach: without its tails a pair
+    that overlaps looks closer together than it is.
+    """
     found = foreground(image, options, window, rules)
     grey, zero = found.grey, found.zero
     if not found.judged:
@@ -147,6 +154,10 @@ def feature_values(
     rows = np.flatnonzero(above(found.tops, found.zero + found.level))
     signal = grey[rows].astype(np.float32) - np.float32(zero)
     values[rows] = np.maximum(signal, 0) * above(found.grey[rows], found.zero + found.level)
+    reach = math.ceil(rules.tail * options.spot_sigma)
+    if reach and len(rows):
+        near = cv2.dilate((values > 0).astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8))
+        values = np.maximum(grey.astype(np.float32) - np.float32(zero), 0) * near
     return values
 
 

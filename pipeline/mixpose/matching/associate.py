@@ -32,6 +32,10 @@ class AssociationRules:
     crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
     merged: bool = constant(True, "whether two features may share a detection: blobs that touch")
     middle: float = constant(0.2, "σ_ε: of two that share one, which one of them may outshine")
+    alike: float = constant(
+        0.01,
+        "of a feature's energy: those nearer than a seventh of C's deviation are not told apart",
+    )
     slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
@@ -66,8 +70,8 @@ def associate(
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
-        shares[k, of], offsets[k, of, :m] = _residuals(
-            *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
+        shares[k, of], offsets[k, of, :m], J[k, of, :m] = _residuals(
+            *mixture, match.sampled[k, 0, of, : 1 + m], J[k, of, :m], amplitude, rules, all(is_grid)
         )
     J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
     if np.count_nonzero(merged):
@@ -207,33 +211,51 @@ def _residuals(
     weights: Floats,
     variance: float,
     sampled: Floats,
+    J: Floats,
     amplitude: float,
     rules: AssociationRules,
     unlike: bool,
-) -> tuple[Floats, Floats]:
-    """Shares and offsets by which a grid of values puts features (n, m) from their predictions.
+) -> tuple[Floats, Floats, Floats]:
+    """Shares, offsets and Jacobians (n, m, 6) of features (n, m) that a grid of values is seen at.
 
     C is the predicted mixture blurred alike, each feature with an amplitude of its own where they
-    are `unlike`.  What is left of the gradient without all others is the pull on a feature.
+    are `unlike`.  What is left of the gradient without all others is the pull on a feature.  Pulls
+    of features that overlap answer to the places of all (F, 1 for a feature by itself) and err
+    together (S), once heights are fitted.  So offsets and Jacobians are S^(−½) δ and S^(−½) F J,
+    whose errors are independent and alike.
     """
-    n, top, away = len(y), peak(variance, y.shape[1]), y[:, None] - y[None]
-    bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
+    (n, m), top, away = y.shape, peak(variance, y.shape[1]), y[:, None] - y[None]
+    overlaps = np.exp(-0.5 * (away * away).sum(axis=-1) / variance)
+    bells = weights * overlaps * top
     rest, amplitudes = sampled[:, 0] - amplitude * bells.sum(axis=1), np.full(n, amplitude)
     height = rest + amplitude * weights * top
+    steep = (overlaps[..., None] * away).swapaxes(1, 2).reshape(n * m, n) / np.sqrt(variance)
+    outer = np.eye(m) - away[..., :, None] * away[..., None, :] / variance
+    F = S = (overlaps[..., None, None] * outer).swapaxes(1, 2).reshape(n * m, n * m)
     if unlike:
-        # nearer than a seventh of C's deviation features cannot be told apart: they are alike
-        amplitudes += np.linalg.solve(bells + 0.01 * top * np.diag(weights), rest)
+        amplitudes += np.linalg.solve(bells + rules.alike * top * np.diag(weights), rest)
         height = amplitudes * weights * top
+        by_height = np.linalg.solve(overlaps + rules.alike * np.eye(n), steep.T)
+        F = F - steep @ by_height
+        S = F - rules.alike * by_height.T @ by_height
     # what the better half of the features looks like by itself
     full = float(np.median(np.sort(height)[n // 2 :]))
     if full <= 0:
-        return np.zeros(n), np.zeros(y.shape)
+        return np.zeros(n), np.zeros(y.shape), J
     shares = np.clip(height / full, 0.0, 1.0)
     is_met = shares > rules.min_share
     predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(height, rules.min_share * full)[:, None]
-    return np.where(is_met, shares * weights, 0.0), np.where(is_met[:, None], offsets, 0.0)
+    values, axes = np.linalg.eigh(S)
+    # what is as small tells nothing of places
+    apart = (axes / np.sqrt(np.where(values > rules.alike, values, np.inf))) @ axes.T
+    offsets, rows = (apart @ offsets.ravel()).reshape(n, m), apart @ F @ J.reshape(n * m, -1)
+    return (
+        np.where(is_met, shares * weights, 0.0),
+        np.where(is_met[:, None], offsets, 0.0),
+        rows.reshape(J.shape),
+    )
 
 
 def _surroundings(
