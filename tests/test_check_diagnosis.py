@@ -201,11 +201,17 @@ def test_frames_of_fewer_coordinates_than_a_pose_has_are_not_searched(
 
 
 def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:
-    """What the cameras meet of a body without noise."""
+    """What the cameras meet of a body without noise, all at once."""
     return [
         [
-            Seen(s.name, np.arange(7), s.sensor.project(transform(T, points))[0], np.full(7, 0.3))
-            for s in session.sensors
+            Seen(
+                each.name,
+                np.arange(7),
+                each.sensor.project(transform(T, points))[0],
+                np.full(7, 0.3),
+                np.zeros(7),
+            )
+            for each in session.sensors
         ]
         for T in poses()
     ]
@@ -256,12 +262,33 @@ def test_a_cut_spot_pulls_as_little_as_it_says(right: Session) -> None:
     assert np.linalg.norm(found[0]) < 0.1
 
 
+def test_a_body_that_moves_before_a_late_camera_is_no_camera_that_stands_elsewhere(
+    right: Session,
+) -> None:
+    """5 ms later it has moved by 3 mm and turned by 0.3°, in each frame another way."""
+    moved = [each for each in unknowns(right) if "T_sensor_world" in each.what]
+    rng, frames = np.random.default_rng(2), exact(right, right.body.means)
+    late, name = 0.005, right.sensors[1].name
+    for own, T in zip(frames, poses()):
+        shift, turn = rng.standard_normal((2, 3))
+        twist = np.concatenate([3.0 * shift / np.linalg.norm(shift), 0.003 * turn])
+        y = right.sensors[1].sensor.project(transform(perturb(T, twist), right.body.means))[0]
+        own[1] = replace(own[1], observed=y)
+    at_once = max(promise(each, given_to(right, frames)) for each in moved)
+    told = [[replace(s, seconds=np.full(7, late * (s.name == name))) for s in f] for f in frames]
+    assert at_once > 5 * DiagnosisRules().promise
+    assert max(promise(each, given_to(right, told)) for each in moved) < DiagnosisRules().promise
+    # one that stands 11° otherwise, in all frames alike, is seen to do so
+    other = moved[1].sensor(name, right.sensors[1].sensor, np.array([0, 0, 0, 0, 0, 0.2]))
+    for own, T in zip(told, poses()):
+        y = other.project(transform(T, right.body.means))[0]
+        own[1] = replace(own[1], observed=y)
+    assert max(promise(each, given_to(right, told)) for each in moved) > DiagnosisRules().promise
+
+
 def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
     size = next(iter(unknowns(right)))
-    few = [
-        [Seen(one.name, one.features[:2], one.observed[:2], one.noise[:2]) for one in frame[:1]]
-        for frame in exact(right, right.body.means)
-    ]
+    few = [[one.only(slice(2)) for one in frame[:1]] for frame in exact(right, right.body.means)]
     assert adjusted(size, given_to(right, few)) is None
     assert promise(size, given_to(right, few)) == 0.0
 
@@ -277,9 +304,7 @@ def test_values_are_asked_for_from_four_coordinates_beyond_what_is_sought(
     some = []
     for k, (first, second) in enumerate(frames):
         counts = [(first, slice(0, 3)), (second, slice(0, more if k == 0 else 0))]
-        some.append(
-            [Seen(s.name, s.features[n], s.observed[n], s.noise[n]) for s, n in counts if n.stop]
-        )
+        some.append([seen.only(n) for seen, n in counts if n.stop])
     assert given_to(right, some).count == 6 * len(some) + 2 * more
     assert (promise(size, given_to(right, some)) > 0.0) == says
 

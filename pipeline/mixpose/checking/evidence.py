@@ -19,9 +19,10 @@ from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
 from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Floats, Indices, PointPattern
+from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.runner import begin
 from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.sensors.moving import moments
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.frame import Start
@@ -145,6 +146,18 @@ class Seen:
     features: Indices  # (n,)
     observed: Floats  # (n, 2)
     noise: Floats  # (n,) standard deviations, in sensor units; of cut spots larger ones
+    seconds: Floats  # (n,) after the frame's time that it was seen; where that is unknown, about so
+
+    def only(self, chosen: Mask | slice) -> Seen:
+        """Some of the features."""
+        features, observed = self.features[chosen], self.observed[chosen]
+        return Seen(self.name, features, observed, self.noise[chosen], self.seconds[chosen])
+
+    @classmethod
+    def by(cls, view: View, pairs: Pairs) -> Seen:
+        """What a view met."""
+        seconds = moments(view.sensor, pairs[1], view.delay + (view.unsure or 0.0), view.readout)
+        return cls(view.name, *pairs, np.broadcast_to(seconds, len(pairs[0])))
 
 
 def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
@@ -170,9 +183,9 @@ def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
                 for each, k in zip(matches, rows)
             ]
             pairs = max(pairs, _shifted([view for _, view in own], predicted), key=_count)
-        for (f, _), met in zip(own, pairs):
+        for (f, view), met in zip(own, pairs):
             if len(met[0]):
-                seen[f].append(Seen(name, *met))
+                seen[f].append(Seen.by(view, met))
     return seen
 
 
@@ -194,7 +207,7 @@ def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
                     matches.places[k, features], distance_upper_bound=near
                 )
                 is_near = np.isfinite(away)
-                own.append(Seen(view.name, *_pairs(view, features[is_near], free[at[is_near]])))
+                own.append(Seen.by(view, _pairs(view, features[is_near], free[at[is_near]])))
         found.append(own)
     return found
 

@@ -1,13 +1,15 @@
 """Values of a session that may be off: the body's size, lenses, poses of cameras, markers.
 
 They are adjusted by least squares over the matches of several frames, together with the poses of
-all frames; outlying matches are weighed down as by Huber's loss.
+all frames, and with velocities where a frame is not seen at one instant; outlying matches are weighed
+down as by Huber's loss.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,7 @@ _SIZE = 0.1  # deviations: of the body's size
 _FOCAL, _CENTRE = 0.1, 0.05  # of the focal length, and of the image
 _BENT = 0.1  # what a lens moves the corners of its image by, of their distance
 _MOVED, _TURNED = 1.0, 0.1  # cameras, in radii of the body and rad
+_SHIFTING, _TURNING = 10.0, 5.0  # of the body, in its radii and rad per second
 _MARKER = 0.05  # radii, that a marker is off: spots beside a hidden one are further
 _LEFT_OUT = 6.0  # nats for distortion where none is given: lenses distort
 _COPIED = 30.0  # nats for one of two cameras with the very same calibration: no two lenses have
@@ -70,8 +73,7 @@ class Adjustment:
             for seen in others if unknown.feature is not None else ():
                 is_it = seen.features == unknown.feature
                 if is_it.any():
-                    parts = seen.features[is_it], seen.observed[is_it], seen.noise[is_it]
-                    own.append(Seen(seen.name, *parts))
+                    own.append(seen.only(is_it))
         return replace(self, sensors=endless, frames=frames)
 
     def has(self, unknown: Unknown) -> bool:
@@ -84,19 +86,30 @@ class Adjustment:
         """Number of coordinates that are met."""
         return 2 * sum(len(seen.features) for frame in self.frames for seen in frame)
 
+    @cached_property
+    def motion(self) -> int:
+        """Unknowns of each frame: its pose, and its velocity where not all is seen at once."""
+        seconds = [seen.seconds for frame in self.frames for seen in frame if len(seen.features)]
+        return 12 if seconds and np.ptp(np.concatenate(seconds)) > 0 else 6
+
 
 def promise(unknown: Unknown, given: Adjustment) -> float:
     """Nats that values are likely to gain, by one step of least squares."""
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
-    step, scales = _step(unknown, given, given.poses, np.zeros(k)), _scales(unknown, given)
-    gain, F = 0.0, len(given.poses)
-    for f in range(F):
-        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
-        r, J = _linearised(unknown, given, f, given.poses[f], np.zeros(k), scales[own])
+    begun = np.zeros(given.motion * len(given.poses) + k)
+    A, b = _normal(unknown, given, given.poses, begun)
+    scales, steps = _scales(unknown, given), np.zeros((2, len(b)))
+    # what moves gains nothing by values
+    steps[0, :-k], steps[1] = np.linalg.solve(A[:-k, :-k], b[:-k]), np.linalg.solve(A, b)
+    gain = 0.0
+    for f, T in enumerate(given.poses):
+        own = _own(given, f, k)
+        r, J = _linearised(unknown, given, f, T, begun[own], scales[own])
         # what is far off may be of clutter, and gains no more than what is outlying
-        gain += float((_loss(r) - _loss(r + J @ step[own])).sum())
+        without, by_values = (_loss(r + J @ step[own]).sum() for step in steps)
+        gain += float(without - by_values)
     return gain
 
 
@@ -109,63 +122,90 @@ def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]]
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return None
-    poses, values = list(given.poses), np.zeros(k)
+    poses, state = list(given.poses), np.zeros(given.motion * len(given.poses) + k)
     for _ in range(_ITERATIONS):
         scales = _scales(unknown, given)
-        step = _step(unknown, given, poses, values) * scales
+        step = np.linalg.solve(*_normal(unknown, given, poses, state)) * scales
         if not np.isfinite(step).all():
             return None
-        poses = [perturb(T, step[6 * f : 6 * f + 6]) for f, T in enumerate(poses)]
-        values = values + step[-k:]
+        poses = [perturb(T, step[_own(given, f, 0)[:6]]) for f, T in enumerate(poses)]
+        state = state + step
         if np.abs(step / scales).max() < 1e-4:
             break
-    return values, poses
+    return state[-k:], poses
+
+
+def _own(given: Adjustment, f: int, k: int) -> list[int]:
+    """Where a frame's pose and velocity are among all unknowns, and then the k values."""
+    p, F = given.motion, len(given.poses)
+    return [*range(p * f, p * f + p), *range(p * F, p * F + k)]
 
 
 def _scales(unknown: Unknown, given: Adjustment) -> Floats:
-    """Units (6 F + k,) in which poses and values are fitted: the body's size, radians."""
+    """Units in which poses, velocities and values are fitted: the body's size, radians, deviations.
+
+    Of velocities they are deviations, too.
+    """
     size = float(np.linalg.norm(given.points - given.points.mean(axis=0), axis=1).max())
-    pose = np.array([size] * 3 + [1.0] * 3)
-    return np.concatenate([np.tile(pose, len(given.frames)), unknown.deviations])
+    pose = np.array([size] * 3 + [1.0] * 3 + [_SHIFTING * size] * 3 + [_TURNING] * 3)
+    return np.concatenate([np.tile(pose[: given.motion], len(given.frames)), unknown.deviations])
 
 
-def _step(unknown: Unknown, given: Adjustment, poses: Sequence[Floats], values: Floats) -> Floats:
-    """A step (6 F + k,) of poses and values by least squares, in their scales."""
-    k, F = len(values), len(poses)
-    A, b = np.zeros((6 * F + k, 6 * F + k)), np.zeros(6 * F + k)
-    A[-k:, -k:], b[-k:] = np.eye(k), -values / unknown.deviations
-    scales = _scales(unknown, given)
-    for f in range(F):
-        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
-        r, J = _linearised(unknown, given, f, poses[f], values, scales[own])
+def _normal(
+    unknown: Unknown, given: Adjustment, poses: Sequence[Floats], state: Floats
+) -> tuple[Floats, Floats]:
+    """Normal equations of a step of poses, velocities and values, in their scales.
+
+    Of the state only velocities and values count; poses are what they are.
+    """
+    k, scales = len(unknown.deviations), _scales(unknown, given)
+    A, b = 1e-9 * np.eye(len(state)), np.zeros(len(state))
+    frames = np.arange(len(state) - k) % given.motion
+    known = np.concatenate([np.flatnonzero(frames >= 6), np.arange(len(state) - k, len(state))])
+    A[known, known] += 1.0
+    b[known] = -(state / scales)[known]
+    for f, T in enumerate(poses):
+        own = _own(given, f, k)
+        r, J = _linearised(unknown, given, f, T, state[own], scales[own])
         w = _OUTLYING / np.maximum(np.abs(r), _OUTLYING)
         A[np.ix_(own, own)] += J.T @ (w[:, None] * J)
         b[own] -= J.T @ (w * r)
-    return np.asarray(np.linalg.solve(A + 1e-9 * np.eye(len(b)), b))
+    return A, b
 
 
 def _linearised(
-    unknown: Unknown, given: Adjustment, f: int, T: Floats, values: Floats, scales: Floats
+    unknown: Unknown, given: Adjustment, f: int, T: Floats, state: Floats, scales: Floats
 ) -> tuple[Floats, Floats]:
-    """Residuals (R,) of a frame in the noise, and their derivatives (R, 6 + k), in scales."""
+    """Residuals (R,) of a frame in the noise, and their derivatives (R, p + k), in scales.
+
+    Of the state (p + k,) of the frame, the velocity and the values.
+    """
+    p, values = given.motion, state[given.motion :]
     points, steps = unknown.points(given.points, values), _STEP * np.diag(unknown.deviations)
     lever = points @ T[:3, :3].T
     world = lever + T[:3, 3]
+    by_twist = np.zeros((len(points), 3, 6))
+    by_twist[:, :, :3], by_twist[:, :, 3:] = (
+        np.eye(3),
+        np.cross(np.eye(3), lever[:, None]).swapaxes(1, 2),
+    )
     moved = np.zeros((len(points), 3, len(scales)))  # of a point in the world, by pose and values
-    moved[:, :, :3] = np.eye(3) * scales[:3]
-    moved[:, :, 3:6] = np.cross(np.eye(3), lever[:, None]).swapaxes(1, 2) * scales[3:6]
+    moved[:, :, :6] = by_twist * scales[:6]
     for j, step in enumerate(steps if points is not given.points else ()):
         by_step = unknown.points(given.points, values + step) - points
-        moved[:, :, 6 + j] = by_step @ T[:3, :3].T / _STEP
+        moved[:, :, p + j] = by_step @ T[:3, :3].T / _STEP
     parts, columns = [np.zeros(0)], [np.zeros((0, len(scales)))]
     for seen in given.frames[f]:
-        at = world[seen.features]
+        at, of_point = world[seen.features], moved[seen.features]
+        if p > 6:
+            late = by_twist[seen.features] * seen.seconds[:, None, None]
+            at, of_point[:, :, 6:p] = at + late @ state[6:p], late * scales[6:p]
         sensor = unknown.sensor(seen.name, given.sensors[seen.name], values)
         y, J, visible = sensor.linearise(at)
-        by_all = J @ moved[seen.features]
+        by_all = J @ of_point
         for j, step in enumerate(steps if sensor is not given.sensors[seen.name] else ()):
             other = unknown.sensor(seen.name, given.sensors[seen.name], values + step)
-            by_all[:, :, 6 + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
+            by_all[:, :, p + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
         off, noise = np.where(visible[:, None], y - seen.observed, 0.0), seen.noise[:, None]
         parts.append((off / noise).ravel())
         columns.append((by_all / noise[..., None]).reshape(-1, len(scales)))
