@@ -1,8 +1,8 @@
 """Values of a session that may be off: the body's size, lenses, poses of cameras, markers.
 
 They are adjusted by least squares over the matches of several frames, together with the poses of
-all frames, and with velocities where a frame is not seen at one instant; outlying matches are weighed
-down as by Huber's loss.
+all frames, and their velocities where a frame is not seen at one instant; outlying matches are
+weighed down as by Huber's loss.
 """
 
 from __future__ import annotations
