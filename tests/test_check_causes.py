@@ -168,4 +168,4 @@ def test_frames_that_are_lost_ask_for_the_cause_as_those_in_doubt_do(
     assert len(causes) == told_of
     for line in causes:
         assert line.startswith("the body of [object] is mirrored: ")
-        assert line.endswith(", frames that are not ok would be")
+        assert line.endswith(", frames that are not ok would be ok")

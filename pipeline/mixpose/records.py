@@ -288,7 +288,7 @@ class Estimate:
     # How late sensors are beyond what the session says, as far as the frames so far show it; no
     # part of the pose line.
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
-    # Why a frame is ambiguous, other than for its rivals; no part of it either.
+    # Why a frame is ambiguous, other than for its rivals.
     doubt: str = field(default="", compare=False)
     # Works out `offsets`.
     measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)

@@ -21,6 +21,7 @@ from mixpose.checking.trials import diagnosis
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
+from mixpose.judgement import APART
 from mixpose.records import FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin, observe
@@ -43,6 +44,7 @@ class Doubts:
     warnings: tuple[str, ...] = ()
     mended: Session | None = None  # that explains them: what is odd without it may follow
     tried: str = ""  # what came of frames by the session as it is; empty where none was estimated
+    unexplained: str = ""  # frames that nothing explains, unless their features are wrong
 
 
 def geometry_doubts(
@@ -73,16 +75,17 @@ def geometry_doubts(
     if found.likeliest:
         mended = found.likeliest.of(session, frames[0][1])
         return Doubts((f"{found.change}, {found.gain}",), mended)
-    if not found.good and len(sources) > 1:
-        doubts = Doubts(_contradiction(session, frames))
-    else:
-        doubts = _at_the_start(recording)
+    doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()
     numbers = ", ".join(str(number) for number in sorted(n for n, _ in frames[: found.count]))
     met = f", features met to {found.rms:.2g} sigma in the median" if found.good else ""
-    explained = (
-        f"{found.good} of {found.count} frames that were estimated ({numbers}) are explained"
-    )
-    return replace(doubts, tried=f"{explained}{met}")
+    tried = f"{found.good} of {found.count} frames that were estimated ({numbers}) are explained"
+    doubts = replace(doubts, tried=f"{tried}{met}")
+    if not (found.good or doubts.warnings):
+        return _nothing_explained(session, frames, doubts)
+    if 2 * found.good < found.count:
+        text = f"only {tried}: are the markers found there, and is the body in view?"
+        doubts = replace(doubts, unexplained=f"{text} mixpose inspect shows a frame")
+    return doubts
 
 
 @dataclass(frozen=True)
@@ -169,23 +172,26 @@ def _at_the_start(recording: _Recording) -> Doubts:
     return Doubts()
 
 
-def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
-    """Why no frame is ok: sensors that contradict each other, or nobody knows."""
+def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doubts:
+    """Why no frame is explained: sensors that contradict each other, or nobody knows."""
     doubt, frames = "", frames[:2]
     for number, views in frames:
         tracker, track = begin(session)
         _, estimate = tracker.advance(track, number, None, views)
         if estimate.status == "ok":
-            return ()
+            return doubts
         doubt = estimate.doubt or doubt
     numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
     if doubt:
-        return (f"{where}: {doubt}: {CAUSES}",)
-    return (
+        causes = f": {CAUSES}" if doubt == APART else ""
+        return replace(doubts, warnings=(f"{where}: {doubt}{causes}",))
+    text = (
         f"{where}: the body is not found, by the session as it is or with any one change of it: is "
-        "it in view, or are several things wrong at once?",
+        "it in view, and are its markers found (mixpose inspect), or are several things wrong at "
+        "once?"
     )
+    return replace(doubts, unexplained=text)
 
 
 def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:

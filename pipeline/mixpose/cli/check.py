@@ -115,6 +115,8 @@ def check_session(
     if doubts.mended is None:
         report.warnings = told_apart(report.of_counts) + report.warnings + given.warnings
         report.warnings += doubts.warnings
+        if doubts.unexplained and not (report.of_counts or doubts.warnings):
+            report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings]
         report.warnings += _of_geometry(with_image_sizes(doubts.mended, sizes)).warnings

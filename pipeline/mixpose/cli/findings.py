@@ -6,7 +6,7 @@ Everything is kept as sums and stretches of frames, so that a run of any length 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
@@ -237,12 +237,22 @@ class Findings:
         # a body of another size is met off at all of its markers
         return [*self._of_doubts(), *(sizes or self._of_markers())]
 
-    def of_sensors(self) -> list[str]:
-        """What is odd about what sensors see, a line each."""
+    @property
+    def tells_of_sensors(self) -> bool:
+        """Whether the causes say why a sensor explains nothing."""
+        return self.change is not None or any(APART in line for line in self._of_doubts())
+
+    def of_sensors(self, idle: Container[str] = ()) -> list[str]:
+        """What is odd about what sensors see, a line each.
+
+        Those that are `idle` may have been looked at only where the body is not.
+        """
         total, lines = self._places + 1, []
         kinds = (("no frame", self._no_frame), ("no feature", self._no_feature))
         for what, found in kinds:
             for name, each in found.items():
+                if found is self._no_feature and name in idle:
+                    continue
                 if each.longest >= _LONG or each.count > _OFTEN * total:
                     lines.append(
                         f"sensor {name!r} had {what} in {each.count} of {total} frames: "
@@ -272,7 +282,7 @@ class Findings:
 
     def _of_doubts(self) -> list[str]:
         if self.change is not None:
-            return [f"{self.change}, frames that are not ok would be"]
+            return [f"{self.change}, frames that are not ok would be ok"]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         since = self._changed_since()
@@ -366,7 +376,8 @@ def _about(marker: _Marker, typical: float, unit: str) -> list[str]:
         ]
     systematic = marker.systematic()
     own = max(marker.squares / marker.views - systematic, 1e-12)
-    sure = systematic * marker.views / own > _SURE
+    # of a few frames a displacement takes up all
+    sure = systematic * marker.views / own > _SURE and marker.met >= _FEWEST
     if sure and systematic > _MEASURED**2 * typical:
         off = float(np.linalg.norm(marker.shift()))
         return [

@@ -154,7 +154,11 @@ def summary(
     if len(estimate.hypotheses) > 1:
         weights = ", ".join(f"{one.weight:.2g}" for one in estimate.hypotheses)
         head += f"; {len(estimate.hypotheses)} poses with weights {weights}, the first is shown"
-    lines = [head]
+    lines, why = [head], estimate.doubt
+    if estimate.status == "ambiguous" and len(estimate.hypotheses) < 2:
+        why = why or "so little is met that other things may look so"
+    if why:
+        lines.append(f"why: {why}; confidence {estimate.confidence:.3g}")
     if estimate.proposer:
         lines.append(f"the pose came from: {estimate.proposer}")
     for finding in findings:

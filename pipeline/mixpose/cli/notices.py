@@ -155,17 +155,18 @@ class Summary:
         apart = {n for n, k in self.idle.items() if k >= _MOST * self.posed[n]}
         found = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
-            "frames with a pose: check its T_sensor_world, calibration and source"
+            "frames with a pose: check its T_sensor_world, calibration and source, which "
+            "mixpose check tries"
             for name in self.idle
             if name in apart
         ]
         posed = sum(self.statuses.values()) - self.statuses["lost"]
-        seen, causes = self.findings.of_sensors(), self.findings.causes()
+        seen, causes = self.findings.of_sensors(apart), self.findings.causes()
         if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
             apart = set(self.split)
             found += [] if seen else [self._split_text()]
         # what names the cause stands for what only shows it
-        found = [*seen, *causes, *(line for line in found if not causes)]
+        found = [*([] if self.findings.tells_of_sensors else found), *seen, *causes]
         found += [
             f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
             for (name, why), count in self.left_out.items()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,6 +24,8 @@ _FLOODED = 0.02  # share of an image above a threshold that would find everythin
 _LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
 _SPECK_PX = 2  # pieces up to this area are noise
 _MOST = 0.8  # of the features in view that must be met to tell what markers look like
+_AS_LARGE = 3.0  # times the usual area: a marker by itself, and no part of something else
+_LOWER = (0.8, 0.6, 0.45, 0.3)  # of the height of a threshold above the background
 _LISTED = 6  # features that are named one by one
 
 
@@ -32,7 +34,13 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
     if finding.frame is None:
         return [f"{finding.name}: no frame of this number"]
     lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
-    data = finding.frame.data
+    data, expected = finding.frame.data, finding.expectation
+    if expected is not None and expected.seen.any() and not expected.met.any():
+        lines.append(
+            "  it takes no part in this pose, as it meets nothing of it: are its T_sensor_world, "
+            "calibration and source right? mixpose check tries others"
+        )
+        return lines
     if isinstance(data, PointPattern | GridPattern):
         advice = _about_measurements(finding, body)
     else:
@@ -192,9 +200,36 @@ def _about_missing(finding: Finding, expected: Expectation, light: _Light, body:
         lines.append(
             f"not met though bright there: {_some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
-            f"{_direction(options, lower=False, level=light.level)}"
+            f"{_apart(finding, expected, light, body, list(found))}"
         )
     return lines
+
+
+def _apart(
+    finding: Finding, expected: Expectation, light: _Light, body: Body, features: Sequence[int]
+) -> str:
+    """The threshold at which features stand apart from what is about them, where there is one."""
+    options, met = light.options, np.flatnonzero(expected.seen & expected.met)
+    if not isinstance(options.threshold, str):
+        return _direction(options, lower=False)
+    labels, areas = light.pieces
+    boxes = {
+        i: _around(expected.y[i], _NEAR_SIGMAS * finding.sigma, light.raw.shape)
+        for i in [*met.tolist(), *features]
+    }
+    largest = {i: int(labels[box].flat[areas[labels[box]].argmax()]) for i, box in boxes.items()}
+    peak = min([float(light.raw[boxes[i]].max()) for i in met.tolist()], default=np.inf)
+    usual = float(np.median([areas[largest[i]] for i in met.tolist()] or [np.inf]))
+    ground = np.median(light.raw[np.isin(labels, [largest[i] for i in features])])
+    level = (peak + float(ground)) / 2
+    _, pieces, there, _ = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))
+    sizes = np.append(0, there[1:, cv2.CC_STAT_AREA])
+    own = {i: int(sizes[pieces[boxes[i]]].max()) for i in features}
+    parted = [i for i in features if options.min_area <= own[i] <= _AS_LARGE * usual]
+    if not parted:
+        return "no threshold parts them"
+    which = _some(parted, body) if len(parted) < len(features) else "them"
+    return f"threshold = {light.in_image(level):.0f} parts {which} in this frame"
 
 
 def _sorted_out(
@@ -276,13 +311,30 @@ def _about_number(finding: Finding, body: Body, light: _Light) -> list[str]:
                 f"{large.min()} px: raise max_area = {options.max_area:g}"
             )
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
-        return lines or [f"too few: {_direction(options, lower=True, level=light.level)}{polarity}"]
+        return lines or [f"too few: {_more(light, len(body))}{polarity}"]
     if finding.count > 3 * len(body):
         return [
             "too many: look which are markers, and whether they differ from the rest in brightness "
             "(threshold) or size (min_area, max_area)"
         ]
     return []
+
+
+def _more(light: _Light, expected: int) -> str:
+    """A threshold at which pieces are as many as expected, or nearly so, where there is one."""
+    options, base = light.options, float(np.median(light.raw))
+    if not isinstance(options.threshold, str):
+        return _direction(options, lower=True)
+    over = float(light.scene.level)
+    counts = {}
+    for level in (base + share * over for share in _LOWER):
+        statistics = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))[2]
+        counts[level] = int(np.count_nonzero(statistics[1:, cv2.CC_STAT_AREA] >= options.min_area))
+    fits = {level: n for level, n in counts.items() if 0.8 * expected <= n <= 3 * expected}
+    if not fits:
+        return "no lower threshold finds them: hidden, out of light, or out of view?"
+    level = max(fits)
+    return f"threshold = {light.in_image(level):.0f} finds {fits[level]} in this frame"
 
 
 def _about_others(finding: Finding, body: Body) -> list[str]:

@@ -76,6 +76,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         "object": estimate.object,
         **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
+        **({"why": estimate.doubt} if estimate.doubt else {}),
         "T_world_object": plain_or_none(T),
         "quaternion_xyzw": plain_or_none(turn),
         "covariance": plain_or_none(covariance),

@@ -66,6 +66,7 @@ class _Pose(_Line):
     instance: Annotated[int, Field(ge=0)] | None = None
     time_s: float | None = None
     status: Status = "ok"
+    why: str = ""
     T_world_object: _Matrix4 | None = None
     covariance: _Matrix6 | None = None
     score: float | None = None
@@ -118,6 +119,7 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             for name, point in pose.points.items()
         },
         "tip_object": _in_object(T, told.pop("tip")),
+        "doubt": told.pop("why"),
     }
     return PoseLine(**told)
 
