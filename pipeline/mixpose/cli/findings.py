@@ -319,10 +319,12 @@ class Findings:
     @cached_property
     def change(self) -> str | None:
         """What the session should have said, where few frames are ok, and some doubted or lost."""
-        doubted = sum(each.count for each in self._doubts.values())
+        # a body that is there twice is no fault of the session
+        doubted = sum(each.count for doubt, each in self._doubts.items() if doubt != TWICE)
         frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
-        bad = self._places + 1 - self._ok if doubted or self._lost >= _LONG else 0
+        twice = sum(each.count for doubt, each in self._doubts.items() if doubt == TWICE)
+        bad = self._places + 1 - self._ok - twice if doubted or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
         return explanation(self._session, self._frames)

@@ -36,6 +36,9 @@ class AssociationRules:
         0.01,
         "of a feature's energy: those nearer than a seventh of C's deviation are not told apart",
     )
+    both: float = constant(
+        0.6, "that a spot is of two features within its radius: P_D² / (1 - (1 - P_D)²)"
+    )
     slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
@@ -77,7 +80,7 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    extra, radii, cut = _looks(views, by, partner, rules.middle)
+    extra, radii, cut = _looks(views, y, seen & (shares == 0), by, partner, rules)
     return Matches(
         extra=extra,
         radii=radii,
@@ -123,10 +126,19 @@ def _detections(views: Sequence[View]) -> Floats:
 
 
 def _looks(
-    views: Sequence[View], by: Indices, partner: Indices, middle: float
+    views: Sequence[View],
+    y: Floats,
+    missed: Mask,
+    by: Indices,
+    partner: Indices,
+    rules: AssociationRules,
 ) -> tuple[Floats, Floats, Floats]:
-    """Variances (L, n) of what meets features beyond noise, σ_ε²; radii, sensor units; `cut`."""
-    extra, radii = np.where(partner >= 0, middle**2, 0.0), np.zeros(by.shape)
+    """Variances (L, n) of what meets features beyond noise, σ_ε²; radii, sensor units; `cut`.
+
+    A spot shows another feature that is missed within its radius as likely as not: the two of them
+    look whole, and it is at their middle.
+    """
+    extra, radii = np.where(partner >= 0, rules.middle**2, 0.0), np.zeros(by.shape)
     cut = np.full((*by.shape, 2), np.nan)
     for k, view in enumerate(views):
         pattern = view.observation.pattern
@@ -137,6 +149,11 @@ def _looks(
         deviations = pattern.deviations[by[k, single]] / view.observation.sigma
         extra[k, single] = deviations * deviations
         radii[k, single] = pattern.radii[by[k, single]]
+        if missed[k].any():
+            away = y[k, single, None] - y[k, missed[k]]
+            squared = np.vecdot(away, away)
+            beside = np.where(squared < radii[k, single, None] ** 2, squared, 0.0).max(axis=1)
+            extra[k, single] += rules.both * beside / (2 * view.observation.sigma) ** 2
         if pattern.cut is not None:
             chances, errors = pattern.cut[by[k, single]].T
             cut[k, single] = np.stack([chances, np.square(errors / view.observation.sigma)], axis=1)

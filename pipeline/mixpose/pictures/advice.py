@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.extraction.blobs import find_blobs
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.threshold import Foreground, above, foreground
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.records import Floats, GridPattern, Image, PointPattern
+from mixpose.pictures.light import Light
+from mixpose.records import Floats, GridPattern, PointPattern
 
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
 _NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
@@ -44,7 +40,7 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
     if isinstance(data, PointPattern | GridPattern):
         advice = _about_measurements(finding, body)
     else:
-        light = _Light(data, finding.setup.extract)
+        light = Light(data, finding.setup.extract)
         lines.append(_threshold(light))
         if light.options.method in ("blobs", "intensity"):
             advice = _about_spots(finding, light, body)
@@ -71,57 +67,7 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
     return f"{text}; {100 * expected.explained:.0f} % of the density explained"
 
 
-@dataclass(frozen=True)
-class _Light:
-    """An image as blobs and intensity are extracted from it."""
-
-    image: Image
-    options: ExtractOptions
-
-    @cached_property
-    def scene(self) -> Foreground:
-        height, width = self.image.shape
-        return foreground(self.image, self.options, (0, 0, width, height))
-
-    @cached_property
-    def above(self) -> NDArray[np.uint8]:
-        return above(self.scene.grey, self.scene.zero + self.scene.level)
-
-    @property
-    def share(self) -> float:
-        """Of the pixels above the threshold."""
-        return float(np.mean(self.above))
-
-    @cached_property
-    def raw(self) -> Floats:
-        """Grey values with features bright."""
-        return np.asarray(self.in_image(self.image.astype(np.float64)))
-
-    def in_image(self, level: Any) -> Any:
-        """A grey level of `raw` as the session file wants it, and the reverse."""
-        if self.options.polarity == "bright":
-            return level
-        if self.image.dtype == np.float32:
-            return float(self.image.max()) - level
-        return (255.0 if self.image.dtype == np.uint8 else 65535.0) - level
-
-    @cached_property
-    def level(self) -> float:
-        """The grey level in the image above which, or below, something is a feature."""
-        # a background that varies is out of `scene.grey`; its middle stands for it
-        base = float(np.median(self.raw)) if self.scene.judged else 0.0
-        return float(self.in_image(base + self.scene.level))
-
-    @cached_property
-    def pieces(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Connected pieces above the threshold: a label per pixel, and areas; 0 is none."""
-        _, labels, statistics, _ = cv2.connectedComponentsWithStats(self.above)
-        areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
-        areas[0] = 0
-        return np.asarray(labels, dtype=np.int32), areas
-
-
-def _threshold(light: _Light) -> str:
+def _threshold(light: Light) -> str:
     """The threshold that was used, in the grey levels of the image."""
     options = light.options
     if options.method in ("corners", "log"):
@@ -146,7 +92,7 @@ def _threshold(light: _Light) -> str:
     return f"{text}; {100 * light.share:.2g} % of the pixels"
 
 
-def _about_spots(finding: Finding, light: _Light, body: Body) -> list[str]:
+def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
     """Advice for blobs and intensity."""
     options = light.options
     lines = []
@@ -171,7 +117,7 @@ def _about_spots(finding: Finding, light: _Light, body: Body) -> list[str]:
     return lines
 
 
-def _about_missing(finding: Finding, expected: Expectation, light: _Light, body: Body) -> list[str]:
+def _about_missing(finding: Finding, expected: Expectation, light: Light, body: Body) -> list[str]:
     """Why expected features were not met, and what would find them."""
     options = light.options
     missing = _sorted_out(finding, expected, light)
@@ -206,7 +152,7 @@ def _about_missing(finding: Finding, expected: Expectation, light: _Light, body:
 
 
 def _apart(
-    finding: Finding, expected: Expectation, light: _Light, body: Body, features: Sequence[int]
+    finding: Finding, expected: Expectation, light: Light, body: Body, features: Sequence[int]
 ) -> str:
     """The threshold at which features stand apart from what is about them, where there is one."""
     options, met = light.options, np.flatnonzero(expected.seen & expected.met)
@@ -233,7 +179,7 @@ def _apart(
 
 
 def _sorted_out(
-    finding: Finding, expected: Expectation, light: _Light
+    finding: Finding, expected: Expectation, light: Light
 ) -> dict[str, dict[int, float]]:
     """Features that were not met, by why: nothing there, faint (with its peak), or by its area."""
     options, scene = light.options, light.scene
@@ -258,7 +204,7 @@ def _sorted_out(
     return kinds
 
 
-def _about_extra(finding: Finding, expected: Expectation, light: _Light) -> list[str]:
+def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[str]:
     """What tells found things that belong to no feature from those that do."""
     if finding.points is None or not expected.unexplained.any():
         return []
@@ -292,7 +238,7 @@ def _about_extra(finding: Finding, expected: Expectation, light: _Light) -> list
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 
 
-def _about_number(finding: Finding, body: Body, light: _Light) -> list[str]:
+def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
     """Advice without a pose: only the number of features is known."""
     options = light.options
     if finding.count < 0.8 * len(body):
@@ -320,7 +266,7 @@ def _about_number(finding: Finding, body: Body, light: _Light) -> list[str]:
     return []
 
 
-def _more(light: _Light, expected: int) -> str:
+def _more(light: Light, expected: int) -> str:
     """A threshold at which pieces are as many as expected, or nearly so, where there is one."""
     options, base = light.options, float(np.median(light.raw))
     if not isinstance(options.threshold, str):
@@ -399,7 +345,7 @@ def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice
     return slice(max(v - r, 0), v + r + 1), slice(max(u - r, 0), u + r + 1)
 
 
-def _looser(light: _Light, level: float) -> str:
+def _looser(light: Light, level: float) -> str:
     if float(np.mean(light.raw > level)) > _FLOODED:
         return 'set threshold = "local", as the background is as bright elsewhere'
     direction = "lower" if light.options.polarity == "bright" else "raise"

@@ -255,7 +255,10 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
                 T, seen = met_at(frame, Fit(T))
             if not np.count_nonzero(seen.merged):
                 break
+            # what is paired pulls from where it is; then what is off by more than noise does not
             blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
+            if not is_second:
+                blurs = np.maximum(blurs, 1.0)
             J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
             rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
             T = perturb(T, least_squares(rest, free=frame.free).states[0])
@@ -266,7 +269,8 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
 def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
     """In each sensor features missed near detections of single ones, as one with these.
 
-    The nearest first, so many at most; `reach` is how far that may be, squared, in variances of C.
+    The nearest first, so many at most; `reach` is how far that may be, squared, in variances of C,
+    of detections without a size.
     """
     if not np.count_nonzero(seen.missed):
         return seen
@@ -278,8 +282,10 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
         away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
         squared = (away * away).sum(axis=2) / 2
+        # of two disks that touch the centres are √2 times as far apart as their joint area is wide
+        squared[squared > np.maximum(reach, (seen.radii[k, met] / seen.sigmas[k]) ** 2)] = np.inf
         for _ in range(most):
-            if squared.min(initial=np.inf) > reach:
+            if squared.min(initial=np.inf) == np.inf:
                 break
             i, j = np.unravel_index(int(squared.argmin()), squared.shape)
             pair = [lost[i], met[j]]

@@ -1,9 +1,9 @@
 """Whether the body is in a frame twice: a mirror image on a table, or one of which nobody told.
 
 What a pose leaves of the detections is compared with the body as if nothing were known before: a
-second pose as evident as the first one says that either may be the body, whichever was followed so
-far.  Frames are searched in which a sensor sees more that belongs to nothing than in those searched
-in vain before, and every few frames anyway.
+second pose that is sure says that either may be the body, whichever was followed so far, and in the
+frames after it.  Frames are searched in which a sensor sees more that belongs to nothing than in
+those searched in vain before, and every few frames anyway; of a flat body all.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit, logit
 
 from mixpose.body import thickness
 from mixpose.judgement import Alternative, ScoredPose, Verdict, is_sure
@@ -37,14 +38,18 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     Either may be it then, whichever was followed so far.
     """
     best, left = verdict.best, {one.name: one.observation.cells for one in rest}
-    if best is None or verdict.status != "ok" or not _is_due(data, best, left):
+    if best is None or verdict.status != "ok":
         return verdict
-    most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
-    verdict, second = replace(verdict, tried=most), _second_pose(data, best, rest)
-    if second is None:
-        return verdict
-    kept = [*((one, weight / 2) for one, weight in verdict.kept), (second, 0.5)]
-    return replace(verdict, kept=kept).doubted([Alternative(TWICE)])
+    odds, second = data.track.twice - data.rules.proposals.forgotten, None
+    if _is_due(data, best, left):
+        most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
+        verdict, second = replace(verdict, tried=most), _second_pose(data, best, rest)
+    if second is not None:
+        odds = max(odds, _more_missed(best, second, data))
+        share = float(expit(odds))
+        kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
+        verdict = replace(verdict, kept=sorted(kept, key=lambda each: -each[1]))
+    return replace(verdict, twice=odds).doubted([Alternative(TWICE, odds)])
 
 
 def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
@@ -70,28 +75,47 @@ def are_both(a: ScoredPose, b: ScoredPose) -> bool:
     return bool(shared < 0.5 * (a.matches.detections >= 0).sum())
 
 
+def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+    """Log odds for the second of two poses that each explain what they meet, as one is the body's.
+
+    Then the other is its image, or another body: of all but what the body is missed at.
+    """
+    missed = [float((one.used.weights - one.used.shares).sum()) for one in (best, second)]
+    return (missed[0] - missed[1]) * float(logit(data.rules.judgement.detection.probability))
+
+
 def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     """Whether as many detections as are left may be the body once more, and were not searched."""
     used, rules = best.matches, data.rules
     if (used.dimensions != 2).any():
         return False
     rest = np.array([left.get(name, 0) for name in used.names])
-    # as much as would convince, by as many sensors
-    if np.minimum(rest, used.met).sum() < rules.acceptance.convincing * used.met.sum():
+    # as much as would cast doubt, by as many sensors
+    if np.minimum(rest, used.met).sum() < used.met.sum() - _most_missed(data):
         return False
     track = data.track
     is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
-    return is_more or track.doubted or track.is_in_turn(data.frame, rules.proposals.static)
+    # a flat body has a mirror image that looks like it
+    if is_more or track.doubted or is_flat(data):
+        return True
+    return track.is_in_turn(data.frame, rules.proposals.static)
+
+
+def _most_missed(data: Frame) -> float:
+    """How many features more a second pose misses at the most that casts doubt on the best one."""
+    return data.rules.acceptance.log_doubt / -float(
+        logit(data.rules.judgement.detection.probability)
+    )
 
 
 def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
-    """A pose that is sure by itself and meets as much as the best one."""
+    """A pose that is sure by itself and may be the body's as well as the best one."""
     rest = data.alone(views=views, still=(), starts=())
-    rules, least = data.rules, data.rules.acceptance.convincing * best.measurements
     likelihood = likelihood_of(rest)
     for start in _starts(data, best, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
-        if is_sure(pose, data.free, rules.acceptance) and pose.measurements >= least:
+        is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
+        if is_likely and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer="second_pose")
     return None
 
