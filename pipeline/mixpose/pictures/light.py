@@ -1,4 +1,4 @@
-"""An image as blobs and grey values are extracted from it: what is above the threshold, in pieces."""
+"""An image as blobs and grey values are extracted from it: what is above the threshold."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ class Light:
 
     @cached_property
     def scene(self) -> Foreground:
+        """Its grey values without the background, and the threshold."""
         height, width = self.image.shape
         return foreground(self.image, self.options, (0, 0, width, height))
 
     @cached_property
     def above(self) -> NDArray[np.uint8]:
+        """1 where it is above the threshold, else 0."""
         return above(self.scene.grey, self.scene.zero + self.scene.level)
 
     @property
