@@ -133,8 +133,8 @@ _CHECKING = (
     Mutant(
         "checking-values-cost-nothing-and-have-no-prior",
         "checking/values.py",
-        "b[-k:] = np.eye(k), -values / unknown.deviations",
-        "b[-k:] = 1e9 * np.eye(k), -values / unknown.deviations",
+        "A[known, known] += 1.0",
+        "A[known, known] += 1e9",
         "values stay where they are, and no size is found",
         _DIAGNOSIS,
     ),

@@ -69,8 +69,8 @@ MUTANTS = (
     Mutant(
         "tracking-twin-never-sought",
         "tracking/twin.py",
-        'verdict.status != "ok" or not _is_due(data, best, left)',
-        "True",
+        'if best is None or verdict.status != "ok":',
+        "if True:",
         "a mirror image is followed while the body itself is in view",
         (_TWIN,),
     ),

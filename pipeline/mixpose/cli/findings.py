@@ -6,7 +6,7 @@ Everything is kept as sums and stretches of frames, so that a run of any length 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
@@ -242,17 +242,12 @@ class Findings:
         """Whether the causes say why a sensor explains nothing."""
         return self.change is not None or any(APART in line for line in self._of_doubts())
 
-    def of_sensors(self, idle: Container[str] = ()) -> list[str]:
-        """What is odd about what sensors see, a line each.
-
-        Those that are `idle` may have been looked at only where the body is not.
-        """
+    def of_sensors(self) -> list[str]:
+        """What is odd about what sensors see, a line each."""
         total, lines = self._places + 1, []
         kinds = (("no frame", self._no_frame), ("no feature", self._no_feature))
         for what, found in kinds:
             for name, each in found.items():
-                if found is self._no_feature and name in idle:
-                    continue
                 if each.longest >= _LONG or each.count > _OFTEN * total:
                     lines.append(
                         f"sensor {name!r} had {what} in {each.count} of {total} frames: "

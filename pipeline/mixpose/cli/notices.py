@@ -161,7 +161,7 @@ class Summary:
             if name in apart
         ]
         posed = sum(self.statuses.values()) - self.statuses["lost"]
-        seen, causes = self.findings.of_sensors(apart), self.findings.causes()
+        seen, causes = self.findings.of_sensors(), self.findings.causes()
         if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
             apart = set(self.split)
             found += [] if seen else [self._split_text()]

@@ -64,7 +64,8 @@ class Verdict:
     most: float = -math.inf  # log odds against it up to which it is ok
     # detections that sensors had left where the body was sought a second time
     tried: Mapping[str, int] = field(default_factory=dict)
-    twice: float = -math.inf  # log odds that the body is another one in the frame, which last
+    # log odds that the body is there twice; None where nobody asked
+    twice: float | None = None
     # log odds of mistakes in the session, by name; None where it was not asked for them
     mistaken: Mapping[str, float] | None = None
 

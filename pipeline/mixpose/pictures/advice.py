@@ -31,7 +31,7 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
         return [f"{finding.name}: no frame of this number"]
     lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
     data, expected = finding.frame.data, finding.expectation
-    if expected is not None and expected.seen.any() and not expected.met.any():
+    if expected is not None and _sees_something_else(expected):
         lines.append(
             "  it takes no part in this pose, as it meets nothing of it: are its T_sensor_world, "
             "calibration and source right? mixpose check tries others"
@@ -47,6 +47,12 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
         else:
             advice = _about_others(finding, body)
     return lines + [f"  {line}" for line in [*advice, *_about_sigma(finding)]]
+
+
+def _sees_something_else(expected: Expectation) -> bool:
+    """Whether a sensor meets nothing of the pose, where it found half as much as is in view."""
+    in_view = int(expected.seen.sum())
+    return bool(0 < in_view <= 2 * int(expected.unexplained.sum()) and not expected.met.any())
 
 
 def _counts(finding: Finding, body: Body, unit: str) -> str:

@@ -245,37 +245,44 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     """
     rules, before = frame.rules.judgement.association, 0
     for most in (1, len(frame.body)):
-        T, seen = judged.T_world_object, judged.matches
-        seen = _paired(seen, rules.reach_squared, rules.middle, most)
-        if (pairs := int(seen.merged.sum())) == before:
+        paired, is_far = _paired(judged.matches, rules.reach_squared, rules.middle, most)
+        if (pairs := int(paired.merged.sum())) == before:
             return
         before = pairs
-        for is_second in (False, True):  # which starts within 0.01 σ_ε of the first's end
-            if is_second:
-                T, seen = met_at(frame, Fit(T))
-            if not np.count_nonzero(seen.merged):
-                break
-            # what is paired pulls from where it is; then what is off by more than noise does not
-            blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
-            if not is_second:
-                blurs = np.maximum(blurs, 1.0)
-            J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
-            rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-            T = perturb(T, least_squares(rest, free=frame.free).states[0])
-        if T is not judged.T_world_object:
-            yield Start(T)
+        # pairs that are as far off as their spot is wide pull from there, or not at all
+        for widest in (0.0, 1.0) if is_far else (0.0,):
+            if (T := _with_pairs(frame, judged.T_world_object, paired, widest)) is not None:
+                yield Start(T)
 
 
-def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
+def _with_pairs(
+    frame: Frame, T_world_object: Floats, paired: Matches, widest: float
+) -> Floats | None:
+    """The pose (4, 4) by two steps of least squares, the first at that blur or the noise's."""
+    T, seen = T_world_object, paired
+    narrow = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
+    for least in (widest, 0.0):  # the second starts within 0.01 σ_ε of the first's end
+        if T is not T_world_object:
+            T, seen = met_at(frame, Fit(T))
+        if not np.count_nonzero(seen.merged):
+            break
+        weights = welsch(seen.squared, np.maximum(narrow, least))
+        J, offsets = replace(seen, shares=seen.shares * weights).rows()
+        rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
+        T = perturb(T, least_squares(rest, free=frame.free).states[0])
+    return None if T is T_world_object else T
+
+
+def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matches, bool]:
     """In each sensor features missed near detections of single ones, as one with these.
 
     The nearest first, so many at most; `reach` is how far that may be, squared, in variances of C,
-    of detections without a size.
+    of detections without a size.  And whether any are farther off.
     """
     if not np.count_nonzero(seen.missed):
-        return seen
+        return seen, False
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
-    merged, extra = seen.merged.copy(), seen.extra.copy()
+    merged, extra, is_far = seen.merged.copy(), seen.extra.copy(), False
     for k in np.flatnonzero((seen.missed > 0) & (seen.met > 0)):
         by = seen.detections[k]
         met = np.flatnonzero((by >= 0) & ((by[:, None] == by).sum(axis=1) == 1))
@@ -288,13 +295,14 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
             if squared.min(initial=np.inf) == np.inf:
                 break
             i, j = np.unravel_index(int(squared.argmin()), squared.shape)
+            is_far |= bool(squared[i, j] > reach)
             pair = [lost[i], met[j]]
             shares[k, pair] = shares[k, met[j]] / 2
             offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
             J[k, pair] = J[k, pair].mean(axis=0)
             merged[k], extra[k, pair] = merged[k] + 1, middle**2
             squared[i], squared[:, j] = np.inf, np.inf
-    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra)
+    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra), is_far
 
 
 def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:

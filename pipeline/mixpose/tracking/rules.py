@@ -28,9 +28,6 @@ class ProposalRules:
     )
     seconds: int = constant(3, "candidates for a second pose: of clutter the best is the likeliest")
     static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
-    forgotten: float = constant(
-        0.3, "nats per frame, of what was seen twice: what flickers is seen again within 20 frames"
-    )
     believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")
 
 

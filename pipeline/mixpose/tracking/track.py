@@ -142,7 +142,7 @@ class Track:
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain
     tried: Mapping[str, int] = field(default_factory=dict)
-    twice: float = -math.inf  # log odds that the body is another one that frames before showed
+    twice: float = -math.inf  # log odds that a second body is there, of those beside `branches[0]`
     # log odds of mistakes in the session, by name; of the others nothing is known
     mistaken: Mapping[str, float] = field(default_factory=dict)
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost

@@ -276,7 +276,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         shown=None if is_ok else shown_after(data, best),
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
-        twice=max(verdict.twice, track.twice - data.rules.proposals.forgotten),
+        twice=track.twice if verdict.twice is None else verdict.twice,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 

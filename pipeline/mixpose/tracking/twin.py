@@ -8,6 +8,7 @@ those searched in vain before, and every few frames anyway; of a flat body all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -40,16 +41,24 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     best, left = verdict.best, {one.name: one.observation.cells for one in rest}
     if best is None or verdict.status != "ok":
         return verdict
-    odds, second = data.track.twice - data.rules.proposals.forgotten, None
-    if _is_due(data, best, left):
-        most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
-        verdict, second = replace(verdict, tried=most), _second_pose(data, best, rest)
+    accepted = data.rules.acceptance
+    # how likely it is there: frames that show little of it tell against it, and none for ever
+    second, odds = _where_it_was(data, best, rest), -math.inf
     if second is not None:
-        odds = max(odds, _more_missed(best, second, data))
-        share = float(expit(odds))
-        kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
-        verdict = replace(verdict, kept=sorted(kept, key=lambda each: -each[1]))
-    return replace(verdict, twice=odds).doubted([Alternative(TWICE, odds)])
+        odds = min(data.track.twice + second.log_evidence, -accepted.log_doubt)
+    is_there = second is not None and is_sure(second, data.free, accepted)
+    if not is_there and _is_due(data, best, left):
+        most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
+        verdict, found = replace(verdict, tried=most), _second_pose(data, best, rest)
+        if found is not None:
+            second, odds = found, -accepted.log_doubt
+    verdict = replace(verdict, twice=odds)
+    if second is None or odds <= accepted.log_doubt:
+        return verdict
+    either = min(odds, 0.0)
+    share = float(expit(either))
+    kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
+    return replace(verdict, kept=kept).doubted([Alternative(TWICE, either)])
 
 
 def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
@@ -120,13 +129,29 @@ def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> Scored
     return None
 
 
-def _starts(data: Frame, best: ScoredPose, rest: Frame) -> Iterator[Start]:
-    """Where a second pose may be: where one was, then what a search finds."""
+def _where_it_was(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
+    """The second pose of the frame before, in this one."""
+    if data.track.twice == -math.inf or not views:
+        return None
+    rest = data.seen_otherwise(views=views, starts=())
+    likelihood = likelihood_of(rest)
+    for start in _elsewhere(data, best):
+        return likelihood.judge(likelihood.fit(start), start)
+    return None
+
+
+def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
+    """Where else than at the best pose the body is expected."""
     here = transform(best.T_world_object, data.body.means)
     for branch in data.predictions:
         off = np.linalg.norm(transform(branch.T_world_object, data.body.means) - here, axis=1)
         if off.min() > data.body.radius:
             yield Start(branch.T_world_object, branch.uncertainty)
+
+
+def _starts(data: Frame, best: ScoredPose, rest: Frame) -> Iterator[Start]:
+    """Where a second pose may be: where one was, then what a search finds."""
+    yield from _elsewhere(data, best)
     views, rules = rest.views, data.rules
     found: Sequence[Copy | Candidate]
     if len(views) > 1:  # quickly, by points that cameras see together
