@@ -258,7 +258,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
             blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
             J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
             rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-            T = perturb(T, least_squares(rest, free=frame.free).states[0])
+            T = perturb(T, least_squares(rest, free=frame.free)[0])
         if T is not judged.T_world_object:
             yield Start(T)
 
