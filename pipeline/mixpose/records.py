@@ -9,7 +9,7 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -63,9 +63,11 @@ class PointPattern:
         cut = None if self.cut is None else self.cut[chosen]
         return PointPattern(points, weights, deviations, radii, cut)
 
-    def weighed(self, deviation: float) -> PointPattern:
-        """With weights as exact as detections are beside those that err by a deviation."""
-        return replace(self, weights=self.weights / (1 + (self.deviations / deviation) ** 2))
+    def weighed(self, deviation: float) -> Floats:
+        """Weights (M,) as exact as detections are beside those that err by a deviation."""
+        if self.is_even:
+            return self.weights
+        return np.asarray(self.weights / (1 + (self.deviations / deviation) ** 2))
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)

@@ -96,6 +96,7 @@ class PinholeBatch:
             P = self._K @ P
         self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
         self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
+        self._R = P[:, None, :, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
@@ -109,19 +110,25 @@ class PinholeBatch:
         if np.count_nonzero(in_front) < in_front.size:
             depth = np.where(in_front, depth, 1.0)
         inverse_depth = 1.0 / depth
-        y = (points[:, :2] * inverse_depth[:, None]).swapaxes(1, 2)
-        lens = self._lens
-        if lens is not None:
-            in_front &= (y * y).sum(axis=2) < lens.radius_limit**2
-            # polynomials of huge radii overflow; hidden points are overwritten anyway
-            y = np.where(in_front[..., None], y, 0.0)
-        J = self._upper_rows - y[..., None] * self._last_row
-        J *= inverse_depth[..., None, None]
-        if lens is not None:
-            K = self._K[:, None, :2, :2]
-            y, D = lens.linearise(y)
-            J = K @ D @ J
-            y = (K @ y[..., None])[..., 0] + self._K[:, None, :2, 2]
+        xy, lens = points[:, :2] * inverse_depth[:, None], self._lens
+        y = xy.swapaxes(1, 2)
+        if lens is None:
+            J = self._upper_rows - y[..., None] * self._last_row
+            J *= inverse_depth[..., None, None]
+        else:
+            in_front &= (xy * xy).sum(axis=1) < lens.radius_limit**2
+            if np.count_nonzero(in_front) < in_front.size:
+                # polynomials of huge radii overflow; hidden points are overwritten anyway
+                xy = np.where(in_front[:, None], xy, 0.0)
+            y, D = lens.linearise(xy)
+            K, (L, _, n) = self._K[:, :2, :2], y.shape
+            y = (K @ y + self._K[:, :2, 2:]).swapaxes(1, 2)
+            # by points before the camera: x / z and y / z fall as z grows
+            by_point = np.empty((L, 2, 3, n))
+            by_point[:, :, :2] = (K @ D.reshape(L, 2, 2 * n)).reshape(L, 2, 2, n)
+            by_point[:, :, 2] = -(by_point[:, :, :2] * xy[:, None]).sum(axis=2)
+            by_point *= inverse_depth[:, None, None]
+            J = by_point.transpose(0, 3, 1, 2) @ self._R
         inside = np.abs(y - self._middle) <= self._half
         if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
             return y, J, in_front

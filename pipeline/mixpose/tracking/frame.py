@@ -188,6 +188,15 @@ class Frame(Setup):
             still=[view for view in self.still if view.name not in names],
         )
 
+    def of_body(self, body: Body) -> Frame:
+        """Of another body with as many features, of which nothing is fitted yet."""
+        other = self.seen_otherwise(body=body)
+        if self.drawn is not None:  # perhaps with what belongs to other bodies
+            return other
+        # the densities are the same
+        projection = project_body(self.finest.projection.sensors, body)
+        return replace(other, drawn=replace(self.finest, projection=projection))
+
     def seen_otherwise(self, **changes: Any) -> Frame:
         """With other views or another body, of which nothing is drawn or fitted yet."""
         return replace(self, drawn=None, together=None, **changes)
