@@ -15,7 +15,6 @@ and are taken for a multiple of χ² with as much.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -44,33 +43,39 @@ def with_cut_spots(
         return np.zeros(information.shape), 1.0
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = inverted(information + np.diag(1 / known**2))
-    G = J @ C
+    G = (J.reshape(-1, k) @ C).reshape(J.shape)
     values, axes = _axes(G @ J.swapaxes(1, 2))
     M = 1 / np.maximum(1 - values, 1e-9)
-    G, r = axes @ G, (axes @ r[..., None])[..., 0]
-    m, s2 = found.dimensions[met[0]], variances[met]
+    G, r = axes @ G, np.vecdot(axes, r[:, None])
+    s2 = variances[met]
     # a little or much, or as its size tells; what is somebody else's may be anywhere
     own = found.cut[met]
     is_sized = np.isfinite(own[:, 0])
     wide = np.where(is_sized, own[:, 1], np.square(errors.cuts)[:, None])
-    v = np.maximum(np.vstack([wide, np.full(len(own), 1e9)]) / s2, 1.0)
+    v = np.full((len(errors.cuts) + 1, len(own)), 1e9)
+    v[:-1] = wide
+    v = np.maximum(v / s2, 1.0)
     # of those whose sizes tell it is one case
     one = np.eye(len(errors.cuts))[:, :1] * own[:, 0]
     given = np.where(is_sized, one, np.array(errors.chances)[:, None])
-    prior = np.where(v > 1, np.vstack([given, np.zeros(len(own))]), 0.0)
-    prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1]) ** (m / 2)
-    P = M + (v - 1)[..., None]
-    shares = (v - 1)[..., None] / P
-    logs = np.log(np.maximum(prior, 1e-300)) + 0.5 * (M * r**2 * shares).sum(axis=2)
-    logs += 0.5 * np.log(M / P).sum(axis=2) + (1 - m / 2) * np.log(v)
+    prior = np.zeros(v.shape)
+    prior[:-1] = np.where(v[:-1] > 1, given, 0.0)
+    prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1])
+    more = (v - 1)[..., None]
+    P = M + more
+    shares = more / P
+    # half the logarithm of a ratio of determinants, the product of two variances
+    ratios = M / P
+    logs = np.log(np.maximum(prior, 1e-300)) + 0.5 * np.vecdot(M * r**2, shares)
+    logs += 0.5 * np.log(ratios[..., 0] * ratios[..., 1])
     top = max(float(logs.max()), 0.0)
     chances = np.exp(logs - top)
     chances /= math.exp(-top) + chances.sum()
     along, wider = -(M * r * shares), M * shares  # μ and Σ − C by rows of G
-    by_case = (along[..., None] * G).sum(axis=2).reshape(-1, k)
+    by_case = (along.swapaxes(0, 1) @ G).reshape(-1, k)  # (n V, k)
     rows, weights = G.reshape(-1, k), np.vecdot(chances.T[:, None], wider.transpose(1, 2, 0))
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
-    spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
+    spread += by_case.T @ (chances.T.reshape(-1, 1) * by_case)
     whole = 1 - float(chances.sum())
     return spread, _larger(C, spread, G, along, wider, chances, whole, outside)
 
@@ -100,10 +105,9 @@ def _larger(
     means, halves = np.append(mean, np.trace(BC)), np.append(variance, np.vdot(BC, BC.T))
     degrees, limits = means**2 / halves, float(chdtri(len(C), outside)) * means / halves
     shares = np.append(chances, whole)
-    enough = bisect_left(
-        LARGER[:-1], True, key=lambda factor: chdtrc(degrees, factor * limits) @ shares <= outside
-    )
-    return LARGER[enough]
+    # the first or the second of most poses
+    enough = (one for one in LARGER[:-1] if chdtrc(degrees, one * limits) @ shares <= outside)
+    return next(enough, LARGER[-1])
 
 
 def _axes(S: Floats) -> tuple[Floats, Floats]:
@@ -111,5 +115,5 @@ def _axes(S: Floats) -> tuple[Floats, Floats]:
     a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
     angle, half = 0.5 * np.arctan2(2 * b, a - c), 0.5 * np.hypot(a - c, 2 * b)
     x, y, mean = np.cos(angle), np.sin(angle), 0.5 * (a + c)
-    axes = np.stack([x, y, -y, x], axis=1).reshape(-1, 2, 2)
-    return np.stack([mean + half, mean - half], axis=1), axes
+    axes = np.array([x, y, -y, x]).T.reshape(-1, 2, 2)
+    return np.array([mean + half, mean - half]).T, axes

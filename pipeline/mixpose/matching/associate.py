@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ def associate(
     sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
     y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
-    product, detections = np.vecdot(match.sampled[:, 0, :, 0], weights), _detections(views)
+    product, (detections, looks) = np.vecdot(match.sampled[:, 0, :, 0], weights), _observed(views)
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = objective.variances.repeat(y.shape[1], axis=1)
     if body.spread:  # variances along an axis by which features may be off
@@ -73,11 +74,12 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    extra, radii, cut = _looks(views, by, partner, rules.middle)
+    # what two features share is long for that
+    own = looks[np.arange(len(views))[:, None], np.where(partner < 0, by, -1)]
     return Matches(
-        extra=extra,
-        radii=radii,
-        cut=cut,
+        extra=np.where(partner >= 0, rules.middle**2, own[..., 0]),
+        radii=own[..., 1],
+        cut=own[..., 2:],
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,
@@ -107,36 +109,30 @@ def parts_of(count: int, clouds: Sequence[Sequence[int]]) -> Floats | float:
     return parts
 
 
-def _detections(views: Sequence[View]) -> Floats:
-    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has."""
+@lru_cache(maxsize=8)  # of one frame, some poses of which are matched
+def _observed(views: tuple[View, ...]) -> tuple[Floats, Floats]:
+    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has.
+
+    And their looks (L, M + 1, 4), the last of none: the variance by which each errs more than
+    others, σ_ε²; its radius, sensor units, 0 where nobody knows; `Matches.cut`.
+    """
     patterns = [view.observation.pattern for view in views]
     points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
     detections = np.full((len(points), max(map(len, points)) or 1, 2), np.nan)
-    for side, own in zip(detections, points):
+    looks = np.zeros((len(points), detections.shape[1] + 1, 4))
+    looks[..., 2:] = np.nan
+    for side, look, own, view in zip(detections, looks, points, views):
         side[: len(own)] = 0.0
         side[: len(own), : own.shape[1]] = own
-    return detections
-
-
-def _looks(
-    views: Sequence[View], by: Indices, partner: Indices, middle: float
-) -> tuple[Floats, Floats, Floats]:
-    """Variances (L, n) of what meets features beyond noise, σ_ε²; radii, sensor units; `cut`."""
-    extra, radii = np.where(partner >= 0, middle**2, 0.0), np.zeros(by.shape)
-    cut = np.full((*by.shape, 2), np.nan)
-    for k, view in enumerate(views):
-        pattern = view.observation.pattern
+        pattern, sigma = view.observation.pattern, view.observation.sigma
         if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
             continue
-        # what two features share is long for that
-        single = np.flatnonzero((by[k] >= 0) & (partner[k] < 0))
-        deviations = pattern.deviations[by[k, single]] / view.observation.sigma
-        extra[k, single] = deviations * deviations
-        radii[k, single] = pattern.radii[by[k, single]]
+        look[: len(own), 0], look[: len(own), 1] = pattern.deviations / sigma, pattern.radii
         if pattern.cut is not None:
-            chances, errors = pattern.cut[by[k, single]].T
-            cut[k, single] = np.stack([chances, np.square(errors / view.observation.sigma)], axis=1)
-    return extra, radii, cut
+            look[: len(own), 2:] = pattern.cut / [1.0, sigma]
+    looks[..., [0, 3]] *= looks[..., [0, 3]]
+    detections.flags.writeable = looks.flags.writeable = False
+    return detections, looks
 
 
 def _to_nearest(

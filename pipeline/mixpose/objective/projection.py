@@ -21,7 +21,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.records import Floats, Indices, Mask
-from mixpose.sensors import OUTSIDE, Sensor, facing, side_by_side
+from mixpose.sensors import Sensor, facing, hide, side_by_side
 
 _NOTHING = np.array([])
 
@@ -84,13 +84,15 @@ class BodyProjection:
         self._normals, radii = body.node_normals, body.node_radii
         self._radii = radii if radii is not None and radii.any() else None
         self._batch = side_by_side(sensors)
-        self._last = np.zeros((0, 4, 4)), Match(*[_NOTHING] * 5)  # poses, and what they look like
+        self._ranges = np.flatnonzero(self.dimensions == 1)
+        # poses, and what they look like
+        self._last: tuple[bytes | None, Match] = (None, Match(*[_NOTHING] * 5))
 
     def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
         # where a body is expected it is looked for, weighed and fitted from
-        if not np.array_equal(poses, self._last[0]):
-            self._last = poses.copy(), self._project(poses)
+        if (asked := poses.tobytes()) != self._last[0]:
+            self._last = asked, self._project(poses)
         return self._last[1]
 
     def _project(self, poses: Floats) -> Match:
@@ -137,11 +139,10 @@ class BodyProjection:
         visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
         weights /= np.where(visible, total, 1.0)[:, None]
         y, J = (weights[..., None] * y).sum(axis=1), (weights[..., None, None] * J).sum(axis=1)
-        y[~visible], J[~visible] = OUTSIDE, 0.0
-        ranges = np.flatnonzero(self.dimensions == 1)
-        if len(ranges):  # to the centre
+        hide(y, visible, J)
+        if len(self._ranges):  # to the centre
             for own, other in zip((y, J, visible), self._batch.linearise(world), strict=True):
-                own[ranges] = other[ranges]
+                own[self._ranges] = other[self._ranges]
         return y, J, visible
 
 

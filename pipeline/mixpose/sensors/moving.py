@@ -199,4 +199,5 @@ def _turned(points: Floats, vectors: Floats) -> Floats:
     """Points (3, ...) turned by small rotation vectors (3, ...), to the third order."""
     once = cross(vectors, points)
     angle2 = (vectors * vectors).sum(axis=0)
-    return points + (1 - angle2 / 6) * once + (0.5 - angle2 / 24) * cross(vectors, once)
+    turned = points + (1 - angle2 / 6) * once + (0.5 - angle2 / 24) * cross(vectors, once)
+    return np.asarray(turned)
