@@ -59,7 +59,7 @@ def associate(
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
     shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    clouds = clouds_among([view.sensor for view in views])
+    clouds = clouds_among(objective.projection.sensors)
     others = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
@@ -252,7 +252,7 @@ def _surroundings(
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     met = shares.sum(axis=1)
     crowd, others = crowding(detections, lower, around, smallest, met)
-    for planes in clouds_among([view.sensor for view in objective.views]):
+    for planes in clouds_among(objective.projection.sensors):
         points, low, high = (from_planes(one[planes]) for one in (detections, lower, around))
         least = rules.min_region * float(sigmas[planes[0]])
         others[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]

@@ -307,8 +307,9 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     most = sum(degrees) + typical
     common = (sum(squares) + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    drawn = [(s + pull * common) / max(d + pull, 1e-12) for s, d in zip(squares, degrees)]
-    return np.array([max(variance, LEAST_VARIANCE) for variance in drawn])
+    drawn = pull * common
+    pairs, least = zip(squares, degrees), LEAST_VARIANCE
+    return np.array([max((s + drawn) / max(d + pull, 1e-12), least) for s, d in pairs])
 
 
 def residual_ratio(

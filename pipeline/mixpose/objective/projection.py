@@ -24,6 +24,9 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.sensors import Sensor, facing, hide, side_by_side
 
 _NOTHING = np.array([])
+# poses of which what they look like is kept: where identical bodies are expected they are looked
+# for, weighed, and fitted from at some blurs
+_KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -85,15 +88,19 @@ class BodyProjection:
         self._radii = radii if radii is not None and radii.any() else None
         self._batch = side_by_side(sensors)
         self._ranges = np.flatnonzero(self.dimensions == 1)
-        # poses, and what they look like
-        self._last: tuple[bytes | None, Match] = (None, Match(*[_NOTHING] * 5))
+        self._known = dict[bytes, Match]()  # what the last poses look like
 
     def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
-        # where a body is expected it is looked for, weighed and fitted from
-        if (asked := poses.tobytes()) != self._last[0]:
-            self._last = asked, self._project(poses)
-        return self._last[1]
+        known, asked = self._known, poses.tobytes()
+        if asked in known:
+            return known[asked]
+        at = self._project(poses)
+        if len(poses) <= _KEPT:
+            if len(known) >= _KEPT:
+                del known[next(iter(known))]
+            known[asked] = at
+        return at
 
     def _project(self, poses: Floats) -> Match:
         H, n, L = len(poses), self._points.shape[-2], len(self.sensors)

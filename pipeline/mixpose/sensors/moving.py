@@ -32,7 +32,12 @@ class Motion:
     def after(self, seconds: float) -> Floats:
         """Where points go in some seconds, as a motion (4, 4) of the world."""
         twist = (self.velocity + 0.5 * seconds * self.acceleration) * seconds
-        return np.asarray(perturb(self.T_world_object, twist) @ inverse(self.T_world_object))
+        return np.asarray(perturb(self.T_world_object, twist) @ self._back)
+
+    @cached_property
+    def _back(self) -> Floats:
+        """From the world to the body."""
+        return inverse(self.T_world_object)
 
 
 def in_motion(sensor: Sensor, motion: Motion, delay: float, readout: float) -> Sensor:

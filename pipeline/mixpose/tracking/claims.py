@@ -102,7 +102,7 @@ class Claims:
     def _agreed(self, owners: Indices) -> Claims:
         """With owners (D,); a point of a cloud belongs to whom two of its three images give it."""
         owners = owners.copy()
-        for planes in clouds_among([view.sensor for view in self.views]):
+        for planes in clouds_among(tuple([view.sensor for view in self.views])):
             rows = [slice(*self.begins[k : k + 2].tolist()) for k in planes]
             first, second, third = (owners[row] for row in rows)
             both = np.where(second == third, second, -1)

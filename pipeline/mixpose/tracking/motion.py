@@ -152,6 +152,14 @@ class Expected(NamedTuple):
         return Motion(T_world_object, self.velocity, self.acceleration)
 
 
+@lru_cache(maxsize=64)
+def at_rest(body: Body, rules: MotionRules) -> Expected:
+    """Nothing is known of a velocity but how large it may be; not to be written to."""
+    fastest, none = per_kind(body, rules.fastest), np.zeros(6)
+    fastest.flags.writeable = none.flags.writeable = False
+    return Expected(none, none, fastest, none)
+
+
 @dataclass(frozen=True, eq=False)
 class Course:
     """How fast a body goes at its last pose, to which states are relative, and how sure that is.

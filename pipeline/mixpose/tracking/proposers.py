@@ -308,11 +308,11 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
     for one, blur in product(predicted(frame, [])[: max(len(frame.predictions), 1)], blurs):
         start = replace(one, blur=blur)
-        T, seen = met_at(frame, likelihood.fit(start))
+        T, seen = met_at(frame, fit := likelihood.fit(start))
         # where all of a sensor are off it is out of step, and the others no better for it
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
-            yield Start(T, matches=seen)
+            yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
