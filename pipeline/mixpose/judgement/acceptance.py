@@ -166,11 +166,10 @@ def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseMo
     inner = np.ix_(free, free)
     whole = replace(used, shares=used.weights, extra=np.zeros(used.extra.shape))
     C = inverted(information_of(used, pose.variances)[inner])
+    if np.vdot(C, information_of(whole, pose.variances)[inner]) <= rules.open:
+        return False
     usual = np.full(len(used.names), model.usual**2)
-    ratio, by_usual = (
-        float(np.vdot(C, information_of(whole, noise)[inner])) for noise in (pose.variances, usual)
-    )
-    return ratio > rules.open and by_usual > 2 * len(C)
+    return bool(np.vdot(C, information_of(whole, usual)[inner]) > 2 * len(C))
 
 
 def insert(

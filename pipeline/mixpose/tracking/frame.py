@@ -88,7 +88,7 @@ class Frame(Setup):
         ranked: Sequence[ScoredPose],
     ) -> bool:
         """Whether there is a pose, and the most evident is `trusted` by the rules of acceptance."""
-        return any(trusted(best, self.free, self.rules.acceptance) for best in ranked[:1])
+        return bool(ranked) and trusted(ranked[0], self.free, self.rules.acceptance)
 
     @property
     def is_found_at_once(self) -> bool:

@@ -197,13 +197,15 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     variance = max(float(met.offsets @ met.offsets) / degrees, LEAST_VARIANCE)
     # what a pose and an unknown change of the velocity explain as well says nothing of delays
     shifts = met.rows * met.late[:, None] * expected.deviation / np.sqrt(variance)
-    other = np.block([[met.rows, shifts], [np.zeros((6, 6)), np.eye(6)]])
-    other /= np.maximum(np.linalg.norm(other, axis=0), np.finfo(float).tiny)
-    columns = np.pad(late, ((0, 6), (0, 0)))
+    count = len(late)
+    other, columns = np.zeros((count + 6, 12)), np.zeros((count + 6, late.shape[1]))
+    other[:count, :6], other[:count, 6:], other[count:, 6:] = met.rows, shifts, np.eye(6)
+    other /= np.maximum(np.sqrt(np.vecdot(other.T, other.T)), np.finfo(float).tiny)
+    columns[:count] = late
     columns -= other @ np.linalg.lstsq(other, columns, rcond=1e-9)[0]
     information = columns.T @ columns / variance
     estimated = {view.name: view.estimated for view in frame.views}
-    vector = columns[: len(late)].T @ met.offsets / variance
+    vector = columns[:count].T @ met.offsets / variance
     vector += information @ np.array([estimated.get(name, 0.0) for name in names])
     n = len(before.names)
     information[:n, :n] += before.information
