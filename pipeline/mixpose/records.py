@@ -76,7 +76,7 @@ class PointPattern:
         object.__setattr__(self, "weights", weights)
         for name in ("deviations", "radii"):
             if (own := getattr(self, name)).shape != weights.shape:
-                object.__setattr__(self, name, np.broadcast_to(own, weights.shape))
+                object.__setattr__(self, name, np.full(weights.shape, own))
         object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(

@@ -114,8 +114,8 @@ _CUT = (
     Mutant(
         "judgement-nothing-is-cut",
         "judgement/cut.py",
-        "np.where(v[:-1] > 1, given, 0.0)",
-        "0.0",
+        "prior[v <= 1] = 0.0",
+        "prior[v > 0] = 0.0",
         "a pose of few spots is as sure as if none of them could be cut",
         ("test_judgement_cut.py",),
     ),

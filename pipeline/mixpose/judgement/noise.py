@@ -142,7 +142,8 @@ def noise_of(
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
     by_markers = of_each(r[:, None], found).swapaxes(1, 2) @ markers
-    pulls, moved = np.append(rest @ fields, by_markers), drawn[:, :q] / sizes
+    pulls = np.concatenate([rest @ fields, by_markers.ravel()])
+    moved = drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
     spare = float(met @ found.dimensions) - count
     own = np.zeros((4, 5))

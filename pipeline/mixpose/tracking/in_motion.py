@@ -146,12 +146,13 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         # a pose that was climbed to at another velocity is off by as much in all sensors
         blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), 1.0)
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
-    kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
+    kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
+    pull = pull[kept[:2]]
     return Offsets(
-        rows=(matches.J * pull[..., None, None])[kept],
-        late=np.broadcast_to(late[..., None], kept.shape)[kept],
-        offsets=(matches.offsets * pull[..., None])[kept],
-        sensor=np.nonzero(kept)[0],
+        rows=matches.J[kept] * pull[:, None],
+        late=late[kept[:2]],
+        offsets=matches.offsets[kept] * pull,
+        sensor=kept[0],
         unsure=tuple((k, view.unsure) for k, view in enumerate(views) if view.unsure is not None),
     )
 

@@ -159,7 +159,7 @@ def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
 
 def met_features(judged: ScoredPose) -> frozenset[int]:
     """Numbers of the features that any sensor meets."""
-    return frozenset(np.flatnonzero(judged.matches.met_by).tolist())
+    return frozenset(judged.matches.met_by.nonzero()[0].tolist())
 
 
 def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
