@@ -128,7 +128,7 @@ class BodyProjection:
             turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
             middle, axes = world[None, None], turned.reshape(2, 1, count, 3)
         else:
-            towards = np.array([sensor.towards(world) for sensor in self.sensors])
+            towards = self._batch.towards(world)
             squared = np.vecdot(towards, towards)[..., None]
             share = np.minimum(radii**2 / squared, 0.81)  # no sensor is within a sphere
             middle = (world + share * towards)[:, None]

@@ -30,6 +30,10 @@ class SensorBatch(Protocol):
         """
         ...
 
+    def towards(self, points_world: Floats) -> Floats:
+        """Directions (L, n, 3) from points (n, 3) or (L, n, 3) to the sensors, of any length."""
+        ...
+
 
 @lru_cache(maxsize=64)
 def side_by_side(sensors: tuple[Sensor, ...]) -> SensorBatch:
@@ -60,6 +64,11 @@ class MixedBatch:
             y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(each[k])
         return y, J, visible
 
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        each = np.broadcast_to(points_world, (len(self._sensors), *points_world.shape[-2:]))
+        return np.array([one.towards(points) for one, points in zip(self._sensors, each)])
+
 
 class RangeBatch:
     """Range sensors, one row of positions each."""
@@ -81,6 +90,10 @@ class RangeBatch:
         hide(y, visible, J)
         return y, J, visible
 
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        return np.asarray(self._positions - points_world)
+
 
 class PinholeBatch:
     """Pinhole cameras without tilted sensors: one product projects the points into all."""
@@ -97,6 +110,8 @@ class PinholeBatch:
         self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
         self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
         self._R = P[:, None, :, :3]
+        T = np.array([camera.T_sensor_world for camera in cameras])
+        self._centres = -T[:, None, :3, 3] @ T[:, :3, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
@@ -135,6 +150,10 @@ class PinholeBatch:
         y, visible = np.ascontiguousarray(y), in_front & inside.all(axis=2)
         hide(y, visible, J)
         return y, J, visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        return np.asarray(self._centres - points_world)
 
 
 def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:

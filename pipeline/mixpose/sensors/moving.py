@@ -137,6 +137,18 @@ class RollingBatch:
         rows = [(rows_apart(one.sensor), middle_row(one.sensor)) for one in cameras]
         apart, self._middle = np.array(rows).T[..., None]
         self._per_row = np.array([[camera.readout] for camera in cameras]) / apart
+        # places and velocities when the middle rows are read, of the origin and by arms from there
+        ends = np.concatenate([np.zeros((3, 1)), np.eye(3)], axis=1)[:, None]
+        at, speeds, _ = self._moved(ends, self._delay)
+        both = np.concatenate([at, speeds]).swapaxes(0, 1)  # (L, 6, 4)
+        self._of_origin, self._by_arm = both[..., :1], both[..., 1:] - both[..., :1]
+
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`, as of the middle rows."""
+        turns = self._by_arm[:, :3]
+        arms = points_world.T - self._origin.swapaxes(0, 1)
+        at = turns @ arms + self._of_origin[:, :3]
+        return np.asarray(self._still.towards(at.swapaxes(1, 2)) @ turns)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`.
@@ -147,9 +159,9 @@ class RollingBatch:
         per_row, n = self._per_row, points_world.shape[-2]
         x = points_world.reshape(-1, n, 3).transpose(2, 0, 1)
         arms = np.subtract(x, self._origin, order="C")
-        at, speeds, _ = self._moved(arms, self._delay)
-        y, J, visible = self._still.linearise(at.transpose(1, 2, 0))
-        speed = np.vecdot(J[:, :, 1], speeds.transpose(1, 2, 0))
+        early = (self._by_arm @ arms.swapaxes(0, 1) + self._of_origin).swapaxes(1, 2)
+        y, J, visible = self._still.linearise(early[..., :3])
+        speed = np.vecdot(J[:, :, 1], early[..., 3:])
         wanted = per_row * (y[..., 1] - self._middle)
         lag = np.where(visible, wanted / (1 - per_row * speed), 0.0)
         at, speeds, turned = self._moved(arms, self._delay + lag)
