@@ -58,10 +58,24 @@ class PointPattern:
 
     def only(self, chosen: Mask) -> PointPattern:
         """Some of the points (M,)."""
-        fields = self.points, self.weights, self.deviations, self.radii
-        points, weights, deviations, radii = [one[chosen] for one in fields]
-        cut = None if self.cut is None else self.cut[chosen]
-        return PointPattern(points, weights, deviations, radii, cut)
+        return self._with(
+            self.deviations[chosen],
+            None if self.cut is None else self.cut[chosen],
+            points=self.points[chosen],
+            weights=self.weights[chosen],
+            radii=self.radii[chosen],
+        )
+
+    def erring(self, deviations: Floats, cut: Floats | None) -> PointPattern:
+        """With other `deviations` (M,) and `cut` (M, 2)."""
+        return self._with(deviations, cut, points=self.points, weights=self.weights, radii=self.radii)
+
+    def _with(self, deviations: Floats, cut: Floats | None, **fields: Floats) -> PointPattern:
+        """Of what was checked already."""
+        made = object.__new__(PointPattern)
+        is_even = not np.count_nonzero(deviations)
+        made.__dict__.update(fields, deviations=deviations, cut=cut, is_even=is_even)
+        return made
 
     def weighed(self, deviation: float) -> Floats:
         """Weights (M,) as exact as detections are beside those that err by a deviation."""

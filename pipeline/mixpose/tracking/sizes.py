@@ -95,7 +95,7 @@ def weighed_by_size(
         chances = sizes.cut(logs, rules)
         own = np.where(chances > 0.5, moved, 0.0)
         cut = np.array([chances, moved]).T
-        known = replace(pattern, deviations=np.maximum(pattern.deviations, own), cut=cut)
+        known = pattern.erring(np.maximum(pattern.deviations, own), cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
 
