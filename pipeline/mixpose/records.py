@@ -68,7 +68,8 @@ class PointPattern:
 
     def erring(self, deviations: Floats, cut: Floats | None) -> PointPattern:
         """With other `deviations` (M,) and `cut` (M, 2)."""
-        return self._with(deviations, cut, points=self.points, weights=self.weights, radii=self.radii)
+        same = {"points": self.points, "weights": self.weights, "radii": self.radii}
+        return self._with(deviations, cut, **same)
 
     def _with(self, deviations: Floats, cut: Floats | None, **fields: Floats) -> PointPattern:
         """Of what was checked already."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -240,7 +240,7 @@ def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, f
     squares, degrees = ratios.sum(axis=1).tolist()
     factor = (nu + squares) / (nu + degrees)
     rarity = -0.5 * nu * (math.log(factor) + 1 / factor - 1)
-    return at * pooled(ratios, replace(rules, typical=1.0), nu), rarity
+    return at * pooled(ratios, rules, nu, deviation=1.0), rarity
 
 
 def of_each(rows: Floats, found: Matches) -> Floats:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.density import DRAWING, peak
+from mixpose.density import DRAWING, Observation, peak
 from mixpose.matching.matches import Matches
-from mixpose.objective import MatchedObjective, View, in_image
+from mixpose.objective import MatchedObjective, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration, clouds_among, from_planes
@@ -49,7 +49,8 @@ def associate(
     sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
     y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
-    product, (detections, looks) = np.vecdot(match.sampled[:, 0, :, 0], weights), _observed(views)
+    product = np.vecdot(match.sampled[:, 0, :, 0], weights)
+    detections, looks = _observed(tuple([view.observation for view in views]))
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = objective.variances.repeat(y.shape[1], axis=1)
     if body.spread:  # variances along an axis by which features may be off
@@ -110,21 +111,21 @@ def parts_of(count: int, clouds: Sequence[Sequence[int]]) -> Floats | float:
 
 
 @lru_cache(maxsize=8)  # of one frame, some poses of which are matched
-def _observed(views: tuple[View, ...]) -> tuple[Floats, Floats]:
+def _observed(observations: tuple[Observation, ...]) -> tuple[Floats, Floats]:
     """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has.
 
     And their looks (L, M + 1, 4), the last of none: the variance by which each errs more than
     others, σ_ε²; its radius, sensor units, 0 where nobody knows; `Matches.cut`.
     """
-    patterns = [view.observation.pattern for view in views]
+    patterns = [one.pattern for one in observations]
     points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
     detections = np.full((len(points), max(map(len, points)) or 1, 2), np.nan)
     looks = np.zeros((len(points), detections.shape[1] + 1, 4))
     looks[..., 2:] = np.nan
-    for side, look, own, view in zip(detections, looks, points, views):
+    for side, look, own, one in zip(detections, looks, points, observations):
         side[: len(own)] = 0.0
         side[: len(own), : own.shape[1]] = own
-        pattern, sigma = view.observation.pattern, view.observation.sigma
+        pattern, sigma = one.pattern, one.sigma
         if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
             continue
         look[: len(own), 0], look[: len(own), 1] = pattern.deviations / sigma, pattern.radii
