@@ -93,13 +93,13 @@ class BodyProjection:
     def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
         known, asked = self._known, poses.tobytes()
-        if asked in known:
-            return known[asked]
-        at = self._project(poses)
-        if len(poses) <= _KEPT:
-            if len(known) >= _KEPT:
-                del known[next(iter(known))]
-            known[asked] = at
+        if (at := known.get(asked)) is None:
+            at = self._project(poses)
+            if len(poses) <= _KEPT:
+                # runs in other threads may have the same sensors and bodies
+                for oldest in list(known)[: 1 - _KEPT]:
+                    known.pop(oldest, None)
+                known[asked] = at
         return at
 
     def _project(self, poses: Floats) -> Match:
