@@ -274,10 +274,10 @@ def test_least_squares_are_climbed_in_one_step() -> None:
     rng = np.random.default_rng(0)
     J, residuals = rng.standard_normal((12, 4)), rng.standard_normal(12)
     known, free = LinearResiduals(np.eye(4) / 0.3, np.full(4, 0.1)), np.array([1, 1, 0, 1], bool)
-    step = least_squares(LinearResiduals(J, residuals), known).states[0]
+    step = least_squares(LinearResiduals(J, residuals), known)[0]
     both = np.vstack([J, known.J]), np.append(residuals, known.residuals)
     # the damping of what has no curvature, a part in 1e12
     assert np.allclose(step, np.linalg.lstsq(*both)[0], rtol=1e-9)
-    held = least_squares(LinearResiduals(J, residuals), free=free).states[0]
+    held = least_squares(LinearResiduals(J, residuals), free=free)[0]
     assert held[2] == 0
     assert np.allclose(held[free], np.linalg.lstsq(J[:, free], residuals)[0], rtol=1e-9)

@@ -66,6 +66,8 @@ def assert_as_one_by_one(together: SensorBatch, sensors: Sequence[Sensor], point
         # the same sums in another order: rounding of numbers up to 1e4, hence 1e-8 at most
         np.testing.assert_allclose(y[k, :, :m], y_alone, rtol=1e-11, atol=1e-9)
         np.testing.assert_allclose(J[k, :, :m], J_alone, rtol=1e-10, atol=1e-9)
+        towards = together.towards(points)[k]
+        np.testing.assert_allclose(towards, sensor.towards(points), rtol=1e-11, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -58,14 +58,31 @@ class PointPattern:
 
     def only(self, chosen: Mask) -> PointPattern:
         """Some of the points (M,)."""
-        fields = self.points, self.weights, self.deviations, self.radii
-        points, weights, deviations, radii = [one[chosen] for one in fields]
-        cut = None if self.cut is None else self.cut[chosen]
-        return PointPattern(points, weights, deviations, radii, cut)
+        return self._with(
+            self.deviations[chosen],
+            None if self.cut is None else self.cut[chosen],
+            points=self.points[chosen],
+            weights=self.weights[chosen],
+            radii=self.radii[chosen],
+        )
 
-    def weighed(self, deviation: float) -> PointPattern:
-        """With weights as exact as detections are beside those that err by a deviation."""
-        return replace(self, weights=self.weights / (1 + (self.deviations / deviation) ** 2))
+    def erring(self, deviations: Floats, cut: Floats | None) -> PointPattern:
+        """With other `deviations` (M,) and `cut` (M, 2)."""
+        same = {"points": self.points, "weights": self.weights, "radii": self.radii}
+        return self._with(deviations, cut, **same)
+
+    def _with(self, deviations: Floats, cut: Floats | None, **fields: Floats) -> PointPattern:
+        """Of what was checked already."""
+        made = object.__new__(PointPattern)
+        is_even = not np.count_nonzero(deviations)
+        made.__dict__.update(fields, deviations=deviations, cut=cut, is_even=is_even)
+        return made
+
+    def weighed(self, deviation: float) -> Floats:
+        """Weights (M,) as exact as detections are beside those that err by a deviation."""
+        if self.is_even:
+            return self.weights
+        return np.asarray(self.weights / (1 + (self.deviations / deviation) ** 2))
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)
@@ -74,7 +91,7 @@ class PointPattern:
         object.__setattr__(self, "weights", weights)
         for name in ("deviations", "radii"):
             if (own := getattr(self, name)).shape != weights.shape:
-                object.__setattr__(self, name, np.broadcast_to(own, weights.shape))
+                object.__setattr__(self, name, np.full(weights.shape, own))
         object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(

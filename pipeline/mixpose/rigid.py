@@ -24,6 +24,7 @@ from mixpose.records import Floats
 
 TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
+_NEXT = np.array([1, 2, 0])  # of each axis the one that follows
 _CHI2_95 = 7.815  # of three degrees of freedom
 
 
@@ -106,6 +107,11 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
     vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """A × b of vectors with their components first (3, ...): for few quicker than NumPy's own."""
+    return (a * b.take(_NEXT, axis=0) - a.take(_NEXT, axis=0) * b).take(_NEXT, axis=0)
 
 
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:

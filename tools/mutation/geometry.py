@@ -106,15 +106,15 @@ _BATCH = (
     Mutant(
         "sensors-batch-jacobian-without-lens",
         "sensors/batch.py",
-        "J = K @ D @ J",
-        "J = K @ J",
+        "(K @ D.reshape(L, 2, 2 * n)).reshape(L, 2, 2, n)",
+        "K[..., None]",
         "steps of the ascent are wrong by the lens distortion",
     ),
     Mutant(
         "sensors-batch-pixels-without-lens",
         "sensors/batch.py",
-        "y, D = lens.linearise(y)",
-        "_, D = lens.linearise(y)",
+        "y, D = lens.linearise(xy)",
+        "y, D = xy, lens.linearise(xy)[1]",
         "features are predicted where a lens without distortion shows them",
     ),
     Mutant(
@@ -155,8 +155,8 @@ _BATCH = (
     Mutant(
         "sensors-batch-jacobian-without-skew",
         "sensors/batch.py",
-        "K = self._K[:, None, :2, :2]",
-        "K = self._K[:, None, :2, :2] * np.eye(2)",
+        "(K @ D.reshape(L, 2, 2 * n))",
+        "(K * np.eye(2) @ D.reshape(L, 2, 2 * n))",
         "the Jacobian lacks the skew that the pixels have",
     ),
     Mutant(
@@ -270,8 +270,8 @@ _SENSORS = (
     Mutant(
         "sensors-lens-tangential-swapped",
         "sensors/distortion.py",
-        "k[2] * (r2 + 2 * yy) + k[3] * xy2",
-        "k[3] * (r2 + 2 * yy) + k[2] * xy2",
+        "p1, p2 = self.coefficients[2:4]",
+        "p2, p1 = self.coefficients[2:4]",
         "p1 and p2 have changed places",
     ),
     Mutant(

@@ -72,8 +72,8 @@ class Atlas:
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
-            part = pattern if pattern.is_even else pattern.weighed(DRAWING.exact * sigmas[k])
-            share.append(part.weights / part.total)
+            weights = pattern.weighed(DRAWING.exact * sigmas[k])
+            share.append(weights / weights.sum())
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)
         # cells along the part of a tile that is looked up

@@ -177,9 +177,9 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(self.pattern, PointPattern):
-            part, blur = self.pattern, DRAWING.exact * self.blur(sigma, matched=True)
-            part = part if part.is_even else part.weighed(blur)
-            return self_overlap(part.points, part.weights, 2 * sigma**2) / part.total**2
+            weights = self.pattern.weighed(DRAWING.exact * self.blur(sigma, matched=True))
+            overlap = self_overlap(self.pattern.points, weights, 2 * sigma**2)
+            return overlap / float(weights.sum()) ** 2
         g = self.density(sigma, (np.array(-np.inf), np.array(np.inf)))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)

@@ -88,8 +88,9 @@ def length_by_width(contour: Contour) -> float:
     if m["m00"] <= 0:  # a line
         return float(len(contour))
     middle, half = (m["mu20"] + m["mu02"]) / 2, math.hypot((m["mu20"] - m["mu02"]) / 2, m["mu11"])
-    long, short = (4 * max(v, 0.0) / m["m00"] for v in (middle + half, middle - half))
-    return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
+    long, short = max(middle + half, 0.0), max(middle - half, 0.0)
+    scale = 4 / m["m00"]
+    return (math.sqrt(scale * long) + 0.5) / (math.sqrt(scale * short) + 0.5)
 
 
 def is_oval(contour: Contour) -> bool:

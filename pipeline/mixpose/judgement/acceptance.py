@@ -168,11 +168,10 @@ def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseMo
     inner = np.ix_(free, free)
     whole = replace(used, shares=used.weights, extra=np.zeros(used.extra.shape))
     C = inverted(information_of(used, pose.variances)[inner])
+    if np.vdot(C, information_of(whole, pose.variances)[inner]) <= rules.open:
+        return False
     usual = np.full(len(used.names), model.usual**2)
-    ratio, by_usual = (
-        float(np.vdot(C, information_of(whole, noise)[inner])) for noise in (pose.variances, usual)
-    )
-    return ratio > rules.open and by_usual > 2 * len(C)
+    return bool(np.vdot(C, information_of(whole, usual)[inner]) > 2 * len(C))
 
 
 def insert(
@@ -191,7 +190,7 @@ def insert(
             told, other = (new, old) if is_better else (old, new)
             belief = beliefs([told, other])[1]
             if told.spread is None and belief > 1 - rules.confidence:
-                wider = max(belief, 1 / limit) * np.outer(away, away)
+                wider = max(belief, 1 / limit) * away[:, None] * away
                 told = replace(told, covariance=told.covariance + wider)
             ranked[k] = told
             break
@@ -204,10 +203,10 @@ def _are_one(
     a: ScoredPose, b: ScoredPose, away: Floats, free: Mask, limit: float, rules: AcceptanceRules
 ) -> bool:
     """Whether two poses, a twist (6,) apart, are on one peak of which one is not the top."""
-    both = (a.covariance + b.covariance + a.bent)[np.ix_(free, free)]
+    both = (a.covariance + b.covariance + a.bent)[free][:, free]
     inside = bool(away[free] @ inverted(both) @ away[free] < limit)
     # those of a likelihood may be drawn to different priors; tilts of a flat body are two
-    turned = float(np.linalg.norm(away[3:]))
+    turned = math.hypot(*away[3:].tolist())
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 

@@ -15,7 +15,6 @@ and are taken for a multiple of χ² with as much.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -44,66 +43,67 @@ def with_cut_spots(
         return np.zeros(information.shape), 1.0
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = inverted(information + np.diag(1 / known**2))
-    G = J @ C
+    G = (J.reshape(-1, k) @ C).reshape(J.shape)
     values, axes = _axes(G @ J.swapaxes(1, 2))
     M = 1 / np.maximum(1 - values, 1e-9)
-    G, r = axes @ G, (axes @ r[..., None])[..., 0]
-    m, s2 = found.dimensions[met[0]], variances[met]
+    G, r = axes @ G, np.vecdot(axes, r[:, None])
+    s2 = variances[met]
     # a little or much, or as its size tells; what is somebody else's may be anywhere
     own = found.cut[met]
     is_sized = np.isfinite(own[:, 0])
-    wide = np.where(is_sized, own[:, 1], np.square(errors.cuts)[:, None])
-    v = np.maximum(np.vstack([wide, np.full(len(own), 1e9)]) / s2, 1.0)
+    # by spots (n,) and cases (V,)
+    v, prior = np.full((2, len(own), len(errors.cuts) + 1), 1e9)
+    v[:, :-1] = np.where(is_sized[:, None], own[:, 1:], np.square(errors.cuts))
+    v = np.maximum(v / s2[:, None], 1.0)
     # of those whose sizes tell it is one case
-    one = np.eye(len(errors.cuts))[:, :1] * own[:, 0]
-    given = np.where(is_sized, one, np.array(errors.chances)[:, None])
-    prior = np.where(v > 1, np.vstack([given, np.zeros(len(own))]), 0.0)
-    prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1]) ** (m / 2)
-    P = M + (v - 1)[..., None]
-    shares = (v - 1)[..., None] / P
-    logs = np.log(np.maximum(prior, 1e-300)) + 0.5 * (M * r**2 * shares).sum(axis=2)
-    logs += 0.5 * np.log(M / P).sum(axis=2) + (1 - m / 2) * np.log(v)
+    prior[:, :-1] = np.where(is_sized[:, None], 0.0, errors.chances)
+    prior[is_sized, 0] = own[is_sized, 0]
+    prior[v <= 1] = 0.0
+    prior[:, -1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[:, -1])
+    more, M = (v - 1)[..., None], M[:, None]
+    P = M + more
+    shares, ratios = more / P, M / P
+    logs = np.log(np.maximum(prior, 1e-300)) + 0.5 * np.vecdot(M * r[:, None] ** 2, shares)
+    logs += 0.5 * np.log(ratios[..., 0] * ratios[..., 1])
     top = max(float(logs.max()), 0.0)
     chances = np.exp(logs - top)
     chances /= math.exp(-top) + chances.sum()
-    along, wider = -(M * r * shares), M * shares  # μ and Σ − C by rows of G
-    by_case = (along[..., None] * G).sum(axis=2).reshape(-1, k)
-    rows, weights = G.reshape(-1, k), np.vecdot(chances.T[:, None], wider.transpose(1, 2, 0))
+    wider = M * shares  # Σ − C by rows of G, and μ
+    along = -wider * r[:, None]
+    rows, weights = G.reshape(-1, k), chances[:, None] @ wider
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
+    by_case = (along @ G).reshape(-1, k)
     spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
-    whole = 1 - float(chances.sum())
-    return spread, _larger(C, spread, G, along, wider, chances, whole, outside)
+    return spread, _larger(C, spread, G, along, wider, chances, outside)
 
 
 def _larger(
     C: Floats,
     spread: Floats,
     G: Floats,  # (n, 2, k)
-    along: Floats,  # (V, n, 2)
-    wider: Floats,  # (V, n, 2)
-    chances: Floats,  # (V, n)
-    whole: float,  # chance that nothing is cut
+    along: Floats,  # (n, V, 2)
+    wider: Floats,  # (n, V, 2)
+    chances: Floats,  # (n, V); what is left of one is the chance that nothing is cut
     outside: float,
 ) -> float:
     """The factor by which an ellipsoid (k, k) has all but some truths inside."""
     B = inverted(C + spread)
-    BC = B @ C
-    H, K = G @ B @ G.swapaxes(1, 2), G @ BC @ B @ G.swapaxes(1, 2)
-    own, beside = (one.diagonal(axis1=1, axis2=2) for one in (H, K))
-    pulled = (along[..., None, :] @ H)[..., 0, :]
-    mean = np.trace(BC) + np.vecdot(wider, own) + np.vecdot(pulled, along)
-    variance = np.vdot(BC, BC.T) + 2 * np.vecdot(wider, beside)
-    variance += np.vecdot((wider[..., None, :] @ H**2)[..., 0, :], wider)
-    variance += 2 * np.vecdot((along[..., None, :] @ K)[..., 0, :], along)
-    variance += 2 * np.vecdot(pulled**2, wider)
+    BC, GB = B @ C, G.reshape(-1, len(C)) @ B
+    by_B, by_both = GB.reshape(G.shape), (GB @ C).reshape(G.shape)
+    H, K = by_B @ G.swapaxes(1, 2), by_both @ by_B.swapaxes(1, 2)
+    own, beside = (one.diagonal(axis1=1, axis2=2)[:, None] for one in (H, K))
+    pulled, mean, variance = along @ H, np.trace(BC), np.vdot(BC, BC.T)
+    more = np.vecdot(wider, own) + np.vecdot(pulled, along)
+    varied = 2 * np.vecdot(wider, beside) + np.vecdot(wider @ H**2, wider)
+    varied += 2 * np.vecdot(along @ K, along) + 2 * np.vecdot(pulled**2, wider)
     # of half the variances: a multiple of χ² with as many degrees of freedom
-    means, halves = np.append(mean, np.trace(BC)), np.append(variance, np.vdot(BC, BC.T))
+    means = mean + np.concatenate([more.ravel(), [0.0]])
+    halves = variance + np.concatenate([varied.ravel(), [0.0]])
     degrees, limits = means**2 / halves, float(chdtri(len(C), outside)) * means / halves
-    shares = np.append(chances, whole)
-    enough = bisect_left(
-        LARGER[:-1], True, key=lambda factor: chdtrc(degrees, factor * limits) @ shares <= outside
-    )
-    return LARGER[enough]
+    shares = np.concatenate([chances.ravel(), [1 - float(chances.sum())]])
+    # the first or the second of most poses
+    enough = (one for one in LARGER[:-1] if chdtrc(degrees, one * limits) @ shares <= outside)
+    return next(enough, LARGER[-1])
 
 
 def _axes(S: Floats) -> tuple[Floats, Floats]:
@@ -111,5 +111,5 @@ def _axes(S: Floats) -> tuple[Floats, Floats]:
     a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
     angle, half = 0.5 * np.arctan2(2 * b, a - c), 0.5 * np.hypot(a - c, 2 * b)
     x, y, mean = np.cos(angle), np.sin(angle), 0.5 * (a + c)
-    axes = np.stack([x, y, -y, x], axis=1).reshape(-1, 2, 2)
-    return np.stack([mean + half, mean - half], axis=1), axes
+    axes = np.array([x, y, -y, x]).T.reshape(-1, 2, 2)
+    return np.array([mean + half, mean - half]).T, axes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.linalg.lapack import dposv
 
@@ -21,12 +23,20 @@ def inverted(information: Floats) -> Floats:
         return information
     scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-18))
     both = scale[:, None] * scale
-    factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
+    factor, inverse, failure = dposv(information * both, unit(len(scale)))
     if failure or min(factor.diagonal().tolist()) < 1e-5:
         values, vectors = np.linalg.eigh(information * both)
         halves = vectors / np.sqrt(np.maximum(values, _SMALLEST))
         inverse = halves @ halves.T
     return np.asarray(inverse * both)
+
+
+@lru_cache(maxsize=16)
+def unit(size: int) -> Floats:
+    """The unit matrix, not to be written to."""
+    unit = np.eye(size)
+    unit.flags.writeable = False
+    return unit
 
 
 def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:

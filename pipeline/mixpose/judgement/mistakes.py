@@ -129,9 +129,9 @@ def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: Noi
     away = (body.nodes.points @ T[:3, :3].T)[..., None]
     columns[1, :, 0] = model.turned * (by_sensor[..., :3] @ away).ravel()
     moved = np.sqrt(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)) / np.maximum(met, 1e-9))
-    for k in range(L):
-        deviations = np.repeat([model.shifted / max(float(moved[k]), 1e-9), model.turned], 3)
-        columns[k + 2].reshape(L, -1, 6)[k] = rows.reshape(L, -1, 6)[k] * deviations
+    deviations, own = np.full((L, 1, 6), model.turned), range(L)
+    deviations[..., :3] = (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
+    columns[2:].reshape(L, L, -1, 6)[own, own] = rows.reshape(L, -1, 6) * deviations
     return columns
 
 
@@ -190,7 +190,10 @@ def _usual(fields: Floats, lenses: Floats, model: NoiseModel) -> Floats:
 
 def _beside(X: Floats, others: Floats) -> Floats:
     """Columns (K, R, p) with others (R, q), which come last."""
-    return np.concatenate([X, np.broadcast_to(others, (len(X), *others.shape))], axis=2)
+    K, R, p = X.shape
+    both = np.empty((K, R, p + others.shape[-1]))
+    both[..., :p], both[..., p:] = X, others
+    return both
 
 
 def evidence_of(X: Floats, r: Floats, degrees: float, s2: Floats) -> tuple[Floats, Floats]:

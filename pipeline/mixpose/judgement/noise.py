@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -142,7 +142,8 @@ def noise_of(
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
     by_markers = of_each(r[:, None], found).swapaxes(1, 2) @ markers
-    pulls, moved = np.append(rest @ fields, by_markers), drawn[:, :q] / sizes
+    pulls = np.concatenate([rest @ fields, by_markers.ravel()])
+    moved = drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
     spare = float(met @ found.dimensions) - count
     own = np.zeros((4, 5))
@@ -239,7 +240,7 @@ def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, f
     squares, degrees = ratios.sum(axis=1).tolist()
     factor = (nu + squares) / (nu + degrees)
     rarity = -0.5 * nu * (math.log(factor) + 1 / factor - 1)
-    return at * pooled(ratios, replace(rules, typical=1.0), nu), rarity
+    return at * pooled(ratios, rules, nu, deviation=1.0), rarity
 
 
 def of_each(rows: Floats, found: Matches) -> Floats:

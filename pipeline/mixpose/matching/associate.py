@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.density import DRAWING, peak
+from mixpose.density import DRAWING, Observation, peak
 from mixpose.matching.matches import Matches
-from mixpose.objective import MatchedObjective, View, in_image
+from mixpose.objective import MatchedObjective, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration, clouds_among, from_planes
@@ -55,7 +56,8 @@ def associate(
     sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
     y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
-    product, detections = np.vecdot(match.sampled[:, 0, :, 0], weights), _detections(views)
+    product = np.vecdot(match.sampled[:, 0, :, 0], weights)
+    detections, looks = _observed(tuple([view.observation for view in views]))
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = objective.variances.repeat(y.shape[1], axis=1)
     if body.spread:  # variances along an axis by which features may be off
@@ -65,7 +67,7 @@ def associate(
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
     shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    clouds = clouds_among([view.sensor for view in views])
+    clouds = clouds_among(objective.projection.sensors)
     others = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
@@ -80,11 +82,15 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    extra, radii, cut = _looks(views, y, seen & (shares == 0), by, partner, rules)
+    # what two features share is long for that
+    own = looks[np.arange(len(views))[:, None], np.where(partner < 0, by, -1)]
+    extra = own[..., 0] + rules.both * _beside(y, seen & (shares == 0), own[..., 1]) / (
+        4 * (sigmas * sigmas)[:, None]
+    )
     return Matches(
-        extra=extra,
-        radii=radii,
-        cut=cut,
+        extra=np.where(partner >= 0, rules.middle**2, extra),
+        radii=own[..., 1],
+        cut=own[..., 2:],
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,
@@ -114,50 +120,46 @@ def parts_of(count: int, clouds: Sequence[Sequence[int]]) -> Floats | float:
     return parts
 
 
-def _detections(views: Sequence[View]) -> Floats:
-    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has."""
-    patterns = [view.observation.pattern for view in views]
+@lru_cache(maxsize=8)  # of one frame, some poses of which are matched
+def _observed(observations: tuple[Observation, ...]) -> tuple[Floats, Floats]:
+    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has.
+
+    And their looks (L, M + 1, 4), the last of none: the variance by which each errs more than
+    others, σ_ε²; its radius, sensor units, 0 where nobody knows; `Matches.cut`.
+    """
+    patterns = [one.pattern for one in observations]
     points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
     detections = np.full((len(points), max(map(len, points)) or 1, 2), np.nan)
-    for side, own in zip(detections, points):
+    looks = np.zeros((len(points), detections.shape[1] + 1, 4))
+    looks[..., 2:] = np.nan
+    for side, look, own, one in zip(detections, looks, points, observations):
         side[: len(own)] = 0.0
         side[: len(own), : own.shape[1]] = own
-    return detections
-
-
-def _looks(
-    views: Sequence[View],
-    y: Floats,
-    missed: Mask,
-    by: Indices,
-    partner: Indices,
-    rules: AssociationRules,
-) -> tuple[Floats, Floats, Floats]:
-    """Variances (L, n) of what meets features beyond noise, σ_ε²; radii, sensor units; `cut`.
-
-    A spot shows another feature that is missed within its radius as likely as not: the two of them
-    look whole, and it is at their middle.
-    """
-    extra, radii = np.where(partner >= 0, rules.middle**2, 0.0), np.zeros(by.shape)
-    cut = np.full((*by.shape, 2), np.nan)
-    for k, view in enumerate(views):
-        pattern = view.observation.pattern
+        pattern, sigma = one.pattern, one.sigma
         if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
             continue
-        # what two features share is long for that
-        single = np.flatnonzero((by[k] >= 0) & (partner[k] < 0))
-        deviations = pattern.deviations[by[k, single]] / view.observation.sigma
-        extra[k, single] = deviations * deviations
-        radii[k, single] = pattern.radii[by[k, single]]
-        if missed[k].any():
-            away = y[k, single, None] - y[k, missed[k]]
-            squared = np.vecdot(away, away)
-            beside = np.where(squared < radii[k, single, None] ** 2, squared, 0.0).max(axis=1)
-            extra[k, single] += rules.both * beside / (2 * view.observation.sigma) ** 2
+        look[: len(own), 0], look[: len(own), 1] = pattern.deviations / sigma, pattern.radii
         if pattern.cut is not None:
-            chances, errors = pattern.cut[by[k, single]].T
-            cut[k, single] = np.stack([chances, np.square(errors / view.observation.sigma)], axis=1)
-    return extra, radii, cut
+            look[: len(own), 2:] = pattern.cut / [1.0, sigma]
+    looks[..., [0, 3]] *= looks[..., [0, 3]]
+    detections.flags.writeable = looks.flags.writeable = False
+    return detections, looks
+
+
+def _beside(y: Floats, missed: Mask, radii: Floats) -> Floats:
+    """Squared distances (L, n) from features at y (L, n, 2) to missed ones within their spots.
+
+    The farthest, and 0 without any.  Such a spot shows both as likely as not: the two of them look
+    whole, and it is at their middle.
+    """
+    farthest = np.zeros(radii.shape)
+    for k in np.flatnonzero(missed.any(axis=1) & radii.any(axis=1)).tolist():
+        sized = np.flatnonzero(radii[k])
+        away = y[k, sized, None] - y[k, missed[k]]
+        squared = np.vecdot(away, away)
+        within = np.where(squared < radii[k, sized, None] ** 2, squared, 0.0)
+        farthest[k, sized] = within.max(axis=1)
+    return farthest
 
 
 def _to_nearest(
@@ -295,7 +297,7 @@ def _surroundings(
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     met = shares.sum(axis=1)
     crowd, others = crowding(detections, lower, around, smallest, met)
-    for planes in clouds_among([view.sensor for view in objective.views]):
+    for planes in clouds_among(objective.projection.sensors):
         points, low, high = (from_planes(one[planes]) for one in (detections, lower, around))
         least = rules.min_region * float(sigmas[planes[0]])
         others[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]

@@ -298,17 +298,21 @@ def log_likelihood(
     return float((matches.shares * np.log1p(odds)).sum()) + price
 
 
-def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
+def pooled(
+    sums: Floats, rules: ErrorRules, typical: float, deviation: float | None = None
+) -> Floats:
     """Variances (L,) of squares and degrees of freedom (2, L), each drawn to that of all sensors.
 
-    In that the typical variance counts as `typical` degrees of freedom.
+    In that the typical variance, or that of another deviation, counts as `typical` degrees.
     """
+    deviation = rules.typical if deviation is None else deviation
     squares, degrees = sums.tolist()
     most = sum(degrees) + typical
-    common = (sum(squares) + typical * rules.typical**2) / max(most, 1e-12)
+    common = (sum(squares) + typical * deviation**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    drawn = [(s + pull * common) / max(d + pull, 1e-12) for s, d in zip(squares, degrees)]
-    return np.array([max(variance, LEAST_VARIANCE) for variance in drawn])
+    drawn = pull * common
+    pairs, least = zip(squares, degrees), LEAST_VARIANCE
+    return np.array([max((s + drawn) / max(d + pull, 1e-12), least) for s, d in pairs])
 
 
 def residual_ratio(

@@ -20,7 +20,7 @@ Where features overlap it is Gauss-Newton's of the residual g − a h,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -128,6 +128,8 @@ class MatchedObjective:
     weights: Floats  # (L, 1) ω_l; (L, K)
     # where several bodies were looked up at once: the body's pose, and what it has there
     at_hand: tuple[Floats, Match] | None = None
+    # what was looked up last, if anything: a pose is asked whether it is near, and climbed from
+    looked_up: list[Match] = field(default_factory=list, repr=False)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
@@ -158,12 +160,12 @@ class MatchedObjective:
         """What is predicted at poses (H, 4, 4), and what is there."""
         if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0]):
             return self.at_hand[1]
-        at = self.projection.project(poses)
-        return Match(
-            *at[:5],
-            self.atlas.look_up(at.y),
-            *overlaps(at.y, at.weights, self.variances, self.tops),
-        )
+        at, known = self.projection.project(poses), self.looked_up
+        if not (known and known[0].y is at.y):
+            sampled = self.atlas.look_up(at.y)
+            lap = overlaps(at.y, at.weights, self.variances, self.tops)
+            known[:] = [Match(*at[:5], sampled, *lap)]
+        return known[0]
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""

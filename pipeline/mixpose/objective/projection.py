@@ -21,9 +21,12 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.records import Floats, Indices, Mask
-from mixpose.sensors import OUTSIDE, Sensor, facing, side_by_side
+from mixpose.sensors import Sensor, facing, hide, side_by_side
 
 _NOTHING = np.array([])
+# poses of which what they look like is kept: where identical bodies are expected they are looked
+# for, weighed, and fitted from at some blurs
+_KEPT = 8
 
 
 @dataclass(frozen=True)
@@ -84,14 +87,20 @@ class BodyProjection:
         self._normals, radii = body.node_normals, body.node_radii
         self._radii = radii if radii is not None and radii.any() else None
         self._batch = side_by_side(sensors)
-        self._last = np.zeros((0, 4, 4)), Match(*[_NOTHING] * 5)  # poses, and what they look like
+        self._ranges = np.flatnonzero(self.dimensions == 1)
+        self._known = dict[bytes, Match]()  # what the last poses look like
 
     def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
-        # where a body is expected it is looked for, weighed and fitted from
-        if not np.array_equal(poses, self._last[0]):
-            self._last = poses.copy(), self._project(poses)
-        return self._last[1]
+        known, asked = self._known, poses.tobytes()
+        if (at := known.get(asked)) is None:
+            at = self._project(poses)
+            if len(poses) <= _KEPT:
+                # runs in other threads may have the same sensors and bodies
+                for oldest in list(known)[: 1 - _KEPT]:
+                    known.pop(oldest, None)
+                known[asked] = at
+        return at
 
     def _project(self, poses: Floats) -> Match:
         H, n, L = len(poses), self._points.shape[-2], len(self.sensors)
@@ -119,7 +128,7 @@ class BodyProjection:
             turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
             middle, axes = world[None, None], turned.reshape(2, 1, count, 3)
         else:
-            towards = np.array([sensor.towards(world) for sensor in self.sensors])
+            towards = self._batch.towards(world)
             squared = np.vecdot(towards, towards)[..., None]
             share = np.minimum(radii**2 / squared, 0.81)  # no sensor is within a sphere
             middle = (world + share * towards)[:, None]
@@ -137,11 +146,10 @@ class BodyProjection:
         visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
         weights /= np.where(visible, total, 1.0)[:, None]
         y, J = (weights[..., None] * y).sum(axis=1), (weights[..., None, None] * J).sum(axis=1)
-        y[~visible], J[~visible] = OUTSIDE, 0.0
-        ranges = np.flatnonzero(self.dimensions == 1)
-        if len(ranges):  # to the centre
+        hide(y, visible, J)
+        if len(self._ranges):  # to the centre
             for own, other in zip((y, J, visible), self._batch.linearise(world), strict=True):
-                own[ranges] = other[ranges]
+                own[self._ranges] = other[self._ranges]
         return y, J, visible
 
 

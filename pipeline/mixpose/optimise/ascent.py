@@ -227,15 +227,19 @@ def _steps(
 
 def _step(C: Floats, g: Floats, damping: float) -> tuple[Floats, list[float]]:
     """The step (1, q) of one state, and its gain: a quarter of the time of `_many_steps`."""
+    step = solved(C, g, damping)
+    return step[None], [float(step @ (g - 0.5 * (C @ step)))]
+
+
+def solved(C: Floats, g: Floats, damping: float) -> Floats:
+    """The step (q,) of a model of gradient g (q,) and curvature C (q, q), damped."""
     diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
     floor = _TINY + max(diagonal.tolist()) * 1e-12 * damping
     A = C.copy()
     A.reshape(-1)[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
     _, step, failure = dposv(A, g)
-    if failure:
-        step = np.linalg.solve(A, g)
-    return step[None], [float(step @ (g - 0.5 * (C @ step)))]
+    return np.asarray(np.linalg.solve(A, g) if failure else step)
 
 
 def _many_steps(C: Floats, g: Floats, damping: list[float]) -> tuple[Floats, list[float]]:

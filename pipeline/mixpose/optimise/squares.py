@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.optimise.ascent import Ascent, NewtonOptions, Quadratic, Sum, ascend
+from mixpose.optimise.ascent import Quadratic, solved
 from mixpose.records import Floats, Mask
 
 
@@ -17,21 +17,25 @@ def squares_of(residuals: Floats, J: Floats) -> Quadratic:
     return Quadratic(-0.5 * (residuals**2).sum(axis=1), gradient, columns @ J)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearResiduals:
-    """Minus half the squares of what steps (H, q) leave of residuals."""
+class LinearResiduals(NamedTuple):
+    """Residuals that a step (q,) lowers by J times it."""
 
     J: Floats  # (K, q)
     residuals: Floats  # (K,)
 
-    def linearise(self, steps: Floats) -> Quadratic:
-        """Second-order models at steps (H, q), which are exact."""
-        J = np.broadcast_to(self.J, (len(steps), *self.J.shape))
-        return squares_of(self.residuals - steps @ self.J.T, J)
 
+def least_squares(*terms: LinearResiduals, free: Mask | None = None) -> tuple[Floats, Floats]:
+    """The step (q,) that leaves the least squares of all terms, and its information (q, q).
 
-def least_squares(*terms: LinearResiduals, free: Mask | None = None) -> Ascent:
-    """The step (1, q), in free directions or all, that leaves the least squares of all terms."""
-    step, options = np.zeros((1, terms[0].J.shape[1])), NewtonOptions(1, 0.0, 0.0, unchecked=True)
-    every = np.ones(step.shape[1], dtype=np.bool_)
-    return ascend(Sum(terms), step, np.add, every if free is None else free, options)
+    In free directions, or all; those that nothing tells of stay where they are.
+    """
+    first, *rest = terms
+    information, gradient = first.J.T @ first.J, first.J.T @ first.residuals
+    for one in rest:
+        information = information + one.J.T @ one.J
+        gradient = gradient + one.J.T @ one.residuals
+    if free is None:
+        return solved(information, gradient, 0.0), information
+    known = free.astype(np.float64)
+    step = solved(information * (known * known[:, None]), gradient * known, 0.0)
+    return step, information

@@ -151,7 +151,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         boxes_of = points, lower[:, k], upper[:, k], smallest, shares[:, k].sum(axis=1)
         in_view, in_space = crowding(*boxes_of)
         crowd[:, k], others[:, k] = in_view * sigma**2, in_space * sigma**3
-    clouds = clouds_among([one.view.sensor for one in sensors])
+    clouds = clouds_among(tuple([one.view.sensor for one in sensors]))
     for planes in clouds:
         points = from_planes(np.array([sensors[k].points for k in planes]))
         low, high = (from_planes(one[:, planes].swapaxes(0, 1)) for one in (lower, upper))
@@ -190,7 +190,7 @@ def _met_in_space(
 ) -> dict[int, tuple[Indices, Indices, Indices]]:
     """By sensor what `_pairs` gives, for images of clouds: the same in all three."""
     sensors, pairs = problem.detections, dict[int, tuple[Indices, Indices, Indices]]()
-    for planes in clouds_among([one.view.sensor for one in sensors]):
+    for planes in clouds_among(tuple([one.view.sensor for one in sensors])):
         points = from_planes(np.array([sensors[k].points for k in planes]))
         places = from_planes(y[:, planes].swapaxes(0, 1))
         found = _pairs(places, seen[:, planes[0]], points, problem.reach(sensors[planes[0]]))

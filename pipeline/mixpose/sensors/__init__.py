@@ -5,7 +5,12 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 
 from __future__ import annotations
 
-from mixpose.sensors.base import OUTSIDE as OUTSIDE, AffineSensor as AffineSensor, Sensor as Sensor
+from mixpose.sensors.base import (
+    OUTSIDE as OUTSIDE,
+    AffineSensor as AffineSensor,
+    Sensor as Sensor,
+    hide as hide,
+)
 from mixpose.sensors.batch import SensorBatch as SensorBatch
 from mixpose.sensors.cloud import (
     PLANES as PLANES,

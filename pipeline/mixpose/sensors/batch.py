@@ -30,6 +30,10 @@ class SensorBatch(Protocol):
         """
         ...
 
+    def towards(self, points_world: Floats) -> Floats:
+        """Directions (L, n, 3) from points (n, 3) or (L, n, 3) to the sensors, of any length."""
+        ...
+
 
 @lru_cache(maxsize=64)
 def side_by_side(sensors: tuple[Sensor, ...]) -> SensorBatch:
@@ -60,6 +64,11 @@ class MixedBatch:
             y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(each[k])
         return y, J, visible
 
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        each = np.broadcast_to(points_world, (len(self._sensors), *points_world.shape[-2:]))
+        return np.array([one.towards(points) for one, points in zip(self._sensors, each)])
+
 
 class RangeBatch:
     """Range sensors, one row of positions each."""
@@ -81,6 +90,10 @@ class RangeBatch:
         hide(y, visible, J)
         return y, J, visible
 
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        return np.asarray(self._positions - points_world)
+
 
 class PinholeBatch:
     """Pinhole cameras without tilted sensors: one product projects the points into all."""
@@ -96,6 +109,9 @@ class PinholeBatch:
             P = self._K @ P
         self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
         self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
+        self._R = P[:, None, :, :3]
+        T = np.array([camera.T_sensor_world for camera in cameras])
+        self._centres = -T[:, None, :3, 3] @ T[:, :3, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
@@ -109,25 +125,35 @@ class PinholeBatch:
         if np.count_nonzero(in_front) < in_front.size:
             depth = np.where(in_front, depth, 1.0)
         inverse_depth = 1.0 / depth
-        y = (points[:, :2] * inverse_depth[:, None]).swapaxes(1, 2)
-        lens = self._lens
-        if lens is not None:
-            in_front &= (y * y).sum(axis=2) < lens.radius_limit**2
-            # polynomials of huge radii overflow; hidden points are overwritten anyway
-            y = np.where(in_front[..., None], y, 0.0)
-        J = self._upper_rows - y[..., None] * self._last_row
-        J *= inverse_depth[..., None, None]
-        if lens is not None:
-            K = self._K[:, None, :2, :2]
-            y, D = lens.linearise(y)
-            J = K @ D @ J
-            y = (K @ y[..., None])[..., 0] + self._K[:, None, :2, 2]
+        xy, lens = points[:, :2] * inverse_depth[:, None], self._lens
+        y = xy.swapaxes(1, 2)
+        if lens is None:
+            J = self._upper_rows - y[..., None] * self._last_row
+            J *= inverse_depth[..., None, None]
+        else:
+            in_front &= (xy * xy).sum(axis=1) < lens.radius_limit**2
+            if np.count_nonzero(in_front) < in_front.size:
+                # polynomials of huge radii overflow; hidden points are overwritten anyway
+                xy = np.where(in_front[:, None], xy, 0.0)
+            y, D = lens.linearise(xy)
+            K, (L, _, n) = self._K[:, :2, :2], y.shape
+            y = (K @ y + self._K[:, :2, 2:]).swapaxes(1, 2)
+            # by points before the camera: x / z and y / z fall as z grows
+            by_point = np.empty((L, 2, 3, n))
+            by_point[:, :, :2] = (K @ D.reshape(L, 2, 2 * n)).reshape(L, 2, 2, n)
+            by_point[:, :, 2] = -(by_point[:, :, :2] * xy[:, None]).sum(axis=2)
+            by_point *= inverse_depth[:, None, None]
+            J = by_point.transpose(0, 3, 1, 2) @ self._R
         inside = np.abs(y - self._middle) <= self._half
         if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
             return y, J, in_front
         y, visible = np.ascontiguousarray(y), in_front & inside.all(axis=2)
         hide(y, visible, J)
         return y, J, visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`."""
+        return np.asarray(self._centres - points_world)
 
 
 def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:

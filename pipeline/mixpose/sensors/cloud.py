@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal, Self
 
 import numpy as np
@@ -91,7 +91,8 @@ class CloudSensor:
         return replace(self, T_sensor_world=self.T_sensor_world @ motion)
 
 
-def clouds_among(sensors: Sequence[Sensor]) -> list[list[int]]:
+@lru_cache(maxsize=64)
+def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
     """Where the three images of each cloud are among sensors, in the order of `PLANES`."""
     groups: dict[object, list[int]] = {}
     for k, sensor in enumerate(sensors):

@@ -22,8 +22,7 @@ _COUNT = 14
 class LensDistortion:
     """OpenCV's distortion of a pinhole camera."""
 
-    # (14,) or (14, ...) in OpenCV's order; further axes broadcast as points do
-    coefficients: Floats
+    coefficients: Floats  # (14,) in OpenCV's order, or (14, L, 1) of L lenses side by side
     # Normalised radius up to which the radial polynomial grows. Beyond it a model fitted to the
     # image folds back and would show points that no lens images.
     radius_limit: float | Floats
@@ -46,66 +45,54 @@ class LensDistortion:
         k = self.coefficients
         return bool(k[5:8].any()), bool(k[8:12].any()), bool(k[12:].any())
 
+    @cached_property
+    def _tangential(self) -> tuple[Floats, Floats]:
+        """What products of coordinates add to these (..., 2, 4), and they to slopes (..., 4, 2)."""
+        p1, p2 = self.coefficients[2:4]
+        none = np.zeros_like(p1)
+        by_products = [[3 * p2, 2 * p1, none, p2], [p1, 2 * p2, none, 3 * p1]]
+        by_places = [[6 * p2, 2 * p1], [2 * p1, 2 * p2], [2 * p1, 2 * p2], [2 * p2, 6 * p1]]
+        first, second = (
+            np.moveaxis(rows[..., 0] if rows.ndim > 2 else rows, [0, 1], [-2, -1])
+            for rows in (np.array(by_products), np.array(by_places))
+        )
+        return first, second
+
     def apply(self, xy: Floats) -> Floats:
-        """Distort normalised coordinates (..., 2)."""
-        k, products = self.coefficients, _products(xy)
-        r2 = products[-1]
-        radial = _polynomial(r2, k[0], k[1], k[4])
-        if self._parts[0]:
-            radial = radial / _polynomial(r2, k[5], k[6], k[7])
-        flat = self._on_flat(xy, radial, *products)
-        return self._tilted(flat)[0] if self._parts[2] else flat
+        """Distort normalised coordinates (..., 2, n)."""
+        return self.linearise(xy)[0]
 
     def linearise(self, xy: Floats) -> tuple[Floats, Floats]:
-        """As `apply`, with its Jacobian (..., 2, 2)."""
+        """As `apply`, with its Jacobian (..., 2, 2, n)."""
         k, (is_rational, has_prisms, is_tilted) = self.coefficients, self._parts
-        x, y = xy[..., 0], xy[..., 1]
-        xx, yy, xy2, r2 = products = _products(xy)
+        products = xy[..., :, None, :] * xy[..., None, :, :]
+        products = products.reshape(*xy.shape[:-2], 4, -1)  # x², xy, xy and y²
+        r2 = products[..., 0, :] + products[..., 3, :]
         radial, slope = _polynomial(r2, k[0], k[1], k[4]), _derivative(r2, k[0], k[1], k[4])
         if is_rational:
             bottom = _polynomial(r2, k[5], k[6], k[7])
             radial = radial / bottom
             slope = (slope - radial * _derivative(r2, k[5], k[6], k[7])) / bottom
-        slope2 = 2 * slope  # of the radial factor, by r²
-        D = np.empty((*xy.shape, 2))
-        D[..., 0, 0] = radial + slope2 * xx + 2 * k[2] * y + 6 * k[3] * x
-        D[..., 0, 1] = D[..., 1, 0] = slope * xy2 + 2 * k[2] * x + 2 * k[3] * y
-        D[..., 1, 1] = radial + slope2 * yy + 6 * k[2] * y + 2 * k[3] * x
+        by_products, by_places = self._tangential
+        y = radial[..., None, :] * xy + by_products @ products
+        # of the radial factor, by r², and by x and y
+        D = 2 * slope[..., None, :] * products + by_places @ xy
+        D[..., ::3, :] += radial[..., None, :]
+        D = D.reshape(*xy.shape[:-1], 2, -1)
         if has_prisms:
-            by_r2 = np.stack([k[8] + 2 * r2 * k[9], k[10] + 2 * r2 * k[11]], axis=-1)
-            D += by_r2[..., :, None] * (2 * xy[..., None, :])
-        flat = self._on_flat(xy, radial, *products)
-        if not is_tilted:
-            return flat, D
-        tilted, by_flat = self._tilted(flat)
-        return tilted, by_flat @ D
+            prism = np.stack([k[8] + r2 * k[9], k[10] + r2 * k[11]], axis=-2)
+            by_r2 = np.stack([k[8] + 2 * r2 * k[9], k[10] + 2 * r2 * k[11]], axis=-2)
+            y += r2[..., None, :] * prism
+            D += 2 * by_r2[..., None, :] * xy[..., None, :, :]
+        return self._tilted(y, D) if is_tilted else (y, D)
 
-    def _on_flat(
-        self, xy: Floats, radial: Floats, xx: Floats, yy: Floats, xy2: Floats, r2: Floats
-    ) -> Floats:
-        """Coordinates (..., 2) on a sensor that is not tilted."""
-        k, flat = self.coefficients, np.empty_like(xy)
-        flat[..., 0] = xy[..., 0] * radial + k[2] * xy2 + k[3] * (r2 + 2 * xx)
-        flat[..., 1] = xy[..., 1] * radial + k[2] * (r2 + 2 * yy) + k[3] * xy2
-        if self._parts[1]:
-            flat[..., 0] += r2 * (k[8] + r2 * k[9])
-            flat[..., 1] += r2 * (k[10] + r2 * k[11])
-        return flat
-
-    def _tilted(self, flat: Floats) -> tuple[Floats, Floats]:
-        """Coordinates (..., 2) on a tilted sensor, and their Jacobian by those on a flat one."""
+    def _tilted(self, y: Floats, D: Floats) -> tuple[Floats, Floats]:
+        """Coordinates (2, n) on a tilted sensor by those on a flat one, with the Jacobian."""
         M = _tilt_matrix(self.coefficients[12], self.coefficients[13])
-        h = flat @ M[:, :2].T + M[:, 2]
-        tilted = h[..., :2] / h[..., 2:]
-        inner = M[:2, :2] - tilted[..., :, None] * M[2, :2]
-        return tilted, np.asarray(inner / h[..., 2, None, None])
-
-
-def _products(xy: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """x², y², 2 x y and r² of coordinates (..., 2)."""
-    x, y = xy[..., 0], xy[..., 1]
-    xx, yy = x * x, y * y
-    return xx, yy, 2 * x * y, xx + yy
+        h = M[:, :2] @ y + M[:, 2:]
+        tilted = h[:2] / h[2]
+        by_flat = (M[:2, :2, None] - tilted[:, None] * M[2, :2, None]) / h[2]
+        return tilted, (by_flat[:, :, None] * D).sum(axis=1)
 
 
 def _polynomial(r2: Floats, a: Floats | float, b: Floats | float, c: Floats | float) -> Floats:

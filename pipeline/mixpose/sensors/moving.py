@@ -14,7 +14,7 @@ from typing import Literal, Self
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.rigid import inverse, perturb
+from mixpose.rigid import cross, inverse, perturb
 from mixpose.sensors import batch
 from mixpose.sensors.base import Sensor
 from mixpose.sensors.rays import Rays
@@ -32,7 +32,12 @@ class Motion:
     def after(self, seconds: float) -> Floats:
         """Where points go in some seconds, as a motion (4, 4) of the world."""
         twist = (self.velocity + 0.5 * seconds * self.acceleration) * seconds
-        return np.asarray(perturb(self.T_world_object, twist) @ inverse(self.T_world_object))
+        return np.asarray(perturb(self.T_world_object, twist) @ self._back)
+
+    @cached_property
+    def _back(self) -> Floats:
+        """From the world to the body."""
+        return inverse(self.T_world_object)
 
 
 def in_motion(sensor: Sensor, motion: Motion, delay: float, readout: float) -> Sensor:
@@ -124,13 +129,26 @@ class RollingBatch:
     def __init__(self, cameras: Sequence[RollingSensor]) -> None:
         motions = [camera.motion for camera in cameras]
         self._still = batch.side_by_side(tuple([camera.sensor for camera in cameras]))
-        self._origin = np.array([one.T_world_object[:3, 3] for one in motions])[:, None]
-        self._velocity = np.array([one.velocity for one in motions])[:, None]
-        self._acceleration = np.array([one.acceleration for one in motions])[:, None]
+        # components first, then sensors: (3, L, 1) and (6, L, 1)
+        self._origin = np.array([one.T_world_object[:3, 3] for one in motions]).T[..., None]
+        self._velocity = np.array([one.velocity for one in motions]).T[..., None]
+        self._acceleration = np.array([one.acceleration for one in motions]).T[..., None]
         self._delay = np.array([[camera.delay] for camera in cameras])
         rows = [(rows_apart(one.sensor), middle_row(one.sensor)) for one in cameras]
         apart, self._middle = np.array(rows).T[..., None]
         self._per_row = np.array([[camera.readout] for camera in cameras]) / apart
+        # places and velocities when the middle rows are read, of the origin and by arms from there
+        ends = np.concatenate([np.zeros((3, 1)), np.eye(3)], axis=1)[:, None]
+        at, speeds, _ = self._moved(ends, self._delay)
+        both = np.concatenate([at, speeds]).swapaxes(0, 1)  # (L, 6, 4)
+        self._of_origin, self._by_arm = both[..., :1], both[..., 1:] - both[..., :1]
+
+    def towards(self, points_world: Floats) -> Floats:
+        """As `SensorBatch.towards`, as of the middle rows."""
+        turns = self._by_arm[:, :3]
+        arms = points_world.T - self._origin.swapaxes(0, 1)
+        at = turns @ arms + self._of_origin[:, :3]
+        return np.asarray(self._still.towards(at.swapaxes(1, 2)) @ turns)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`.
@@ -138,34 +156,35 @@ class RollingBatch:
         The moment t solves t = moment of the row that is seen at t.  One Newton step from the
         middle row leaves the square of the share of the readout in which the image moves a row.
         """
-        L, per_row = len(self._delay), self._per_row
-        x = np.broadcast_to(points_world, (L, *points_world.shape[-2:]))
-        at, speeds, _ = self._moved(x, self._delay)
-        y, J, visible = self._still.linearise(at)
-        speed = (J[:, :, 1] * speeds).sum(axis=2)
+        per_row, n = self._per_row, points_world.shape[-2]
+        x = points_world.reshape(-1, n, 3).transpose(2, 0, 1)
+        arms = np.subtract(x, self._origin, order="C")
+        early = (self._by_arm @ arms.swapaxes(0, 1) + self._of_origin).swapaxes(1, 2)
+        y, J, visible = self._still.linearise(early[..., :3])
+        speed = np.vecdot(J[:, :, 1], early[..., 3:])
         wanted = per_row * (y[..., 1] - self._middle)
         lag = np.where(visible, wanted / (1 - per_row * speed), 0.0)
-        at, speeds, R = self._moved(x, self._delay + lag)
-        y, J, visible = self._still.linearise(at)
-        by_time = (J @ speeds[..., None])[..., 0]
-        J = J @ R
+        at, speeds, turned = self._moved(arms, self._delay + lag)
+        y, J, visible = self._still.linearise(at.transpose(1, 2, 0))
+        by_place = J.transpose(3, 2, 0, 1)  # (3, 2, L, n)
+        by_time = (by_place * speeds[:, None]).sum(axis=0)
+        by_point = _turned(by_place, -turned[:, None])
         # as t moves with the row, so does the image: y(x, t(x))
-        by_point = J[:, :, 1] * (per_row / (1 - per_row * by_time[..., 1]))[..., None]
-        return y, J + by_time[..., None] * by_point[:, :, None], visible
+        by_row = by_point[:, 1] * (per_row / (1 - per_row * by_time[1]))
+        by_point += by_time * by_row[:, None]
+        return y, by_point.transpose(2, 3, 1, 0), visible
 
-    def _moved(self, x: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points (L, n, 3) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
+    def _moved(self, arms: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+        """Points (3, L, n) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
 
-        Velocities (L, n, 3) are those of points of the body, but for how far its origin moved.
+        Of arms (3, L, n) from the body's origin.  Velocities are those of points of the body, but
+        for how far its origin moved; turns are rotation vectors (3, L, n) or (3, L, 1).
         """
-        t = seconds[..., None]
-        twists = (self._velocity + 0.5 * t * self._acceleration) * t
-        rates = self._velocity + t * self._acceleration
-        R = _turns(twists[..., 3:])
-        arms = ((x - self._origin)[..., None, :] @ R.swapaxes(2, 3))[..., 0, :]
-        shift = twists[..., :3]
-        turning = _crossed(rates[..., 3:], arms + shift)
-        return self._origin + shift + arms, rates[..., :3] + turning, R
+        more = seconds * self._acceleration
+        twists = (self._velocity + 0.5 * more) * seconds
+        rates, turned = self._velocity + more, twists[3:]
+        moved = _turned(arms, turned) + twists[:3]
+        return self._origin + moved, rates[:3] + cross(rates[3:], moved), turned
 
 
 def side_by_side(sensors: Sequence[Sensor]) -> batch.SensorBatch:
@@ -193,16 +212,9 @@ def moments(sensor: Sensor, y: Floats, delay: float, readout: float) -> Floats:
     return np.asarray(delay + readout * (y[..., 1] - middle_row(sensor)) / rows_apart(sensor))
 
 
-def _turns(vectors: Floats) -> Floats:
-    """Rotation matrices (..., 3, 3) of small rotation vectors (..., 3), to the third order."""
-    angle2 = (vectors * vectors).sum(axis=-1)[..., None, None]
-    K = np.zeros((*vectors.shape, 3))
-    K[..., [2, 0, 1], [1, 2, 0]] = vectors
-    K[..., [1, 2, 0], [2, 0, 1]] = -vectors
-    return np.asarray(np.eye(3) + (1 - angle2 / 6) * K + (0.5 - angle2 / 24) * (K @ K))
-
-
-def _crossed(a: Floats, b: Floats) -> Floats:
-    """A × b (..., 3): for few vectors quicker than NumPy's own."""
-    after, before = [1, 2, 0], [2, 0, 1]
-    return np.asarray(a[..., after] * b[..., before] - a[..., before] * b[..., after])
+def _turned(points: Floats, vectors: Floats) -> Floats:
+    """Points (3, ...) turned by small rotation vectors (3, ...), to the third order."""
+    once = cross(vectors, points)
+    angle2 = (vectors * vectors).sum(axis=0)
+    turned = points + (1 - angle2 / 6) * once + (0.5 - angle2 / 24) * cross(vectors, once)
+    return np.asarray(turned)

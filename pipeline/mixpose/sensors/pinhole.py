@@ -58,7 +58,9 @@ class PinholeCamera:
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         xy, _, visible = self._normalised(points_world)
-        y = (self.lens.apply(xy) if self.lens else xy) @ self.camera_matrix[:2, :2].T
+        if self.lens:
+            xy = self.lens.apply(xy.reshape(-1, 2).T).T.reshape(xy.shape)
+        y = xy @ self.camera_matrix[:2, :2].T
         y += self.camera_matrix[:2, 2]
         visible &= within(y, self.lower, self.upper)
         hide(y, visible)
@@ -69,7 +71,8 @@ class PinholeCamera:
         xy, inverse_depth, visible = self._normalised(points_world)
         y, D = xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))
         if self.lens:
-            y, D = self.lens.linearise(xy)
+            y, D = self.lens.linearise(xy.reshape(-1, 2).T)
+            y, D = y.T.reshape(xy.shape), D.transpose(2, 0, 1).reshape(*xy.shape, 2)
         y = y @ self.camera_matrix[:2, :2].T + self.camera_matrix[:2, 2]
         R = self.T_sensor_world[:3, :3]
         normalised_by_world = (R[:2] - xy[..., :, None] * R[2]) * inverse_depth[..., None, None]

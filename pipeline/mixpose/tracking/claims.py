@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -50,7 +51,7 @@ class Claims:
 
     def part(self, left: Mask) -> list[View]:
         """The views with some of their detections (D,)."""
-        masks = np.split(left, self.begins[1:-1])
+        masks = [left[a:b] for a, b in pairwise(self.begins.tolist())]
         return [
             view if mask.all() else replace(view, observation=view.observation.only(mask))
             for view, mask in zip(self.views, masks, strict=True)
@@ -102,7 +103,7 @@ class Claims:
     def _agreed(self, owners: Indices) -> Claims:
         """With owners (D,); a point of a cloud belongs to whom two of its three images give it."""
         owners = owners.copy()
-        for planes in clouds_among([view.sensor for view in self.views]):
+        for planes in clouds_among(tuple([view.sensor for view in self.views])):
             rows = [slice(*self.begins[k : k + 2].tolist()) for k in planes]
             first, second, third = (owners[row] for row in rows)
             both = np.where(second == third, second, -1)

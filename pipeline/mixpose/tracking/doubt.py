@@ -177,8 +177,8 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
         sharp = met >= min(2, met.max())
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
         # no rival meets less than a quarter of what the body meets; values grow as the square
-        theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
-        if asked or theirs > value / 16:
+        value = float(data.finest.weights[:, 0] @ seen.explained)
+        if asked or there.finest.value(T) > value / 16:
             # fitted, which may end at clutter, and where it is asked for as it stands
             starts = [data.rival(judged, T, data.close), *([Start(T)] if asked else [])]
             near = max([_evidence(there, one) for one in starts]) - own
@@ -228,6 +228,4 @@ def _evidence(data: Frame, start: Start) -> float:
 
 def _mirrored(data: Frame, chosen: Mask) -> Frame:
     """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
-    return data.seen_otherwise(
-        body=mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist()))
-    )
+    return data.of_body(mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist())))

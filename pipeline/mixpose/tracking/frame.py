@@ -21,13 +21,13 @@ from mixpose.judgement import (
     is_sure,
     nearest_alike,
 )
-from mixpose.matching import Matches, log_likelihood, pooled
+from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
-from mixpose.tracking.motion import Course, Expected, RandomWalk, per_kind
+from mixpose.tracking.motion import Course, Expected, RandomWalk, at_rest, per_kind
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, either
 
@@ -43,6 +43,7 @@ class Start:
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
     matches: Matches | None = None  # that it meets, where it is there already
+    noise: NoiseEstimate | None = None  # as these show it, where that is at hand
     least: float = -math.inf  # log likelihood at σ_ε with which narrower blurs are worth a fit
 
 
@@ -87,7 +88,7 @@ class Frame(Setup):
         ranked: Sequence[ScoredPose],
     ) -> bool:
         """Whether there is a pose, and the most evident is `trusted` by the rules of acceptance."""
-        return any(trusted(best, self.free, self.rules.acceptance) for best in ranked[:1])
+        return bool(ranked) and trusted(ranked[0], self.free, self.rules.acceptance)
 
     @property
     def is_found_at_once(self) -> bool:
@@ -142,11 +143,19 @@ class Frame(Setup):
 
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
-        misses, rules = self.track.misses, self.rules.motion
-        own = self._prior(T_world_object, self.predictions, misses)
-        if self.beside is None:
-            return own
-        return either(own, self._prior(T_world_object, [self.beside], 0), misses, rules)
+        misses, rules, asked = self.track.misses, self.rules.motion, T_world_object.tobytes()
+        if asked not in self._priors:
+            own = self._prior(T_world_object, self.predictions, misses)
+            if self.beside is not None:
+                beside = self._prior(T_world_object, [self.beside], 0)
+                own = either(own, beside, misses, rules)
+            self._priors[asked] = own
+        return self._priors[asked]
+
+    @cached_property
+    def _priors(self) -> dict[bytes, Prior]:
+        """What was known of poses that were asked for already."""
+        return {}
 
     def _prior(self, T_world_object: Floats, some: Sequence[Branch], misses: int) -> Prior:
         """Density of a pose by predictions, or now and then anywhere."""
@@ -188,6 +197,15 @@ class Frame(Setup):
             still=[view for view in self.still if view.name not in names],
         )
 
+    def of_body(self, body: Body) -> Frame:
+        """Of another body with as many features, of which nothing is fitted yet."""
+        other = self.seen_otherwise(body=body)
+        if self.drawn is not None:  # perhaps with what belongs to other bodies
+            return other
+        # the densities are the same
+        projection = project_body(self.finest.projection.sensors, body)
+        return replace(other, drawn=replace(self.finest, projection=projection))
+
     def seen_otherwise(self, **changes: Any) -> Frame:
         """With other views or another body, of which nothing is drawn or fitted yet."""
         return replace(self, drawn=None, together=None, **changes)
@@ -223,7 +241,7 @@ class Frame(Setup):
         """The velocity that the frames before let expect of a pose, or near it."""
         elapsed, rules = self.track.seconds_until(self.time_s), self.rules.motion
         # where nothing was seen before: rest, give or take what hands can do
-        rest = Expected(np.zeros(6), np.zeros(6), per_kind(self.body, rules.fastest), np.zeros(6))
+        rest = at_rest(self.body, rules)
         branch = self.track.nearest(T_world_object, self.body)
         if branch is None or not elapsed:
             return rest

@@ -8,6 +8,7 @@ by δv.  A sensor that is later than it says by τ has offsets J v τ more.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -17,6 +18,7 @@ import numpy as np
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverted, nearest_alike
 from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
+from mixpose.objective import View
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
@@ -34,7 +36,6 @@ class Offsets(NamedTuple):
     offsets: Floats  # (K,), observed minus predicted
     sensor: Indices  # (K,)
     unsure: tuple[tuple[int, float], ...]  # sensors with estimated delays, standard deviations
-    beside: float  # how far features may be off by velocity and delay, in σ_ε
 
     def by_delay(self, velocity: Floats, sensors: Sequence[int] | Floats) -> Floats:
         """How the features of some sensors would move with their delays, (K, q) per second."""
@@ -42,10 +43,10 @@ class Offsets(NamedTuple):
             self.sensor[:, None] == np.array(sensors, int), (self.rows @ velocity)[:, None], 0.0
         )
 
-    def least_squares(
-        self, velocity: Floats, expected: Expected, free: Mask, variance: float
-    ) -> tuple[Floats, Floats, Floats]:
-        """The step of all unknowns, their covariance, and offsets (K,) that are left.
+    def unknowns(
+        self, velocity: Floats, expected: Expected, free: Mask
+    ) -> tuple[Floats, LinearResiduals]:
+        """How offsets change with all unknowns (K, q), and what is known of these before.
 
         Unknown are pose, velocity, delays, and in each delay the body's way at another velocity.
         """
@@ -61,10 +62,7 @@ class Offsets(NamedTuple):
         prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
         known = np.zeros(len(prior))
         known[:count] = (expected.velocity - velocity)[free] / fast
-        seen = LinearResiduals(*(part / np.sqrt(variance) for part in (design, self.offsets)))
-        end = least_squares(seen, LinearResiduals(prior, known))
-        x = end.states[0]
-        return x, inverted(end.last.curvature[0]), self.offsets - design @ x
+        return design, LinearResiduals(prior, known)
 
 
 def fit_in_motion(
@@ -81,15 +79,16 @@ def fit_in_motion(
         seen = frame.in_motion(motion)
         expected, matches = frame.expected(T), None
         if moved > timing.linear:
-            beside = offsets_of(seen, matches_at(seen, T), expected).beside
-            fit = climb(seen, T, beside)
+            fit = climb(seen, T, _beside(seen, T, expected))
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
             matches = fit.matches if T is fit.T_world_object else None
             expected = frame.expected(T)
         met = offsets_of(seen, matches or matches_at(seen, T), expected)
+        design, known = met.unknowns(motion.velocity, expected, frame.free)
         variance = errors.typical**2
         for _ in range(2):  # the second time with the variance that the first leaves
-            x, _, rest = met.least_squares(motion.velocity, expected, frame.free, variance)
+            x, _ = least_squares(known, _weighed(design, met.offsets, variance))
+            rest = met.offsets - design @ x
             total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
             degrees = errors.typical_degrees + max(len(rest) - count, 0)
             variance = max(total / degrees, LEAST_VARIANCE)
@@ -97,7 +96,7 @@ def fit_in_motion(
         change[frame.free] = x[count : 2 * count]
         way = met.late * (met.rows @ change)
         left = LinearResiduals(met.rows, met.offsets - way)
-        T = perturb(T, least_squares(left, free=frame.free).states[0])
+        T = perturb(T, least_squares(left, free=frame.free)[0])
         motion = Motion(T, motion.velocity + change, expected.acceleration)
         moved = float(np.abs(way).max(initial=0.0))
         if moved < timing.settled:
@@ -114,11 +113,19 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     scale = float(np.trace(alone @ covariance[inner])) / max(len(alone), 1)
     if not np.isfinite(scale) or scale <= 0:
         return judged
-    _, together, _ = met.least_squares(motion.velocity, expected, free, scale)
-    extra = together[: len(alone), : len(alone)] - scale * inverted(alone)
+    design, known = met.unknowns(motion.velocity, expected, free)
+    information = least_squares(known, _weighed(design, met.offsets, scale))[1]
+    together = inverted(information)[: len(alone), : len(alone)]
+    extra = together - scale * inverted(alone)
     values, vectors = np.linalg.eigh((extra + extra.T) / 2)
     covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
     return replace(judged, covariance=covariance)
+
+
+def _weighed(design: Floats, offsets: Floats, variance: float) -> LinearResiduals:
+    """Offsets (K,) that change by a design (K, q), in units of their deviation."""
+    scale = 1 / math.sqrt(variance)
+    return LinearResiduals(scale * design, scale * offsets)
 
 
 def matches_at(frame: Frame, T_world_object: Floats) -> Matches:
@@ -130,30 +137,47 @@ def matches_at(frame: Frame, T_world_object: Floats) -> Matches:
 def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:
     """Met features, as they pull: little, where farther off than noise and velocity explain."""
     views = [view for view in frame.still or frame.views if view.name in matches.names]
-    pairs, seen = zip(views, matches.places, strict=True), matches.weights > 0
-    seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in pairs]
-    late, blurs, beside = np.where(seen, seconds, 0.0), np.ones(len(views)), 0.0
+    seen = matches.weights > 0
+    late, blurs = _seconds(views, matches.places, seen), np.ones(len(views))
     if expected is not None:
-        delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
-        speed = np.hypot(expected.velocity, expected.deviation)
-        ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
-        squares = ((matches.J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
-        beside = float(np.sqrt(squares.max(initial=0.0, where=seen)))
-        model = frame.rules.judgement.noise
+        beside, model = _off(views, late, matches.J, seen, expected), frame.rules.judgement.noise
         known = model.memory * frame.track.residuals.of(matches.names)
         _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
         blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), 1.0)
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
-    kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
+    kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
+    pull = pull[kept[:2]]
     return Offsets(
-        rows=(matches.J * pull[..., None, None])[kept],
-        late=np.broadcast_to(late[..., None], kept.shape)[kept],
-        offsets=(matches.offsets * pull[..., None])[kept],
-        sensor=np.nonzero(kept)[0],
+        rows=matches.J[kept] * pull[:, None],
+        late=late[kept[:2]],
+        offsets=matches.offsets[kept] * pull,
+        sensor=kept[0],
         unsure=tuple((k, view.unsure) for k, view in enumerate(views) if view.unsure is not None),
-        beside=beside,
     )
+
+
+def _beside(frame: Frame, T_world_object: Floats, expected: Expected) -> float:
+    """How far features may be off at a pose by velocity and delays, in σ_ε, whatever meets them."""
+    at, views = frame.finest.projection.project(T_world_object[None]), frame.still or frame.views
+    seen, J = at.weights[:, 0] > 0, at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
+    return _off(views, _seconds(views, at.y[:, 0], seen), J, seen, expected)
+
+
+def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:
+    """When features at places (L, N, 2) are seen (L, N), after the common time."""
+    each = zip(views, places, strict=True)
+    seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in each]
+    return np.where(seen, seconds, 0.0)
+
+
+def _off(views: Sequence[View], late: Floats, J: Floats, seen: Mask, expected: Expected) -> float:
+    """How far features (L, N) that are seen `late` may be off by velocity and delays, in σ_ε."""
+    delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
+    speed = np.hypot(expected.velocity, expected.deviation)
+    ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
+    squares = ((J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
+    return float(np.sqrt(squares.max(initial=0.0, where=seen)))
 
 
 def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
@@ -174,13 +198,15 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     variance = max(float(met.offsets @ met.offsets) / degrees, LEAST_VARIANCE)
     # what a pose and an unknown change of the velocity explain as well says nothing of delays
     shifts = met.rows * met.late[:, None] * expected.deviation / np.sqrt(variance)
-    other = np.block([[met.rows, shifts], [np.zeros((6, 6)), np.eye(6)]])
-    other /= np.maximum(np.linalg.norm(other, axis=0), np.finfo(float).tiny)
-    columns = np.pad(late, ((0, 6), (0, 0)))
+    count = len(late)
+    other, columns = np.zeros((count + 6, 12)), np.zeros((count + 6, late.shape[1]))
+    other[:count, :6], other[:count, 6:], other[count:, 6:] = met.rows, shifts, np.eye(6)
+    other /= np.maximum(np.sqrt(np.vecdot(other.T, other.T)), np.finfo(float).tiny)
+    columns[:count] = late
     columns -= other @ np.linalg.lstsq(other, columns, rcond=1e-9)[0]
     information = columns.T @ columns / variance
     estimated = {view.name: view.estimated for view in frame.views}
-    vector = columns[: len(late)].T @ met.offsets / variance
+    vector = columns[:count].T @ met.offsets / variance
     vector += information @ np.array([estimated.get(name, 0.0) for name in names])
     n = len(before.names)
     information[:n, :n] += before.information

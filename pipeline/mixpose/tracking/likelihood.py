@@ -55,7 +55,7 @@ class MatchedLikelihood:
         if start.left_out:
             frame = frame.without(start.left_out)
         if uncertainty is None:
-            return Fit(T, matches=start.matches)
+            return Fit(T, matches=start.matches, noise=start.noise)
         if frame.together and start is frame.together[0]:
             return frame.together[1]
         timed, model = frame.is_timed, frame.rules.judgement

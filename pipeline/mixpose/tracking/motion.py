@@ -13,6 +13,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.records import Floats
+from mixpose.rigid import cross
 from mixpose.sensors import Motion
 
 Scale: TypeAlias = tuple[float, float]  # radii of the body, and degrees
@@ -151,6 +152,14 @@ class Expected(NamedTuple):
         return Motion(T_world_object, self.velocity, self.acceleration)
 
 
+@lru_cache(maxsize=64)
+def at_rest(body: Body, rules: MotionRules) -> Expected:
+    """Nothing is known of a velocity but how large it may be; not to be written to."""
+    fastest, none = per_kind(body, rules.fastest), np.zeros(6)
+    fastest.flags.writeable = none.flags.writeable = False
+    return Expected(none, none, fastest, none)
+
+
 @dataclass(frozen=True, eq=False)
 class Course:
     """How fast a body goes at its last pose, to which states are relative, and how sure that is.
@@ -183,7 +192,7 @@ class Course:
         gains = covariance[:, 1:3, 0] / covariance[:, :1, 0]
         rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
         variance = covariance[:, 1, 1] - gains[:, 0] * covariance[:, 1, 0]
-        rates[3:] += np.cross(moved[3:], rates[3:], axisb=0, axisc=0) / 2
+        rates[3:] += cross(moved[3:, None], rates[3:]) / 2
         return Expected(rates[:, 0], gains[:, 0], np.sqrt(np.maximum(variance, 0.0)), rates[:, 1])
 
     def ahead(self, elapsed: float) -> tuple[Floats, Floats]:
@@ -210,7 +219,8 @@ class Course:
         covariances = covariances - gains[..., None] * covariances[..., None, 0, :]
         means[..., 0] -= moved
         # derivatives by the turn itself, not by its logarithm
-        means[:, 3:, 1:] += np.cross(moved[3:], means[:, 3:, 1:], axisb=1, axisc=1) / 2
+        turning = means[:, 3:, 1:].swapaxes(0, 1)
+        turning += cross(moved[3:, None, None], turning) / 2
         seen = -0.5 * (np.log(variance) + off)
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
         return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)

@@ -159,7 +159,7 @@ def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
 
 def met_features(judged: ScoredPose) -> frozenset[int]:
     """Numbers of the features that any sensor meets."""
-    return frozenset(np.flatnonzero(judged.matches.met_by).tolist())
+    return frozenset(judged.matches.met_by.nonzero()[0].tolist())
 
 
 def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
@@ -269,7 +269,7 @@ def _with_pairs(
         weights = welsch(seen.squared, np.maximum(narrow, least))
         J, offsets = replace(seen, shares=seen.shares * weights).rows()
         rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-        T = perturb(T, least_squares(rest, free=frame.free).states[0])
+        T = perturb(T, least_squares(rest, free=frame.free)[0])
     return None if T is T_world_object else T
 
 
@@ -322,11 +322,11 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
     for one, blur in product(predicted(frame, [])[: max(len(frame.predictions), 1)], blurs):
         start = replace(one, blur=blur)
-        T, seen = met_at(frame, likelihood.fit(start))
+        T, seen = met_at(frame, fit := likelihood.fit(start))
         # where all of a sensor are off it is out of step, and the others no better for it
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
-            yield Start(T, matches=seen)
+            yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)

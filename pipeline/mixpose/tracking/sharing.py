@@ -63,6 +63,9 @@ class Sharing:
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
     looked: bool = False  # whether they were looked for among points that cameras see together
+    # what explanations meet, and whose detections are by what `claimed` bodies meet
+    met: dict[int, tuple[Explanation, Met]] = field(default_factory=dict)
+    taken: tuple[Mapping[int, Met], Claims | None] = field(default=({}, None))
 
     def explained(self) -> dict[int, Explanation]:
         """The poses of all bodies."""
@@ -270,10 +273,19 @@ class Sharing:
 
     def _claims(self) -> Claims:
         """Whose each detection is by now."""
-        return self._nobody.taken({k: self._met(k) for k in self.claimed})
+        met, (before, claims) = {k: self._met(k) for k in self.claimed}, self.taken
+        if claims is None or list(map(id, before.values())) != list(map(id, met.values())):
+            claims = self._nobody.taken(met)
+            self.taken = met, claims
+        return claims
 
     def _met(self, k: int) -> Met:
-        return self._nobody.met_by(self.found[k].ranked[0], self.found[k].left)
+        """What the most evident pose of a body meets; of each explanation once."""
+        found, (one, met) = self.found[k], self.met.get(k, (None, None))
+        if met is None or one is not found:
+            met = self._nobody.met_by(found.ranked[0], found.left)
+            self.met[k] = found, met
+        return met
 
     @cached_property
     def _shared(self) -> SharedDensities | None:

@@ -78,24 +78,24 @@ def weighed_by_size(
     if not (sizes.count and rules.cut and views):
         return list(views)
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
-    seen_otherwise = list(views)
+    seen_otherwise, every, scatter = list(views), _scales(at.J[:, 0]), sizes.scatter(rules)
     for k, view in enumerate(views):
         pattern = view.observation.pattern
         if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
-        away = np.linalg.norm(pattern.points[:, None] - at.y[k, 0, seen], axis=2)
-        scales = _scales(at.J[k, 0, seen])[away.argmin(axis=1)]
+        away = pattern.points[:, None] - at.y[k, 0, seen]
+        scales = every[k, seen[np.vecdot(away, away).argmin(axis=1)]]
         logs = np.log(pattern.radii / scales)
         whole = scales * np.exp(sizes.mean)
-        smaller = np.exp(-2 * np.hypot(logs - sizes.mean, sizes.scatter(rules)))
+        smaller = np.exp(-2 * np.hypot(logs - sizes.mean, scatter))
         # of each of two coordinates
         moved = np.maximum(pattern.radii, whole) * (1 - smaller) / np.sqrt(2)
         # what is likely whole is not made less exact by a little
         chances = sizes.cut(logs, rules)
         own = np.where(chances > 0.5, moved, 0.0)
-        cut = np.stack([chances, moved], axis=1)
-        known = replace(pattern, deviations=np.maximum(pattern.deviations, own), cut=cut)
+        cut = np.array([chances, moved]).T
+        known = pattern.erring(np.maximum(pattern.deviations, own), cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
 

@@ -149,6 +149,11 @@ class Track:
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
     distances: Distances | None = None  # between identical bodies, of which this is the first
 
+    @cached_property
+    def foretold(self) -> dict[tuple[int, float | None], list[Branch]]:
+        """Where it expects the body in frames that were asked for already, see `predict`."""
+        return {}
+
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s

@@ -98,7 +98,10 @@ class Tracker(Setup):
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
         """Where the track expects the body in a frame."""
-        return predict(track, self.body, frame, time_s, self.rules.motion)
+        known, asked = track.foretold, (frame, time_s)
+        if asked not in known:
+            known[asked] = predict(track, self.body, frame, time_s, self.rules.motion)
+        return known[asked]
 
     def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
         """A frame, and what is known before it; sensors that saw nothing are left out."""
