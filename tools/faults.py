@@ -350,7 +350,7 @@ def is_right(estimate: Estimate, truth: dict[int, Floats | None]) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="What becomes of recordings with faults.")
-    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS))
+    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS).replace("%", "%%"))
     parser.add_argument("--markdown", action="store_true")
     options = parser.parse_args()
     unknown = {*options.faults} - {*FAULTS}

@@ -334,7 +334,7 @@ _NOISE = (
     Mutant(
         "tracking-merged-spots-pull-by-all-that-they-are-off",
         "tracking/proposers.py",
-        "seen.shares * welsch(seen.squared, blurs)",
+        "seen.shares * weights",
         "seen.shares",
         "a spot of two features that is cut bends the pose",
         ("test_tracking_proposers.py",),

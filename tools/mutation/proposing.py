@@ -148,8 +148,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers.py",
-        "        if T is not judged.T_world_object:",
-        "        if T is judged.T_world_object:",
+        "return None if T is T_world_object else T",
+        "return None",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
     ),

@@ -314,11 +314,15 @@ class Findings:
     @cached_property
     def change(self) -> str | None:
         """What the session should have said, where few frames are ok, and some doubted or lost."""
-        # a body that is there twice is no fault of the session
-        doubted = sum(each.count for doubt, each in self._doubts.items() if doubt != TWICE)
+        doubted = sum(each.count for each in self._doubts.values())
+        # a body that is there twice, most of the time, is no fault of the session
+        twice = sum(each.count for doubt, each in self._doubts.items() if doubt == TWICE)
+        if 2 * twice > doubted:
+            doubted -= twice
+        else:
+            twice = 0
         frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
-        twice = sum(each.count for doubt, each in self._doubts.items() if doubt == TWICE)
         bad = self._places + 1 - self._ok - twice if doubted or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None

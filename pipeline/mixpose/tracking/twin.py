@@ -55,7 +55,7 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     verdict = replace(verdict, twice=odds)
     if second is None or odds <= accepted.log_doubt:
         return verdict
-    either = min(odds, 0.0)
+    either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
     share = float(expit(either))
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
     return replace(verdict, kept=kept).doubted([Alternative(TWICE, either)])
@@ -87,10 +87,12 @@ def are_both(a: ScoredPose, b: ScoredPose) -> bool:
 def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     """Log odds for the second of two poses that each explain what they meet, as one is the body's.
 
-    Then the other is its image, or another body: of all but what the body is missed at.
+    Then the other is its image, or another body: of all but what the body is missed at.  A sensor
+    of which nothing is left misses the second one.
     """
-    missed = [float((one.used.weights - one.used.shares).sum()) for one in (best, second)]
-    return (missed[0] - missed[1]) * float(logit(data.rules.judgement.detection.probability))
+    met = [dict(zip(one.used.names, one.used.met.tolist())) for one in (best, second)]
+    more = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
+    return -float(more) * float(logit(data.rules.judgement.detection.probability))
 
 
 def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
@@ -118,12 +120,17 @@ def _most_missed(data: Frame) -> float:
 
 
 def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
-    """A pose that is sure by itself and may be the body's as well as the best one."""
+    """A pose that is sure by itself and may be the body's as well as the best one.
+
+    Where sensors agree about that one, they do about this one.
+    """
+    agree = min(np.count_nonzero(best.used.met), 2)
     rest = data.alone(views=views, still=(), starts=())
     likelihood = likelihood_of(rest)
     for start in _starts(data, best, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
         is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
+        is_likely &= np.count_nonzero(pose.matches.met) >= agree
         if is_likely and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer="second_pose")
     return None
