@@ -245,7 +245,7 @@ def _to_the_noise(
         weighed = errors.counted(variances, fields)
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
-        is_noise = _are_noise(matches, variances, blurs, errors)
+        is_noise = _are_noise(matches, variances, blurs, errors, rules)
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
         if best is None:
             is_end &= bool(weighed.min() > rules.narrower**2 * weighed.max())  # weights are right
@@ -264,10 +264,18 @@ def _to_the_noise(
         ascent = ascend(by_noise, ascent.states, perturb, free, rules.sharp)
 
 
-def _are_noise(matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules) -> bool:
-    """Whether no offset is too large for noise (L,), and no other detection pulls at blurs (L,)."""
-    far = errors.are_off(matches, variances[:, None] + matches.extra)
-    return not np.count_nonzero(far | (matches.beside < errors.met * blurs[:, None]))
+def _are_noise(
+    matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules, rules: FitRules
+) -> bool:
+    """Whether no offset is too large for noise (L,), and no other detection pulls at blurs (L,).
+
+    A pose moves by no more deviations than pulls together are of the noise.
+    """
+    if np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)):
+        return False
+    beside = matches.beside * matches.beside  # NaN of features that are not in view
+    pulls = beside * np.exp(beside / (-2 * blurs * blurs)[:, None])
+    return bool((np.nansum(pulls, axis=1) < rules.moved**2 * variances).all())
 
 
 def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:

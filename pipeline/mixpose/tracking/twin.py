@@ -124,14 +124,14 @@ def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> Scored
 
     Where sensors agree about that one, they do about this one.
     """
-    agree = min(np.count_nonzero(best.used.met), 2)
+    agree = min(int(np.count_nonzero(best.used.met)), 2)
     rest = data.alone(views=views, still=(), starts=())
     likelihood = likelihood_of(rest)
     for start in _starts(data, best, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
         is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
-        is_likely &= np.count_nonzero(pose.matches.met) >= agree
-        if is_likely and is_sure(pose, data.free, data.rules.acceptance):
+        is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
+        if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer="second_pose")
     return None
 
