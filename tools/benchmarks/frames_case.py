@@ -25,7 +25,7 @@ import numpy as np
 from make_synthetic import RECORDINGS, Recording
 
 import mixpose
-from benchmarks.recordings import session_text, simulated, write_mjpeg, write_session
+from benchmarks.recordings import EYES, session_text, simulated, write_mjpeg, write_session
 from benchmarks.timing import PROCESSOR, show
 from mixpose import runner
 from mixpose.frames import Source
@@ -113,6 +113,21 @@ def plate(folder: Path) -> Session:
     return simulated(folder / "plate", text, options)
 
 
+def sheet(folder: Path) -> Session:
+    """Two cameras; a sheet of 450 dark dots, all alike but four, that is not quite flat."""
+    y, x = np.divmod(np.arange(450), 25)
+    large = np.isin(x, (8, 16)) & np.isin(y, (5, 12))
+    bent = np.random.default_rng(0).normal(0.0, 1.2, 450)  # a pitch of 20 mm by what it is in real
+    dots = np.stack([20.0 * (x - 12.0), bent, 20.0 * (y - 8.5)], axis=1)  # seen along y
+    radii = np.where(large, 9.0, 4.0).tolist()
+    shape = f'shape = "disk"\nradius = {radii}\nnormals = {[[0, -1, 0]] * 450}'
+    sources, size = [f'"{name}*.png"' for name in "ab"], (1920, 1440)
+    text = session_text(sources, size, 2600.0, points=dots.tolist(), shape=shape, eyes=EYES[::3])
+    text += '[extract]\npolarity = "dark"\n'
+    options = replace(MOTION, background=60.0, brightness=150.0, noise=2.0)
+    return simulated(folder / "sheet", text, options)
+
+
 def made(name: str) -> Scene:
     """A recording of data/synthetic, made as it was."""
 
@@ -135,6 +150,7 @@ SCENES: Mapping[str, tuple[Scene, float | None]] = {  # ms of a tracked frame th
     "real room, two cameras": (made("real_room"), 15.0),
     "four bodies, two cameras": (made("several_bodies"), 15.0),
     "plate of dark dots, one camera": (plate, 15.0),
+    "sheet of 450 dots, two cameras": (sheet, 60.0),
 }
 REAL: Mapping[str, tuple[Scene, float | None]] = {
     "box of 72 corners, two tables": (recorded("tag_box/session.toml"), 15.0),
