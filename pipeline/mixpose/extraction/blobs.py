@@ -271,8 +271,9 @@ def _disks(outlined: Sequence[tuple[Foreground, Contour]], rules: BlobRules) -> 
         for k, (scene, rim) in enumerate(zip(scenes, disks, strict=True))
         if rim and rim.ellipse.area < math.pi * rules.large**2
     }
-    off = off_centre([*told.values()], rules.spots.margin, rules.spots.centroid, rules.beside)
-    by_number = dict(zip(told, off.tolist(), strict=True))
+    beside = rules.spots.margin, rules.spots.centroid, rules.beside
+    some = [*zip(*told.values(), strict=True)] or [(), ()]
+    by_number = dict(zip(told, off_centre(some[0], together(some[1]), *beside).tolist()))
     return [
         None if rim is None else Blob.of_rim(rim, by_number.get(k)) for k, rim in enumerate(disks)
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -63,11 +64,11 @@ class Ellipses:
         return Ellipse((u, v), (a, b), float(self.angle[k]))
 
 
-def together(ellipses: list[Ellipse]) -> Ellipses:
+def together(ellipses: Sequence[Ellipse]) -> Ellipses:
     """Single ellipses side by side."""
     return Ellipses(
-        np.array([one.centre for one in ellipses]),
-        np.array([one.half_axes for one in ellipses]),
+        np.array([one.centre for one in ellipses]).reshape(-1, 2),
+        np.array([one.half_axes for one in ellipses]).reshape(-1, 2),
         np.array([one.angle for one in ellipses]),
         np.ones(len(ellipses), dtype=np.bool_),
     )
