@@ -19,10 +19,10 @@ from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.fit import Fit, blur_schedule
-from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, is_sure
+from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
@@ -301,8 +301,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     has_cells = any(view.observation.cell is not None for view in frame.views)
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # what is known to be cut pulls as well
-    are_noise = not errors.are_off(used, judged.variances[:, None]).any()
-    if has_cells or (judged.residual_ratio <= 1 and are_noise):
+    off = errors.are_off(used, judged.variances[:, None])
+    if has_cells or (judged.residual_ratio <= 1 and not _carry(off, judged, frame)):
         return
     narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
@@ -313,6 +313,21 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
             yield Start(T, matches=seen)
+
+
+def _carry(off: Mask, judged: ScoredPose, frame: Frame) -> bool:
+    """Whether features (L, N) that are off carry any away, by a part of the noise that matters.
+
+    They do so by least squares at the most.  What stays nearer meets the same at narrow blurs.
+    """
+    if not np.count_nonzero(off):
+        return False
+    used, noise = judged.used, np.sqrt(judged.variances)[:, None, None]
+    J = used.J[..., frame.free] / noise[..., None]
+    met = J[used.shares > 0].reshape(-1, J.shape[-1])
+    pull = np.einsum("nmk,nm->k", J[off], (used.offsets / noise)[off])
+    moved = (met @ (inverted(met.T @ met) @ pull)).reshape(-1, J.shape[-2])
+    return bool(np.vecdot(moved, moved).max() > frame.rules.fit.moved**2)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
