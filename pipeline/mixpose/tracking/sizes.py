@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -84,8 +85,8 @@ def weighed_by_size(
         if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
-        away = np.linalg.norm(pattern.points[:, None] - at.y[k, 0, seen], axis=2)
-        scales = _scales(at.J[k, 0, seen])[away.argmin(axis=1)]
+        _, nearest = cKDTree(at.y[k, 0, seen]).query(pattern.points)
+        scales = _scales(at.J[k, 0, seen])[nearest]
         logs = np.log(pattern.radii / scales)
         whole = scales * np.exp(sizes.mean)
         smaller = np.exp(-2 * np.hypot(logs - sizes.mean, sizes.scatter(rules)))
