@@ -27,7 +27,7 @@ from mixpose.extraction.background import Grey
 from mixpose.extraction.conics import FEWEST, Ellipse, Ellipses, distances, fit_conics, turns
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.sampling import sample, sample_each
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, Singles
 
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
@@ -252,11 +252,14 @@ def _edges(
     There the signal falls through half the height of the edge; whether by one of `contrasts`, well
     within reach, by how much, and down to what (B, DIRECTIONS).
     """
-    axes = ellipses.half_axes[:, None]
-    turned = turns(ellipses.angle).swapaxes(1, 2)
-    on_rim = ellipses.centre[:, None] + (_CIRCLE * axes) @ turned
-    normals = (_CIRCLE / axes) @ turned
-    normals /= np.hypot(normals[..., 0], normals[..., 1])[..., None]
+    (a, b), angle = ellipses.half_axes.T[..., None], ellipses.angle[:, None]
+    (x, y), c, s = _CIRCLE.T, np.cos(angle), np.sin(angle)
+    on_rim = np.array([c * a * x - s * b * y, s * a * x + c * b * y])
+    on_rim += ellipses.centre.T[..., None]
+    # as long as one, across the rim
+    length = np.sqrt((b * x) ** 2 + (a * y) ** 2)
+    x, y = b * x / length, a * y / length
+    normals = np.array([c * x - s * y, s * x + c * y])
     reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
     reach = reach.astype(np.intp)
     where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
@@ -264,41 +267,43 @@ def _edges(
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
         offsets = np.arange(-whole - 1.5, whole + 2)
-        u, v = (
-            (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
-            for k in (0, 1)
-        )
-        profiles = sample_each([signals[k] for k in some.tolist()], u, v)
-        step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
+        of_some = [signals[k] for k in some.tolist()]
+        profiles = sample_each(of_some, on_rim[:, some], normals[:, some], offsets)
+        step, place, below, low = _fall(profiles.reshape(len(offsets), -1), offsets)
         shape = (len(some), DIRECTIONS)
         sure = step >= np.repeat(contrasts[some], DIRECTIONS).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
-    return on_rim + normals * where[..., None], found > 0, steps, lows
+    edges = np.stack(tuple(on_rim + normals * where), axis=2)
+    return edges, found > 0, steps, lows
 
 
 def _fall(
     profiles: NDArray[np.float32], offsets: Floats
-) -> tuple[Floats, Floats, Mask, NDArray[np.float32]]:
-    """Of profiles (n, k) how far each falls, where it is at half the height, whether it is.
+) -> tuple[Singles, Floats, Mask, Singles]:
+    """Of profiles (k, n) how far each falls, where it is at half the height, whether it is.
 
-    And how low it is outside.
+    And how low it is outside.  Row by row, as there are many profiles and each is short.
     """
     # The rim is near where the signal falls most over a width that optics blur an edge to...
-    fall = profiles[:, :-3] - profiles[:, 3:]
-    rows = np.arange(len(profiles))
-    steepest = fall.argmax(axis=1)
+    steepest, (fall, *falls) = np.zeros(profiles.shape[1], np.int8), profiles[:-3] - profiles[3:]
+    for k, one in enumerate(falls, 1):
+        np.putmask(steepest, one > fall, k)
+        np.maximum(fall, one, out=fall)
     # ... and at half the height there, which noise moves less than the steepest place.
-    column = np.arange(profiles.shape[1])
-    outside = column > (steepest + 1)[:, None]
-    high = np.where(outside, -np.inf, profiles)
-    summit = high.argmax(axis=1)
-    # of long columns, which is quicker than of short rows
-    low = np.ascontiguousarray(np.where(outside, profiles, np.inf).T).min(axis=0)
-    half = (high[rows, summit] + low) / 2
-    below = (column > summit[:, None]) & (profiles < half[:, None])
-    after = np.maximum(below.argmax(axis=1), 1)
-    upper, lower = profiles[rows, after - 1].astype(np.float64), profiles[rows, after]
+    summit, high, low = np.zeros_like(steepest), profiles[0].copy(), profiles[-1].copy()
+    for k, one in enumerate(profiles):
+        outside = steepest + 1 < k
+        inner = np.where(outside, -np.inf, one)
+        np.putmask(summit, inner > high, k)
+        np.maximum(high, inner, out=high)
+        np.minimum(low, np.where(outside, one, np.inf), out=low)
+    half, after = (high + low) / 2, np.zeros_like(steepest)
+    for k in range(len(profiles) - 1, 0, -1):
+        np.putmask(after, (profiles[k] < half) & (summit < k), k)
+    below, rows = after > 0, np.arange(len(after))
+    after = np.maximum(after, 1).astype(np.intp)
+    upper, lower = profiles[after - 1, rows].astype(np.float64), profiles[after, rows]
     where = offsets[after - 1] + (upper - half) / np.maximum(upper - lower, 1e-12)
-    return fall[rows, steepest], where, below[rows, after], low
+    return fall, where, below, low
