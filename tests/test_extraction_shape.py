@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.extraction.blobs import extract_blobs
-from mixpose.extraction.conics import Ellipse
+from mixpose.extraction.conics import Ellipse, together
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centroids, off_centre
 from mixpose.extraction.threshold import Foreground
@@ -74,12 +74,12 @@ def test_an_ellipse_beside_the_light_that_it_is_of_seems_off_by_as_much() -> Non
     scene = Foreground(image, 20.0, 40.0, noise=1.0, least_peak=60.0, judged=True, tops=top)
     u, v = MIDDLE.tolist()
     right, beside = (Ellipse((u + d, v), (7.0, 7.0), 0.0) for d in (0.0, 0.5))
-    off = off_centre([(scene, right), (scene, beside)], 3, 0.1, 2.0)
+    off = off_centre([scene, scene], together([right, beside]), 3, 0.1, 2.0)
     assert off[0] < 0.03
     assert off[1] == pytest.approx(0.5, rel=0.1)
     flat = replace(scene, grey=np.full((40, 40), 20.0, np.float32))
-    assert off_centre([(flat, right)], 3, 0.1, 2.0).tolist() == [0.0]
-    assert not off_centre([], 3, 0.1, 2.0).size
+    assert off_centre([flat], together([right]), 3, 0.1, 2.0).tolist() == [0.0]
+    assert not off_centre([], together([]), 3, 0.1, 2.0).size
 
 
 @pytest.mark.parametrize("radius", [3.5, 4.3])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,8 +18,7 @@ FEWEST = 6  # points of an ellipse: five always lie on a conic
 _LEAST = 1e-3  # px, of a half-axis: points on a line make none
 
 
-@dataclass(frozen=True)
-class Ellipse:
+class Ellipse(NamedTuple):
     """An ellipse in pixel coordinates; `angle` in radians turns the first half-axis from u."""
 
     centre: tuple[float, float]
@@ -58,10 +58,10 @@ class Ellipses:
             part[rows] = other
         return Ellipses(*parts)  # type: ignore[arg-type]
 
-    def one(self, k: int) -> Ellipse:
-        """One of them."""
-        (u, v), (a, b) = self.centre[k].tolist(), self.half_axes[k].tolist()
-        return Ellipse((u, v), (a, b), float(self.angle[k]))
+    def each(self) -> list[Ellipse]:
+        """One by one."""
+        parts = (self.centre.tolist(), self.half_axes.tolist(), self.angle.tolist())
+        return [Ellipse((u, v), (a, b), angle) for (u, v), (a, b), angle in zip(*parts)]
 
 
 def together(ellipses: Sequence[Ellipse]) -> Ellipses:

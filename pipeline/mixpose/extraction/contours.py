@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
+from mixpose.extraction.conics import Ellipse
 from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
@@ -92,11 +93,20 @@ def length_by_width(contour: Contour) -> float:
     return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
 
 
-def is_oval(contour: Contour) -> bool:
-    """Whether a contour may be an ellipse, by its area and moments: of most, rims say the same."""
+def oval(contour: Contour) -> Ellipse | None:
+    """The ellipse that has the moments of a contour, where it may be one by its area.
+
+    Of most, rims say the same.
+    """
     m = cv2.moments(contour)
-    spread = math.sqrt(max(m["mu20"] * m["mu02"] - m["mu11"] ** 2, 0.0))
-    return bool(m["m00"] ** 2 >= OVAL * 4 * math.pi * spread)
+    area, uu, vv, uv = m["m00"], m["mu20"], m["mu02"], m["mu11"]
+    if area <= 0 or area**2 < OVAL * 4 * math.pi * math.sqrt(max(uu * vv - uv**2, 0.0)):
+        return None
+    middle, half = (uu + vv) / 2, math.hypot((uu - vv) / 2, uv)
+    # the contour runs through the centres of the outermost pixels: it is half a pixel inside
+    long, short = math.sqrt((middle + half) / area), math.sqrt(max(middle - half, 0.0) / area)
+    axes, angle = (2 * long + 0.5, 2 * short + 0.5), 0.5 * math.atan2(2 * uv, uu - vv)
+    return Ellipse((m["m10"] / area, m["m01"] / area), axes, angle)
 
 
 def is_solid(contour: Contour, least: float) -> bool:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,10 +24,18 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
-from mixpose.extraction.conics import FEWEST, Ellipse, Ellipses, distances, fit_conics, turns
+from mixpose.extraction.conics import (
+    FEWEST,
+    Ellipse,
+    Ellipses,
+    distances,
+    fit_conics,
+    together,
+    turns,
+)
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.sampling import sample, sample_each
-from mixpose.records import Floats, Mask, Singles
+from mixpose.extraction.sampling import sample_each
+from mixpose.records import Floats, Indices, Mask, Singles
 
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
@@ -73,8 +81,7 @@ class EllipseRules:
     hidden_arcs: int = constant(8, "arcs, of which three that follow each other may be hidden")
 
 
-@dataclass(frozen=True)
-class Rim:
+class Rim(NamedTuple):
     """An ellipse found in an image."""
 
     ellipse: Ellipse
@@ -82,42 +89,74 @@ class Rim:
     residual: float  # RMS distance in px of these edges from it
     contrast: float  # median step of the signal across the edges
 
-    def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
-        """Whether the rim is an ellipse."""
-        minor, major = sorted(self.ellipse.half_axes)
-        least = rules.coverage if major < rules.long * minor else rules.long_coverage
-        return self.coverage >= least and bool(self.residual <= tolerance(minor, rules) / 2)
+
+@dataclass(frozen=True)
+class Rims:
+    """Those of B features; not sound where nothing is like an ellipse."""
+
+    ellipses: Ellipses
+    coverage: Floats  # (B,) each, as of a `Rim`
+    residual: Floats
+    contrast: Floats
+
+    def are_good(self, rules: EllipseRules = EllipseRules()) -> Mask:
+        """Which (B,) are ellipses."""
+        minor, major = np.sort(self.ellipses.half_axes, axis=1).T
+        least = np.where(major < rules.long * minor, rules.coverage, rules.long_coverage)
+        near = self.residual <= tolerance(minor, rules) / 2
+        return np.asarray(self.ellipses.sound & (self.coverage >= least) & near)
+
+    def select(self, chosen: Mask | Indices) -> Rims:
+        """Some of them."""
+        parts = (self.coverage, self.residual, self.contrast)
+        return Rims(self.ellipses.select(chosen), *(part[chosen] for part in parts))
+
+    def each(self) -> list[Rim]:
+        """One by one."""
+        numbers = (one.tolist() for one in (self.coverage, self.residual, self.contrast))
+        return [Rim(*one) for one in zip(self.ellipses.each(), *numbers, strict=True)]
 
 
 def find_rims(
     signals: Sequence[Grey],
     outlines: Sequence[Contour],
     contrasts: Floats,
+    ovals: Sequence[Ellipse | None] = (),
     rules: EllipseRules = EllipseRules(),
-) -> list[Rim | None]:
+) -> Rims:
     """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
 
-    An edge is a step of at least such `contrasts` (B,).  None where nothing is like an ellipse.
+    An edge is a step of at least such `contrasts` (B,).  Where outlines are `ovals`, rims are
+    looked for at these.
     """
-    rims: list[Rim | None] = [None] * len(outlines)
-    # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
-    # convex hull, arcs have many: the corners alone favour the true rim.
-    hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
-    ellipses, _ = fit_ellipses(*_side_by_side(hulls), rules)
-    found = np.arange(len(outlines))
+    ellipses = _begun(outlines, ovals or [None] * len(outlines), rules)
+    edges, found = np.zeros((3, len(outlines))), np.arange(len(outlines))
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
     for least in (rules.coverage / 2, rules.coverage):
-        some, sound = ellipses.select(ellipses.sound), found[ellipses.sound]
-        if not sound.size:
-            return rims
-        of_sound = [signals[k] for k in sound.tolist()]
-        ellipses, edges = _rims_near(of_sound, some, contrasts[sound], least, rules)
-        found = sound
-    for k, i in enumerate(found.tolist()):
-        if ellipses.sound[k]:
-            numbers = (float(one[k]) for one in edges)
-            rims[i] = Rim(ellipses.one(k), *numbers)
-    return rims
+        found = found[ellipses.sound[found]]
+        if not found.size:
+            break
+        some, of_some = ellipses.select(found), [signals[k] for k in found.tolist()]
+        better, edges[:, found] = _rims_near(of_some, some, contrasts[found], least, rules)
+        ellipses = ellipses.replaced(found, better)
+    return Rims(ellipses, *edges)
+
+
+def _begun(
+    outlines: Sequence[Contour], ovals: Sequence[Ellipse | None], rules: EllipseRules
+) -> Ellipses:
+    """The ellipses near which rims are looked for: ovals, else those through hulls."""
+    begun = together([one or Ellipse((0.0, 0.0), (1.0, 1.0), 0.0) for one in ovals])
+    minor, major = np.sort(begun.half_axes, axis=1).T
+    there = np.array([one is not None for one in ovals], np.bool_) & (
+        minor >= rules.oblique * major
+    )
+    if not (rest := np.flatnonzero(~there)).size:
+        return begun
+    # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
+    # convex hull, arcs have many: the corners alone favour the true rim.
+    hulls = [cv2.convexHull(outlines[k])[:, 0] for k in rest.tolist()]
+    return begun.replaced(rest, fit_ellipses(*_side_by_side(hulls), rules)[0])
 
 
 def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
@@ -151,18 +190,24 @@ def _rims_near(
     return better, (count / DIRECTIONS, residual, _medians(steps, on_rim))
 
 
-def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRules()) -> bool:
-    """Whether a long ellipse is two spots that touch: dim in the middle, but not hollow."""
-    a, b = ellipse.half_axes
-    if max(a, b) < rules.long * min(a, b):
-        return False
-    directions = turns(np.array(ellipse.angle)).T * np.array([[a], [b]])
-    major, minor = directions if a >= b else directions[::-1]
-    along = np.stack([0 * major, major / 2, -major / 2, rules.waist * minor, -rules.waist * minor])
-    middle, one, other, *sides = sample(signal, (ellipse.centre + along)[:, None])[:, 0]
-    height = max(one, other) - min(sides)
-    dips = min(one, other) - middle > rules.dip * height
-    return bool(dips and middle - max(sides) > rules.ridge * height)
+def are_waisted(
+    signals: Sequence[Grey], ellipses: Ellipses, rules: EllipseRules = EllipseRules()
+) -> Mask:
+    """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow."""
+    axes, waisted = ellipses.half_axes, np.zeros(len(signals), dtype=np.bool_)
+    own = np.flatnonzero(axes.max(axis=1) >= rules.long * axes.min(axis=1))
+    if not own.size:
+        return waisted
+    directions = turns(ellipses.angle[own]).swapaxes(1, 2) * axes[own, :, None]
+    order = np.argsort(-axes[own], axis=1, kind="stable")[..., None]
+    along = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, rules.waist], [0.0, -rules.waist]])
+    places = ellipses.centre[own, None] + along @ np.take_along_axis(directions, order, axis=1)
+    of_own, still = [signals[k] for k in own.tolist()], np.zeros((2, *places.shape[:2]))
+    middle, *ends = sample_each(of_own, places.transpose(2, 0, 1), still, np.zeros(1))[0].T
+    (low, high), (left, right) = np.sort(ends[:2], axis=0), np.sort(ends[2:], axis=0)
+    height = high - left
+    waisted[own] = (low - middle > rules.dip * height) & (middle - right > rules.ridge * height)
+    return waisted
 
 
 def tolerance(minor: Any, rules: EllipseRules) -> Any:
@@ -279,9 +324,7 @@ def _edges(
     return edges, found > 0, steps, lows
 
 
-def _fall(
-    profiles: NDArray[np.float32], offsets: Floats
-) -> tuple[Singles, Floats, Mask, Singles]:
+def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Singles, Floats, Mask, Singles]:
     """Of profiles (k, n) how far each falls, where it is at half the height, whether it is.
 
     And how low it is outside.  Row by row, as there are many profiles and each is short.

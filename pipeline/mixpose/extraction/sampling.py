@@ -48,8 +48,8 @@ def sample_each(
 ) -> NDArray[np.float32]:
     """As `sample`, of B features, in an image for each, at so many steps (k,) beside their places.
 
-    Places and steps are (2, B, n), u and v, samples (k, B, n).  Only what is around each feature is turned
-    into single precision, not all between them.
+    Places and steps are (2, B, n), u and v, samples (k, B, n).  Only what is around each feature is
+    turned into single precision, not all between them.
     """
     samples = np.empty((len(offsets), *places.shape[1:]), np.float32)
     ends = places + steps * offsets.min(), places + steps * offsets.max()

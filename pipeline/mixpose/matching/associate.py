@@ -180,8 +180,8 @@ def _neighbours(
 
     Two at least, and all within reach; NaN is the distance of those that there are not.
     """
-    (L, n, _), most = y.shape, detections.shape[1]
-    if clouds or n * most <= DRAWING.few_pairs:
+    most = detections.shape[1]
+    if clouds or y.shape[1] * most <= DRAWING.few_pairs:
         away = detections[:, None] - y[:, :, None]
         squared = np.vecdot(away, away)
         for planes in clouds:  # each coordinate is in two of them
