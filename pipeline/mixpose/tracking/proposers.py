@@ -137,10 +137,13 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     that is small in an image looks almost the same tilted the other way.
     """
     kinds, most = frame.rules.look_alikes.kinds, -np.inf
-    # once more, where what is moved is better: two that are as good would take turns for ever
+    # from where what is moved is better on: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
-        yield from _as_evident(frame, ranked[0])
+        for start in _as_evident(frame, ranked[0]):
+            yield start
+            if ranked[0].log_evidence > most:
+                break
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
@@ -186,7 +189,8 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     # the value grows as the square of the features met
     values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
     fewer = best.matches.met.max() * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
-    for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
+    few = np.flatnonzero(fewer < rules.look_alikes.fewer)
+    for k in few[np.argsort(fewer[few], kind="stable")].tolist():  # the best first
         moved = _moves_alike(frame, T) if alike[k].is_step else None
         against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
         least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
