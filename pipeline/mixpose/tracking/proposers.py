@@ -15,9 +15,11 @@ from operator import add
 from typing import TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
+from mixpose.density import DRAWING
 from mixpose.fit import Fit, blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
@@ -186,16 +188,40 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     if not alike:
         return
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
+    most, own, limits = best.matches.met.max(), frame.prior(T)[0], []
+    for one, pose in zip(alike, poses[1:], strict=True):
+        moved = _moves_alike(frame, T) if one.is_step else None
+        against = own - frame.prior(pose if moved is None else moved)[0]
+        limits.append(1 + max(against, 0.0) / rules.acceptance.log_doubt)
+    least = rules.look_alikes.fewer * np.array(limits)
+    # mostly what has no detection near it tells, which is less than to look all up
+    near = _near_any(frame, poses)
+    (few,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()
+    if not few.size:
+        return
     # the value grows as the square of the features met
-    values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
-    fewer = best.matches.met.max() * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
-    few = np.flatnonzero(fewer < rules.look_alikes.fewer)
-    for k in few[np.argsort(fewer[few], kind="stable")].tolist():  # the best first
-        moved = _moves_alike(frame, T) if alike[k].is_step else None
-        against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
-        least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
-        if fewer[k] < rules.look_alikes.fewer * least:
-            yield frame.rival(best, poses[1 + k], frame.close, T_moved=moved)
+    values = np.sqrt(frame.finest.shares(poses[[0, *(1 + few)]], whole=True).sum(axis=0))
+    fewer = most * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
+    for k in np.argsort(fewer, kind="stable").tolist():  # the best first
+        if fewer[k] < least[few[k]]:
+            moved = _moves_alike(frame, T) if alike[few[k]].is_step else None
+            yield frame.rival(best, poses[1 + few[k]], frame.close, T_moved=moved)
+
+
+def _near_any(frame: Frame, poses: Floats) -> Floats:
+    """How many features have a detection near them at poses (H, 4, 4), or grey values may be.
+
+    The root of the sum of squares over sensors, as the value goes.
+    """
+    at = frame.finest.projection.project(poses)
+    near = at.seen.copy()
+    for k, (view, variance) in enumerate(zip(frame.views, frame.finest.variances[:, 0])):
+        points, m = view.observation.points, view.sensor.dimension
+        if points is not None:
+            reach = DRAWING.reach * np.sqrt(variance)
+            away, _ = cKDTree(points).query(at.y[k, ..., :m], distance_upper_bound=reach)
+            near[k] &= np.isfinite(away)
+    return np.asarray(np.linalg.norm(near.sum(axis=2), axis=0))
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
