@@ -25,7 +25,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import DRAWING, Atlas, all_pairs, close_pairs, matched_atlas, pairs_by_picture, peak
+from mixpose.density import (
+    DRAWING,
+    Atlas,
+    all_pairs,
+    close_pairs,
+    matched_atlas,
+    pairs_by_picture,
+    peak,
+)
 from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Indices
