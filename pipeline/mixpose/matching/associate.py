@@ -305,7 +305,9 @@ def _surroundings(
         near = np.abs(detections - middle[:, None]) <= half[:, None]
         beside = np.count_nonzero(near.all(axis=2), axis=1) - met
         unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
-    finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
+    finest = np.zeros(len(sigmas))
+    if seen.size > DRAWING.own_tiles:  # on pages
+        finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
     for k, one in enumerate(observations):
         if one.cell is not None:  # as many equal features as would give the energy of grey values
             near, far = (corner / one.sigma for corner in one.extent)
