@@ -40,11 +40,14 @@ from mixpose.records import Floats, Indices, Mask, Singles
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
 
+# One in so many of these is looked at first: an ellipse through half of the edges is near enough.
+FIRST = 2
+
 # Times that an ellipse is fitted again to the points near it.
 REFITS = 3
 
 _ANGLES = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
-_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_CIRCLE = np.array([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 @dataclass(frozen=True)
@@ -131,13 +134,13 @@ def find_rims(
     """
     ellipses = _begun(outlines, ovals or [None] * len(outlines), rules)
     edges, found = np.zeros((3, len(outlines))), np.arange(len(outlines))
-    # Once more from the better ellipse, which has all of a soft or broken rim within reach.
-    for least in (rules.coverage / 2, rules.coverage):
+    # Roughly first, then from the better ellipse, which has all of a soft or broken rim in reach.
+    for least, circle in ((rules.coverage / 2, _CIRCLE[:, ::FIRST]), (rules.coverage, _CIRCLE)):
         found = found[ellipses.sound[found]]
         if not found.size:
             break
         some, of_some = ellipses.select(found), [signals[k] for k in found.tolist()]
-        better, edges[:, found] = _rims_near(of_some, some, contrasts[found], least, rules)
+        better, edges[:, found] = _rims_near(of_some, some, contrasts[found], circle, least, rules)
         ellipses = ellipses.replaced(found, better)
     return Rims(ellipses, *edges)
 
@@ -169,14 +172,19 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signals: Sequence[Grey], others: Ellipses, contrasts: Floats, least: float, rules: EllipseRules
+    signals: Sequence[Grey],
+    others: Ellipses,
+    contrasts: Floats,
+    circle: Floats,
+    least: float,
+    rules: EllipseRules,
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each.
 
-    Those that have edges in less than a share `least` of the directions are not fitted.
+    Those that have edges in less than a share `least` of the directions (2, n) are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, others, contrasts, rules)
-    found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
+    edges, found, steps, lows = _edges(signals, others, contrasts, circle, rules)
+    found &= (found.sum(axis=1) >= least * circle.shape[1])[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
@@ -187,7 +195,7 @@ def _rims_near(
     squares = np.where(on_rim, distance, 0.0) ** 2
     residual = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
     better = replace(better, sound=better.sound & (count > 0))
-    return better, (count / DIRECTIONS, residual, _medians(steps, on_rim))
+    return better, (count / circle.shape[1], residual, _medians(steps, on_rim))
 
 
 def are_waisted(
@@ -290,15 +298,19 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signals: Sequence[Grey], ellipses: Ellipses, contrasts: Floats, rules: EllipseRules
+    signals: Sequence[Grey],
+    ellipses: Ellipses,
+    contrasts: Floats,
+    circle: Floats,
+    rules: EllipseRules,
 ) -> tuple[Floats, Mask, Floats, Floats]:
-    """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
+    """Edges (B, n, 2) along the normals of ellipses, to parts of a pixel, in directions (2, n).
 
     There the signal falls through half the height of the edge; whether by one of `contrasts`, well
-    within reach, by how much, and down to what (B, DIRECTIONS).
+    within reach, by how much, and down to what (B, n).
     """
     (a, b), angle = ellipses.half_axes.T[..., None], ellipses.angle[:, None]
-    (x, y), c, s = _CIRCLE.T, np.cos(angle), np.sin(angle)
+    (x, y), c, s = circle, np.cos(angle), np.sin(angle)
     on_rim = np.array([c * a * x - s * b * y, s * a * x + c * b * y])
     on_rim += ellipses.centre.T[..., None]
     # as long as one, across the rim
@@ -307,7 +319,7 @@ def _edges(
     normals = np.array([c * x - s * y, s * x + c * y])
     reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
     reach = reach.astype(np.intp)
-    where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
+    where, found, steps, lows = np.zeros((4, len(reach), circle.shape[1]))
     for whole in sorted(set(reach.tolist())):
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
@@ -315,8 +327,8 @@ def _edges(
         of_some = [signals[k] for k in some.tolist()]
         profiles = sample_each(of_some, on_rim[:, some], normals[:, some], offsets)
         step, place, below, low = _fall(profiles.reshape(len(offsets), -1), offsets)
-        shape = (len(some), DIRECTIONS)
-        sure = step >= np.repeat(contrasts[some], DIRECTIONS).astype(np.float32)
+        shape = (len(some), circle.shape[1])
+        sure = step >= np.repeat(contrasts[some], shape[1]).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
