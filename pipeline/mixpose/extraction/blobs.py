@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.constants import constant
-from mixpose.extraction.conics import Ellipse, distances, together
+from mixpose.extraction.conics import Ellipses, distances, joined, none, together
 from mixpose.extraction.contours import (
     Box,
     Contour,
@@ -38,7 +38,7 @@ from mixpose.extraction.contours import (
     neighbours,
     on_border,
     outlines,
-    oval,
+    ovals,
     pieces,
 )
 from mixpose.extraction.ellipse import EllipseRules, Rim, are_waisted, find_rims
@@ -91,12 +91,6 @@ class Blob(NamedTuple):
     length: float = 1.0  # by width
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
-
-    @classmethod
-    def of_rim(cls, rim: Rim, off: float | None) -> Blob:
-        """A disk."""
-        ellipse = rim.ellipse
-        return cls(*ellipse.centre, ellipse.area, ellipse.length, rim, off)
 
 
 def extract_blobs(
@@ -166,7 +160,6 @@ class Part:
     area: float  # number of pixels that it encloses
     level: float
     min_area: float  # of what is looked for in it
-    oval: Ellipse | None = None  # that it may be
     is_apart: bool = False
     # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
@@ -189,14 +182,14 @@ def find_blobs(
     ]
     parts = list(chain(*found))
     large = [part for part in parts if part.area > rules.small_area]
-    for part in large:
-        part.oval = oval(part.contour)
-    shapeless = [part for part in large if part.oval is None]
+    are_oval = ovals([part.contour for part in large])
+    shapeless = [part for part, is_oval in zip(large, are_oval.sound.tolist()) if not is_oval]
     for _ in range(2):
         for part in shapeless:
             _take_apart(part, rules, islands=True)
-        rest = _without_disks([*parts, *_below(shapeless)], rules)
-        parts, shapeless = [], [part for part in rest if not part.is_apart]
+        rest = _without_disks([*parts, *_below(shapeless)], are_oval, rules)
+        parts, are_oval = [], none(0)
+        shapeless = [part for part in rest if not part.is_apart]
     blobs = []
     for (scene, options), parts in zip(scenes, found, strict=True):
         _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
@@ -225,11 +218,15 @@ def _below(parts: Sequence[Part]) -> Iterator[Part]:
             yield from _below(layer)
 
 
-def _without_disks(parts: Sequence[Part], rules: BlobRules) -> list[Part]:
-    """The large ones that are no disks; the others know their disk."""
+def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) -> list[Part]:
+    """The large ones that are no disks; the others know their disk.
+
+    The ovals are of the first of them.
+    """
     large = [part for part in parts if part.area > rules.small_area]
-    outlined = [(part.scene, part.contour, part.oval) for part in large]
-    for part, disk in zip(large, _disks(outlined, rules), strict=True):
+    begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
+    outlined = [(part.scene, part.contour) for part in large]
+    for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):
         part.found = [disk] if disk else []
     return [part for part in large if not part.found]
 
@@ -250,8 +247,9 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
     shapeless = [part for part in parts if part.area > rules.small_area and not part.found]
     for group in neighbours([part.contour for part in shapeless], rules.contours):
         some = [shapeless[k] for k in group]
-        joined = [(some[0].scene, np.concatenate([part.contour for part in some]), None)]
-        rims = [disk for disk in _disks(joined if len(some) > 1 else [], rules) if disk]
+        several = [(some[0].scene, np.concatenate([part.contour for part in some]))]
+        several = several if len(some) > 1 else []
+        rims = [disk for disk in _disks(several, none(len(several)), rules) if disk]
         blobs += rims
         for part in some if not rims else []:
             inner = [blob for layer in part.inner for blob in _blobs_of(layer, rules)]
@@ -260,32 +258,34 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
 
 
 def _disks(
-    outlined: Sequence[tuple[Foreground, Contour, Ellipse | None]], rules: BlobRules
+    outlined: Sequence[tuple[Foreground, Contour]], are_oval: Ellipses, rules: BlobRules
 ) -> list[Blob | None]:
     """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
     disks: list[Blob | None] = [None] * len(outlined)
     if not outlined:
         return disks
-    scenes, contours, ovals = zip(*outlined, strict=True)
+    of_all, contours = zip(*outlined, strict=True)
+    scenes = list({id(scene): scene for scene in of_all}.values())
+    numbers = {id(scene): number for number, scene in enumerate(scenes)}
+    which = np.array([numbers[id(scene)] for scene in of_all])
     levels, greys = np.array([scene.level for scene in scenes]), [scene.grey for scene in scenes]
-    rims = find_rims(greys, contours, levels, ovals, rules.rims)
+    rims = find_rims(greys, which, contours, levels[which], are_oval, rules.rims)
     some = np.flatnonzero(rims.are_good(rules.rims))
-    some = some[
-        ~are_waisted([greys[k] for k in some.tolist()], rims.ellipses.select(some), rules.rims)
-    ]
-    contrasts = rims.contrast[some].tolist()
+    some = some[~are_waisted(greys, which[some], rims.ellipses.select(some), rules.rims)]
     stand_out = [
-        _stands_out(scenes[k], contours[k], c, rules) for k, c in zip(some.tolist(), contrasts)
+        _stands_out(of_all[k], contours[k], contrast, rules)
+        for k, contrast in zip(some.tolist(), rims.contrast[some].tolist())
     ]
     some = some[np.array(stand_out, np.bool_)]
-    of_some, ellipses = [scenes[k] for k in some.tolist()], rims.ellipses.select(some)
+    ellipses = rims.ellipses.select(some)
     # a larger one is told by its rim
     told = np.flatnonzero(ellipses.half_axes.prod(axis=1) < rules.large**2)
     beside = rules.spots.margin, rules.spots.centroid, rules.beside
-    off = off_centre([of_some[k] for k in told.tolist()], ellipses.select(told), *beside)
+    off = off_centre(scenes, which[some[told]], ellipses.select(told), *beside)
     by_number = dict(zip(told.tolist(), off.tolist(), strict=True))
+    areas, lengths = (part.tolist() for part in (ellipses.area, ellipses.length))
     for k, (place, rim) in enumerate(zip(some.tolist(), rims.select(some).each(), strict=True)):
-        disks[place] = Blob.of_rim(rim, by_number.get(k))
+        disks[place] = Blob(*rim.ellipse.centre, areas[k], lengths[k], rim, by_number.get(k))
     return disks
 
 

@@ -49,6 +49,16 @@ class Ellipses:
     angle: Floats  # (B,) radians; turns the first half-axis from u
     sound: Mask  # (B,) which of them are ellipses; the others are unit circles
 
+    @property
+    def area(self) -> Floats:
+        """Enclosed areas (B,) in px."""
+        return np.asarray(math.pi * self.half_axes.prod(axis=1))
+
+    @property
+    def length(self) -> Floats:
+        """By width (B,)."""
+        return np.asarray(self.half_axes.max(axis=1) / self.half_axes.min(axis=1))
+
     def select(self, chosen: Mask | NDArray[np.intp]) -> Ellipses:
         """Some of them."""
         parts = (self.centre, self.half_axes, self.angle, self.sound)
@@ -76,6 +86,18 @@ def together(ellipses: Sequence[Ellipse]) -> Ellipses:
         np.array([one.angle for one in ellipses]),
         np.ones(len(ellipses), dtype=np.bool_),
     )
+
+
+def none(count: int) -> Ellipses:
+    """So many unit circles that stand for no ellipse."""
+    zeros = np.zeros((count, 2))
+    return Ellipses(zeros, zeros + 1.0, zeros[:, 0], np.zeros(count, dtype=np.bool_))
+
+
+def joined(parts: Sequence[Ellipses]) -> Ellipses:
+    """Ellipses, and others after them."""
+    each = [(one.centre, one.half_axes, one.angle, one.sound) for one in parts]
+    return Ellipses(*map(np.concatenate, zip(*each)))
 
 
 def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:

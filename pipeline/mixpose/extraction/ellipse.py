@@ -30,7 +30,6 @@ from mixpose.extraction.conics import (
     Ellipses,
     distances,
     fit_conics,
-    together,
     turns,
 )
 from mixpose.extraction.contours import Contour
@@ -122,44 +121,40 @@ class Rims:
 
 def find_rims(
     signals: Sequence[Grey],
+    which: Indices,
     outlines: Sequence[Contour],
     contrasts: Floats,
-    ovals: Sequence[Ellipse | None] = (),
+    ovals: Ellipses,
     rules: EllipseRules = EllipseRules(),
 ) -> Rims:
-    """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
+    """The elliptical rims of bright features, by their outlines in pixels of signals (H, W).
 
-    An edge is a step of at least such `contrasts` (B,).  Where outlines are `ovals`, rims are
-    looked for at these.
+    `which` (B,) is the signal of each; an edge is a step of at least `contrasts` (B,).  Where
+    outlines are sound `ovals` (B), rims are looked for at these.
     """
-    ellipses = _begun(outlines, ovals or [None] * len(outlines), rules)
+    ellipses = _begun(outlines, ovals, rules)
     edges, found = np.zeros((3, len(outlines))), np.arange(len(outlines))
     # Roughly first, then from the better ellipse, which has all of a soft or broken rim in reach.
     for least, circle in ((rules.coverage / 2, _CIRCLE[:, ::FIRST]), (rules.coverage, _CIRCLE)):
         found = found[ellipses.sound[found]]
         if not found.size:
             break
-        some, of_some = ellipses.select(found), [signals[k] for k in found.tolist()]
-        better, edges[:, found] = _rims_near(of_some, some, contrasts[found], circle, least, rules)
+        at = signals, which[found], ellipses.select(found), contrasts[found]
+        better, edges[:, found] = _rims_near(*at, circle, least, rules)
         ellipses = ellipses.replaced(found, better)
     return Rims(ellipses, *edges)
 
 
-def _begun(
-    outlines: Sequence[Contour], ovals: Sequence[Ellipse | None], rules: EllipseRules
-) -> Ellipses:
+def _begun(outlines: Sequence[Contour], ovals: Ellipses, rules: EllipseRules) -> Ellipses:
     """The ellipses near which rims are looked for: ovals, else those through hulls."""
-    begun = together([one or Ellipse((0.0, 0.0), (1.0, 1.0), 0.0) for one in ovals])
-    minor, major = np.sort(begun.half_axes, axis=1).T
-    there = np.array([one is not None for one in ovals], np.bool_) & (
-        minor >= rules.oblique * major
-    )
-    if not (rest := np.flatnonzero(~there)).size:
-        return begun
+    minor, major = np.sort(ovals.half_axes, axis=1).T
+    rest = np.flatnonzero(~(ovals.sound & (minor >= rules.oblique * major)))
+    if not rest.size:
+        return ovals
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hulls = [cv2.convexHull(outlines[k])[:, 0] for k in rest.tolist()]
-    return begun.replaced(rest, fit_ellipses(*_side_by_side(hulls), rules)[0])
+    return ovals.replaced(rest, fit_ellipses(*_side_by_side(hulls), rules)[0])
 
 
 def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
@@ -173,6 +168,7 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 def _rims_near(
     signals: Sequence[Grey],
+    which: Indices,
     others: Ellipses,
     contrasts: Floats,
     circle: Floats,
@@ -183,7 +179,7 @@ def _rims_near(
 
     Those that have edges in less than a share `least` of the directions (2, n) are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, others, contrasts, circle, rules)
+    edges, found, steps, lows = _edges(signals, which, others, contrasts, circle, rules)
     found &= (found.sum(axis=1) >= least * circle.shape[1])[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
@@ -199,10 +195,13 @@ def _rims_near(
 
 
 def are_waisted(
-    signals: Sequence[Grey], ellipses: Ellipses, rules: EllipseRules = EllipseRules()
+    signals: Sequence[Grey],
+    which: Indices,
+    ellipses: Ellipses,
+    rules: EllipseRules = EllipseRules(),
 ) -> Mask:
     """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow."""
-    axes, waisted = ellipses.half_axes, np.zeros(len(signals), dtype=np.bool_)
+    axes, waisted = ellipses.half_axes, np.zeros(len(which), dtype=np.bool_)
     own = np.flatnonzero(axes.max(axis=1) >= rules.long * axes.min(axis=1))
     if not own.size:
         return waisted
@@ -210,8 +209,8 @@ def are_waisted(
     order = np.argsort(-axes[own], axis=1, kind="stable")[..., None]
     along = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, rules.waist], [0.0, -rules.waist]])
     places = ellipses.centre[own, None] + along @ np.take_along_axis(directions, order, axis=1)
-    of_own, still = [signals[k] for k in own.tolist()], np.zeros((2, *places.shape[:2]))
-    middle, *ends = sample_each(of_own, places.transpose(2, 0, 1), still, np.zeros(1))[0].T
+    lines = places.transpose(2, 0, 1), np.zeros((2, *places.shape[:2])), np.zeros(1)
+    middle, *ends = sample_each(signals, which[own], *lines)[0].T
     (low, high), (left, right) = np.sort(ends[:2], axis=0), np.sort(ends[2:], axis=0)
     height = high - left
     waisted[own] = (low - middle > rules.dip * height) & (middle - right > rules.ridge * height)
@@ -299,6 +298,7 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 def _edges(
     signals: Sequence[Grey],
+    which: Indices,
     ellipses: Ellipses,
     contrasts: Floats,
     circle: Floats,
@@ -324,8 +324,8 @@ def _edges(
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
         offsets = np.arange(-whole - 1.5, whole + 2)
-        of_some = [signals[k] for k in some.tolist()]
-        profiles = sample_each(of_some, on_rim[:, some], normals[:, some], offsets)
+        lines = on_rim[:, some], normals[:, some], offsets
+        profiles = sample_each(signals, which[some], *lines)
         step, place, below, low = _fall(profiles.reshape(len(offsets), -1), offsets)
         shape = (len(some), circle.shape[1])
         sure = step >= np.repeat(contrasts[some], shape[1]).astype(np.float32)

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from mixpose.extraction.background import Grey
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, Singles
 
 # OpenCV takes maps with sides below 32767.
 MOST_ROWS = 30000
@@ -44,9 +43,9 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
 
 
 def sample_each(
-    greys: Sequence[Grey], places: Floats, steps: Floats, offsets: Floats
-) -> NDArray[np.float32]:
-    """As `sample`, of B features, in an image for each, at so many steps (k,) beside their places.
+    greys: Sequence[Grey], which: Indices, places: Floats, steps: Floats, offsets: Floats
+) -> Singles:
+    """As `sample`, of features (B,) `which` image, at so many steps (k,) beside their places.
 
     Places and steps are (2, B, n), u and v, samples (k, B, n).  Only what is around each feature is
     turned into single precision, not all between them.
@@ -54,11 +53,9 @@ def sample_each(
     samples = np.empty((len(offsets), *places.shape[1:]), np.float32)
     ends = places + steps * offsets.min(), places + steps * offsets.max()
     lower, upper = np.minimum(*ends).min(axis=2).T, np.maximum(*ends).max(axis=2).T
-    images = {id(grey): grey for grey in greys}
-    numbers = np.array([id(grey) for grey in greys])
     beside = offsets.astype(np.float32)[:, None, None]
-    for number, grey in images.items():
-        own = np.flatnonzero(numbers == number)
+    for number, grey in enumerate(greys):
+        own = np.flatnonzero(which == number)
         last = np.array(grey.shape[::-1]) - 1
         first, end = (np.clip(one[own], 0, last).astype(np.intp) for one in (lower, upper))
         # the last pixel's neighbour is not looked at, but has to be there

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.extraction.conics import Ellipses, turns
 from mixpose.extraction.threshold import Foreground
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 
 # Patches of so many shapes are prepared for.
 SHAPES = 256
@@ -98,21 +98,25 @@ class Patches(NamedTuple):
 
 
 def off_centre(
-    scenes: Sequence[Foreground], rims: Ellipses, margin: int, least: float, beside: float
+    scenes: Sequence[Foreground],
+    which: Indices,
+    rims: Ellipses,
+    margin: int,
+    least: float,
+    beside: float,
 ) -> Floats:
     """How far the centres of ellipses (K,) may be off, px: from their grey values and of these.
 
-    Each is in a scene of its own or of others, too.
+    `which` (K,) is the scene of each.
 
     Up to `beside` px outside of an ellipse, what is brighter than a share of the peak counts, above
     the background `margin` px around it.  0 where nothing is, so that nothing is told.
     """
-    off, boxes, alike = np.zeros(len(scenes)), _boxes(rims), dict[tuple[int, int], list[int]]()
-    for k, (scene, side) in enumerate(zip(scenes, boxes[:, 2:].max(axis=1).tolist(), strict=True)):
-        alike.setdefault((id(scene), side // ALIKE), []).append(k)
-    for some in alike.values():
-        own = np.array(some)
-        patches = Patches.about(scenes[some[0]], boxes[own], margin)
+    off, boxes = np.zeros(len(which)), _boxes(rims)
+    kinds = len(scenes) * (boxes[:, 2:].max(axis=1, initial=0) // ALIKE) + which
+    for kind in np.unique(kinds).tolist():
+        own = np.flatnonzero(kinds == kind)
+        patches = Patches.about(scenes[kind % len(scenes)], boxes[own], margin)
         off[own] = _off(patches, rims.select(own), least, beside)
     return off
 
