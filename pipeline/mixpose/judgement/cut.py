@@ -100,6 +100,8 @@ def _larger(
     means, halves = np.append(mean, np.trace(BC)), np.append(variance, np.vdot(BC, BC.T))
     degrees, limits = means**2 / halves, float(chdtri(len(C), outside)) * means / halves
     shares = np.append(chances, whole)
+    some = shares > 1e-12  # of many cases most are next to impossible
+    degrees, limits, shares = degrees[some], limits[some], shares[some]
     enough = bisect_left(
         LARGER[:-1], True, key=lambda factor: chdtrc(degrees, factor * limits) @ shares <= outside
     )
