@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.extraction.blobs import extract_blobs
-from mixpose.extraction.conics import Ellipse, together
+from mixpose.extraction.conics import together
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centroids, off_centre
 from mixpose.extraction.threshold import Foreground
@@ -73,7 +73,7 @@ def test_an_ellipse_beside_the_light_that_it_is_of_seems_off_by_as_much() -> Non
     top = image.max(axis=1)
     scene = Foreground(image, 20.0, 40.0, noise=1.0, least_peak=60.0, judged=True, tops=top)
     u, v = MIDDLE.tolist()
-    right, beside = (Ellipse((u + d, v), (7.0, 7.0), 0.0) for d in (0.0, 0.5))
+    right, beside = ((u + d, v, 7.0, 7.0, 0.0) for d in (0.0, 0.5))
     off = off_centre([scene], np.zeros(2, np.intp), together([right, beside]), 3, 0.1, 2.0)
     assert off[0] < 0.03
     assert off[1] == pytest.approx(0.5, rel=0.1)

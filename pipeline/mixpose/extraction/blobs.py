@@ -272,11 +272,12 @@ def _disks(
     rims = find_rims(greys, which, contours, levels[which], are_oval, rules.rims)
     some = np.flatnonzero(rims.are_good(rules.rims))
     some = some[~are_waisted(greys, which[some], rims.ellipses.select(some), rules.rims)]
-    stand_out = [
-        _stands_out(of_all[k], contours[k], contrast, rules)
-        for k, contrast in zip(some.tolist(), rims.contrast[some].tolist())
-    ]
-    some = some[np.array(stand_out, np.bool_)]
+    contrasts = rims.contrast[some]
+    # mostly the brightest row of all tells, or pixel, which is quicker than the median
+    doubted = contrasts < np.array([_usual_step(scene, rules) for scene in scenes])[which[some]]
+    for row, k in [(row, some[row]) for row in np.flatnonzero(doubted).tolist()]:
+        doubted[row] = not _stands_out(of_all[k], contours[k], float(contrasts[row]), rules)
+    some = some[~doubted]
     ellipses = rims.ellipses.select(some)
     # a larger one is told by its rim
     told = np.flatnonzero(ellipses.half_axes.prod(axis=1) < rules.large**2)
@@ -284,17 +285,19 @@ def _disks(
     off = off_centre(scenes, which[some[told]], ellipses.select(told), *beside)
     by_number = dict(zip(told.tolist(), off.tolist(), strict=True))
     areas, lengths = (part.tolist() for part in (ellipses.area, ellipses.length))
-    for k, (place, rim) in enumerate(zip(some.tolist(), rims.select(some).each(), strict=True)):
-        disks[place] = Blob(*rim.ellipse.centre, areas[k], lengths[k], rim, by_number.get(k))
+    for k, (place, rim) in enumerate(zip(some.tolist(), rims.each(some), strict=True)):
+        disks[place] = Blob(rim.u, rim.v, areas[k], lengths[k], rim, by_number.get(k))
     return disks
+
+
+def _usual_step(scene: Foreground, rules: BlobRules) -> float:
+    """The step at a rim with which anything in a scene is a disk."""
+    return rules.spots.min_step * (scene.highest - scene.zero) if scene.judged else -math.inf
 
 
 def _stands_out(scene: Foreground, contour: Contour, contrast: float, rules: BlobRules) -> bool:
     """Whether what a contour with a rim encloses is a disk, by the step there."""
     least = rules.spots.min_step
-    # mostly the brightest row of all tells, or pixel, which is quicker than the median
-    if not scene.judged or contrast >= least * (scene.highest - scene.zero):
-        return True
     u, v, width, height = box = cv2.boundingRect(contour)
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
     if contrast >= least * (highest - scene.zero):
@@ -370,14 +373,14 @@ def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:
 
 def _outside_disks(blobs: list[Blob]) -> list[Blob]:
     """Blobs without those inside of a larger disk: scraps of its own broken rim."""
-    rims = [blob.rim.ellipse for blob in blobs if blob.rim is not None]
+    rims = [blob.rim[:5] for blob in blobs if blob.rim is not None]
     if not rims:
         return blobs
     centres, areas = np.array([blob[:2] for blob in blobs]), np.array([blob[2] for blob in blobs])
-    disks, disk_areas = together(rims), np.array([one.area for one in rims])
+    disks = together(rims)
     # few have another's centre in reach
     apart, _ = cKDTree(centres).query(disks.centre, k=2)
     near = np.flatnonzero(apart[:, 1] <= disks.half_axes.max(axis=1))
     within = distances(disks.select(near), centres) < 0
-    scrap = np.any(within & (areas < disk_areas[near, None]), axis=0)
+    scrap = np.any(within & (areas < disks.area[near, None]), axis=0)
     return [blob for blob, inner in zip(blobs, scrap.tolist(), strict=True) if not inner]

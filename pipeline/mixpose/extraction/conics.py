@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,24 +19,6 @@ MANY = 20  # conics from which on all at once take less than one by one
 SQUARED = 4  # times: of two quotients the larger counts as its 16th power; more would underflow
 
 _LEAST = 1e-3  # px, of a half-axis: points on a line make none
-
-
-class Ellipse(NamedTuple):
-    """An ellipse in pixel coordinates; `angle` in radians turns the first half-axis from u."""
-
-    centre: tuple[float, float]
-    half_axes: tuple[float, float]
-    angle: float
-
-    @property
-    def area(self) -> float:
-        """Enclosed area in px."""
-        return math.pi * self.half_axes[0] * self.half_axes[1]
-
-    @property
-    def length(self) -> float:
-        """By width."""
-        return max(self.half_axes) / min(self.half_axes)
 
 
 @dataclass(frozen=True)
@@ -72,20 +53,11 @@ class Ellipses:
             part[rows] = other
         return Ellipses(*parts)  # type: ignore[arg-type]
 
-    def each(self) -> list[Ellipse]:
-        """One by one."""
-        parts = (self.centre.tolist(), self.half_axes.tolist(), self.angle.tolist())
-        return [Ellipse((u, v), (a, b), angle) for (u, v), (a, b), angle in zip(*parts)]
 
-
-def together(ellipses: Sequence[Ellipse]) -> Ellipses:
-    """Single ellipses side by side."""
-    return Ellipses(
-        np.array([one.centre for one in ellipses]).reshape(-1, 2),
-        np.array([one.half_axes for one in ellipses]).reshape(-1, 2),
-        np.array([one.angle for one in ellipses]),
-        np.ones(len(ellipses), dtype=np.bool_),
-    )
+def together(rows: Sequence[Sequence[float]]) -> Ellipses:
+    """Single ellipses side by side: centre u, v, half-axes, and the angle of the first."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    return Ellipses(table[:, :2], table[:, 2:4], table[:, 4], np.ones(len(table), dtype=np.bool_))
 
 
 def none(count: int) -> Ellipses:

@@ -26,7 +26,6 @@ from mixpose.constants import constant
 from mixpose.extraction.background import Grey
 from mixpose.extraction.conics import (
     FEWEST,
-    Ellipse,
     Ellipses,
     distances,
     fit_conics,
@@ -84,12 +83,15 @@ class EllipseRules:
 
 
 class Rim(NamedTuple):
-    """An ellipse found in an image."""
+    """An ellipse found in an image, in px, as `conics.together` takes it."""
 
-    ellipse: Ellipse
+    u: float
+    v: float
+    half_axis: float  # in the direction of the angle, which is in radians
+    other: float
+    angle: float
     coverage: float  # share of the directions in which an edge lies on the ellipse
     residual: float  # RMS distance in px of these edges from it
-    contrast: float  # median step of the signal across the edges
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,9 @@ class Rims:
     """Those of B features; not sound where nothing is like an ellipse."""
 
     ellipses: Ellipses
-    coverage: Floats  # (B,) each, as of a `Rim`
-    residual: Floats
-    contrast: Floats
+    coverage: Floats  # (B,) as of a `Rim`
+    residual: Floats  # (B,) likewise
+    contrast: Floats  # (B,) median step of the signal across the edges
 
     def are_good(self, rules: EllipseRules = EllipseRules()) -> Mask:
         """Which (B,) are ellipses."""
@@ -108,15 +110,12 @@ class Rims:
         near = self.residual <= tolerance(minor, rules) / 2
         return np.asarray(self.ellipses.sound & (self.coverage >= least) & near)
 
-    def select(self, chosen: Mask | Indices) -> Rims:
-        """Some of them."""
-        parts = (self.coverage, self.residual, self.contrast)
-        return Rims(self.ellipses.select(chosen), *(part[chosen] for part in parts))
-
-    def each(self) -> list[Rim]:
-        """One by one."""
-        numbers = (one.tolist() for one in (self.coverage, self.residual, self.contrast))
-        return [Rim(*one) for one in zip(self.ellipses.each(), *numbers, strict=True)]
+    def each(self, chosen: Indices) -> list[Rim]:
+        """Some of them, one by one."""
+        ellipses = self.ellipses
+        parts = ellipses.centre, ellipses.half_axes, ellipses.angle, self.coverage, self.residual
+        table = np.column_stack([part[chosen] for part in parts])
+        return [Rim(*row) for row in table.tolist()]
 
 
 def find_rims(
