@@ -130,9 +130,8 @@ class BodyProjection:
         nodes = np.concatenate([middle + steps, middle - steps], axis=1)
         y, J, seen = self._batch.linearise(nodes.reshape(-1, 4 * count, 3))
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
-        # the determinant of J by two axes, as a product of cross products
-        around = _cross(axes[:, 0], axes[:, 1])[:, None]
-        weights = np.abs(np.vecdot(_cross(J[..., 0, :], J[..., 1, :]), around))
+        along, across = (np.vecdot(J, axes[:, k, None, :, None]) for k in (0, 1))
+        weights = np.abs(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
         total = weights.sum(axis=1)
         visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
         weights /= np.where(visible, total, 1.0)[:, None]
@@ -177,12 +176,6 @@ def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
     J[..., 4] = z * a - x * c
     J[..., 5] = x * b - y * a
     return J
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross products a × b (..., 3); `np.cross` takes longer."""
-    (x, y, z), (u, v, w) = ((c[..., 0], c[..., 1], c[..., 2]) for c in (a, b))
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def _across(directions: Floats) -> Floats:
