@@ -245,16 +245,16 @@ def _to_the_noise(
         weighed = errors.counted(variances, fields)
         end = np.minimum(np.minimum(narrow, before), blurs)
         is_noise, others = _are_noise(matches, variances, blurs, errors)
-        is_end = is_noise or bool((end > rules.narrower * blurs).all())
-        moved, shift = np.inf, np.inf
-        if not is_noise or best is None:
-            moved, shift = _moved(matches, free, end, variances)
         unlike, counted = weighed / counted, weighed
         are_right = bool(unlike.min() > rules.narrower**2 * unlike.max())  # weights by noise
-        if best is None:
-            is_end = (is_end and are_right) or moved < rules.moved**2
-        # as narrow as features are off by then at once, if nothing else pulls them
-        straight = np.inf if others or not are_right else shift
+        is_end = is_noise or bool((end > rules.narrower * blurs).all())
+        is_end = is_end and (are_right or best is not None)
+        straight, is_clear = np.inf, are_right and not others
+        if not is_end and (best is None or is_clear):
+            moved, shift = _moved(matches, free, end, variances)
+            is_end = best is None and moved < rules.moved**2
+            # as narrow as features are off by then at once, if nothing else pulls them
+            straight = shift if is_clear else np.inf
         narrower = np.maximum(end, np.minimum(blurs / rules.ratio, straight))
         is_only = best is None and is_end
         likelihood = np.inf if is_only else log_likelihood(narrow, matches, count, errors)
