@@ -224,6 +224,8 @@ def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) 
     The ovals are of the first of them.
     """
     large = [part for part in parts if part.area > rules.small_area]
+    if not large:
+        return []
     begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
     outlined = [(part.scene, part.contour) for part in large]
     for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):

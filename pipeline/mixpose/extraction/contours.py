@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.conics import Ellipses
+from mixpose.extraction.conics import Ellipses, none
 from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
@@ -101,8 +101,10 @@ def ovals(contours: Sequence[Contour]) -> Ellipses:
 
     Of most, rims say the same.
     """
+    if not contours:
+        return none(0)
     rows = [_MOMENTS(cv2.moments(contour)) for contour in contours]
-    area, u, v, uu, vv, uv = np.array(rows, dtype=np.float64).reshape(-1, 6).T
+    area, u, v, uu, vv, uv = np.array(rows, dtype=np.float64).T
     spread = np.sqrt(np.maximum(uu * vv - uv * uv, 0.0))
     sound = (area > 0) & (area * area >= OVAL * 4 * math.pi * spread)
     area = np.where(sound, area, 1.0)

@@ -13,10 +13,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from mixpose.extraction.conics import Ellipses, turns
+from mixpose.extraction.sampling import parts_of
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats, Indices
 
@@ -81,7 +81,7 @@ class Patches(NamedTuple):
         most = sides.max(axis=0)
         # those at the end of the window begin before their first pixel
         corners = np.minimum(first, size - most)
-        parts = sliding_window_view(scene.grey, most[::-1].tolist())[*corners.T[::-1]]
+        parts = parts_of(scene.grey, (int(most[1]), int(most[0])))[corners[:, 1], corners[:, 0]]
         signal = parts.astype(np.float32) - np.float32(scene.zero)
         skipped = (first - corners)[..., None]
         place = [np.arange(one) - left for one, left in zip(most.tolist(), skipped.swapaxes(0, 1))]

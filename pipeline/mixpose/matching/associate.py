@@ -201,6 +201,8 @@ def _neighbours(
 def _in_turn(one: Indices, other: Indices) -> Indices:
     """Which pairs (P,) come to be, of those before which neither of the two was taken."""
     taken, left = [], np.arange(len(one))
+    if len({*one.tolist()}) == len(one) == len({*other.tolist()}):
+        return left  # as a rule each has one
     while len(left):
         first, also = np.zeros(one.max() + 1, np.intp), np.zeros(other.max() + 1, np.intp)
         first[one[left][::-1]] = also[other[left][::-1]] = left[::-1]
