@@ -298,6 +298,26 @@ def test_edges_that_fix_no_ellipse_give_the_same_one_each_time() -> None:
     assert found[0] == found[1] == found[2]
 
 
+@pytest.mark.parametrize("shown", [72, 30, 18])
+def test_ellipses_of_many_rims_at_once_are_those_of_each_by_itself(shown: int) -> None:
+    rng = np.random.default_rng(8)
+    angles = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    axes, centres = rng.uniform(7.0, 12.0, (40, 1, 2)), rng.uniform(100.0, 1500.0, (40, 1, 2))
+    rims = centres + axes * circle + rng.normal(0.0, 0.02, (40, 72, 2))
+    chosen = np.tile(np.arange(72) < shown, (40, 1))
+    chosen[0, 5:] = False  # too few
+    together = fit_conics(rims, chosen, 0.15)
+    assert together.sound.tolist() == [False] + 39 * [True]
+    for k in range(1, 40):
+        alone = fit_conics(rims[k : k + 1], chosen[k : k + 1], 0.15)
+        # OpenCV computes in single precision, of which a quarter of a rim leaves less
+        assert np.abs(alone.centre[0] - together.centre[k]).max() < 1e-3
+        assert np.abs(np.sort(alone.half_axes[0]) - np.sort(together.half_axes[k])).max() < 1e-3
+    exact = fit_conics(centres + axes * circle, chosen, 0.15)
+    assert np.abs(exact.centre - centres[:, 0])[1:].max() < 1e-6
+
+
 def test_blobs_in_a_window_are_those_of_the_whole_image() -> None:
     truth = np.array([(100.3, 140.6), (160.2, 170.1), (300.5, 200.5)])
     image = photograph(spots((400, 500), truth, 1.6, 150), 14)

@@ -17,7 +17,11 @@ def test_many_features_in_several_images_are_looked_up_as_exactly_as_one() -> No
     turned = np.linspace(0, 2 * np.pi, 24)
     u = centres[:, :1] + radii[:, None] * np.cos(turned)
     v = centres[:, 1:] + radii[:, None] * np.sin(turned)
-    found = sample_each([images[k] for k in own], u, v)
+    places, steps = np.zeros((2, 2, *u.shape))
+    places[:] = centres.T[..., None]
+    steps[:] = np.array([u, v]) - places
+    middles, found = sample_each(images, own, places, steps, np.array([0.0, 1.0]))
+    assert (middles == middles[..., :1]).all()
     for k, image in enumerate(images):
         inside = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)
         alone = sample(image, np.stack(inside, axis=2)[own == k])

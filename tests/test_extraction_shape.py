@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.extraction.blobs import extract_blobs
-from mixpose.extraction.conics import Ellipse
+from mixpose.extraction.conics import together
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centroids, off_centre
 from mixpose.extraction.threshold import Foreground
@@ -73,13 +73,15 @@ def test_an_ellipse_beside_the_light_that_it_is_of_seems_off_by_as_much() -> Non
     top = image.max(axis=1)
     scene = Foreground(image, 20.0, 40.0, noise=1.0, least_peak=60.0, judged=True, tops=top)
     u, v = MIDDLE.tolist()
-    right, beside = (Ellipse((u + d, v), (7.0, 7.0), 0.0) for d in (0.0, 0.5))
-    off = off_centre([(scene, right), (scene, beside)], 3, 0.1, 2.0)
+    right, beside = ((u + d, v, 7.0, 7.0, 0.0) for d in (0.0, 0.5))
+    off = off_centre([scene], np.zeros(2, np.intp), together([right, beside]), 3, 0.1, 2.0)
     assert off[0] < 0.03
     assert off[1] == pytest.approx(0.5, rel=0.1)
     flat = replace(scene, grey=np.full((40, 40), 20.0, np.float32))
-    assert off_centre([(flat, right)], 3, 0.1, 2.0).tolist() == [0.0]
-    assert not off_centre([], 3, 0.1, 2.0).size
+    assert off_centre([flat], np.zeros(1, np.intp), together([right]), 3, 0.1, 2.0).tolist() == [
+        0.0
+    ]
+    assert not off_centre([scene], np.zeros(0, np.intp), together([]), 3, 0.1, 2.0).size
 
 
 @pytest.mark.parametrize("radius", [3.5, 4.3])

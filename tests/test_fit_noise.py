@@ -155,13 +155,16 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         sigmas = np.array([view.observation.sigma for view in views])
         matches = matched(objective, ascent.states[0])
         _, variances, blurs, _ = errors_seen(matches, 6, known, errors)
-        expected = near._moved(matches, ALL_FREE, blurs, variances)
+        expected, shift = near._moved(matches, ALL_FREE, blurs, variances)
         narrow = matched_objective(views, body, (blurs * sigmas).tolist())
         end = ascend(narrow, ascent.states, perturb, ALL_FREE, FitRules().sharp).states[0]
         unit = float(np.sqrt(variances.mean())) * 1.5 / NOISE_PX
         moved = apart(views, body, end, ascent.states[0]) / unit
         # two steps of iterated least squares, of which there are some more
         assert 0.6 * moved < np.sqrt(expected) < 1.2 * moved
+        y = objective.projection.project(np.concatenate([end[None], ascent.states])).y
+        farthest = (np.linalg.norm(y[:, 0] - y[:, 1], axis=2) / sigmas[:, None]).max()
+        assert 0.6 * farthest < shift < 1.2 * farthest
 
 
 def test_a_fit_has_the_matches_at_its_own_pose_and_the_noise_that_they_show(

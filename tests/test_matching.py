@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation, peak
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, crowding
-from mixpose.matching.associate import _residuals
+from mixpose.matching.associate import _in_turn, _neighbours, _residuals
 from mixpose.objective import View, matched_objective
 from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
@@ -164,3 +164,32 @@ def test_what_is_one_behind_the_other_in_an_image_is_told_apart_in_space() -> No
     np.testing.assert_array_equal(found.detections, [[0, 1, 2]] * len(PLANES))
     assert float(found.measurements.sum()) == 9.0
     assert float(found.squares.sum()) == pytest.approx(3 * 0.5 / 1.5**2)
+
+
+def test_of_many_detections_the_nearest_and_all_in_reach_are_those_of_each_pair_by_itself() -> None:
+    rng = np.random.default_rng(5)
+    y, detections = rng.uniform(0, 100, (2, 120, 2)), rng.uniform(0, 100, (2, 150, 2))
+    detections[1, 90:] = np.nan  # a sensor that has fewer
+    reach = rng.uniform(0, 15.0**2, (2, 120))
+    which, squared = _neighbours(y, detections, reach, ())
+    away = detections[:, None] - y[:, :, None]
+    each = np.vecdot(away, away)
+    for k in range(2):
+        for i in range(120):
+            is_there = np.isfinite(squared[k, i])
+            found = dict(zip(which[k, i, is_there].tolist(), squared[k, i, is_there].tolist()))
+            near = np.argsort(each[k, i])
+            within = np.flatnonzero(each[k, i] <= reach[k, i]).tolist()
+            assert set(found) >= {*near[:2].tolist(), *within}
+            assert all(s == pytest.approx(each[k, i, j]) for j, s in found.items())
+
+
+def test_pairs_come_to_be_in_turn_as_if_one_by_one() -> None:
+    rng = np.random.default_rng(6)
+    one, other = rng.integers(0, 20, (2, 200))
+    taken: list[int] = []
+    for k in range(200):
+        if one[k] not in one[taken] and other[k] not in other[taken]:
+            taken.append(k)
+    assert _in_turn(one, other).tolist() == taken
+    assert not _in_turn(one[:0], other[:0]).size

@@ -391,3 +391,31 @@ def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
     judged = likelihood.judge(likelihood.fit(start), start)
     assert judged.residual_ratio > 1
     assert list(narrowed(data, likelihood, judged)) == []
+
+
+def test_narrow_blurs_are_tried_where_a_spot_that_is_off_can_carry_the_others(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # one spot is 8 standard deviations off: of eight features, whose pose is a third of what each
+    # tells, it moves some by more than the noise; of 200 itself, the most, by a sixth of it
+    many = np.random.default_rng(3).uniform(-80, 80, (200, 3))
+    for body in (EIGHT, Body("many", tuple(PointFeature(point) for point in many))):
+        tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+        track = tracker.begin()
+        for k in range(6):
+            seen = detect(pinhole_cameras, body, TRUTH, noise=0.03, seed=k)
+            track, _ = tracker.advance(track, k, k / 30, seen)
+        views = []
+        for k, camera in enumerate(pinhole_cameras):
+            y = camera.project(transform(TRUTH, body.means))[0]
+            y += np.random.default_rng(k).normal(0, 0.02, y.shape)
+            y[2] += [0.24 * (k == 0), 0.0]
+            views.append(view_of(str(k), camera, y))
+        data = tracker.data(track, 6, 6 / 30, views)
+        likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
+        judged = likelihood.judge(likelihood.fit(start), start)
+        judged = replace(judged, proposer="predicted")
+        off = data.rules.judgement.noise.errors.are_off(judged.used, judged.variances[:, None])
+        assert off[0, 2]
+        assert judged.residual_ratio <= 1
+        assert bool(list(narrowed(data, likelihood, judged))) == (body is EIGHT)

@@ -100,6 +100,23 @@ def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
     assert not list(look_alikes(data, [judged_here(data, TRUTH)]))
 
 
+def test_of_places_of_a_slipped_grid_the_best_is_tried_first_and_then_only_its_own_rivals(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    board = grid(7, 5)
+    tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
+    data = data_of(tracker, detect(pinhole_cameras, board, TRUTH))
+    ranked = [judged_here(data, shifted(TRUTH, np.array([20.0, 20.0, 0.0])))]
+    assert len(list(look_alikes(data, ranked))) > 1
+    starts = []
+    for start in look_alikes(data, ranked):
+        starts.append(start.T_world_object)
+        ranked.insert(0, judged_here(data, start.T_world_object))
+    # of the truth there are none
+    (first,) = starts
+    assert np.abs(first - TRUTH).max() < 1e-9
+
+
 def test_poses_that_are_as_evident_do_not_take_turns_for_ever(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from make_synthetic import RECORDINGS, Recording
 
 import mixpose
-from benchmarks.recordings import session_text, simulated, write_mjpeg, write_session
+from benchmarks.recordings import EYES, session_text, simulated, write_mjpeg, write_session
 from benchmarks.timing import PROCESSOR, show
 from mixpose import runner
 from mixpose.frames import Source
@@ -113,6 +113,22 @@ def plate(folder: Path) -> Session:
     return simulated(folder / "plate", text, options)
 
 
+def sheet(folder: Path) -> Session:
+    """Two cameras; a sheet of 450 dark dots, all alike but four, that is not quite flat."""
+    y, x = np.divmod(np.arange(450), 25)
+    large = np.isin(x, (8, 16)) & np.isin(y, (5, 12))
+    # as bent, by their distance, as those of the real recording
+    bent = np.random.default_rng(0).normal(0.0, 1.2, 450)
+    dots = np.stack([20.0 * (x - 12.0), bent, 20.0 * (y - 8.5)], axis=1)  # seen along y
+    radii = np.where(large, 9.0, 4.0).tolist()
+    shape = f'shape = "disk"\nradius = {radii}\nnormals = {[[0, -1, 0]] * 450}'
+    sources, size = [f'"{name}*.png"' for name in "ab"], (1920, 1440)
+    text = session_text(sources, size, 2600.0, points=dots.tolist(), shape=shape, eyes=EYES[::3])
+    text += '[extract]\npolarity = "dark"\n'
+    options = replace(MOTION, background=60.0, brightness=150.0, noise=2.0)
+    return simulated(folder / "sheet", text, options)
+
+
 def made(name: str) -> Scene:
     """A recording of data/synthetic, made as it was."""
 
@@ -128,20 +144,32 @@ def recorded(path: str) -> Scene:
     return lambda _: load_session(Path(os.environ["MIXPOSE_RECORDINGS"]) / path)
 
 
-SCENES: Mapping[str, tuple[Scene, float | None]] = {  # ms of a tracked frame that are aimed at
-    "laboratory, two cameras": (laboratory, 1.2),
-    "laboratory, video": (video, 0.8),
-    "hand scene, three cameras": (hand, 15.0),
-    "real room, two cameras": (made("real_room"), 15.0),
-    "four bodies, two cameras": (made("several_bodies"), 15.0),
-    "plate of dark dots, one camera": (plate, 15.0),
+@dataclass(frozen=True)
+class Aim:
+    """Milliseconds of processor time that a frame is aimed to take at most."""
+
+    tracked: float | None = None
+    first: float | None = None
+
+
+SCENES: Mapping[str, tuple[Scene, Aim]] = {
+    "laboratory, two cameras": (laboratory, Aim(1.2)),
+    "laboratory, video": (video, Aim(0.8)),
+    "hand scene, three cameras": (hand, Aim(15.0)),
+    "real room, two cameras": (made("real_room"), Aim(15.0)),
+    "four bodies, two cameras": (made("several_bodies"), Aim(15.0)),
+    "plate of dark dots, one camera": (plate, Aim(15.0)),
+    "sheet of 450 dots, two cameras": (sheet, Aim(60.0, first=1500.0)),
 }
-REAL: Mapping[str, tuple[Scene, float | None]] = {
-    "box of 72 corners, two tables": (recorded("tag_box/session.toml"), 15.0),
-    "block of 40 corners, one table": (recorded("tag_block/session.toml"), 20.0),
-    "web cams, four tables": (recorded("webcams4_a/session_reference.toml"), None),
-    "sheet of 450 dots, two cameras": (recorded("dots_plate/session.toml"), 60.0),
-}
+REAL: Mapping[str, tuple[Scene, Aim]] = {
+    "box of 72 corners, two tables": (recorded("tag_box/session.toml"), Aim(15.0)),
+    "block of 40 corners, one table": (recorded("tag_block/session.toml"), Aim(20.0)),
+    "web cams, four tables": (recorded("webcams4_a/session_reference.toml"), Aim()),
+    # photographs, of which each is searched for
+    "sheet of 450 dots, two photographs": (
+        recorded("dots_plate/session.toml"), Aim(first=1500.0),
+    ),
+}  # fmt: skip
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
@@ -157,11 +185,12 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return figures
 
 
-def told(figures: dict[str, Any], aim: float | None) -> dict[str, Any]:
+def told(figures: dict[str, Any], aim: Aim) -> dict[str, Any]:
     """The figures, printed."""
+    aims = {"first_ms": aim.first, "tracked_ms": aim.tracked}
     for key, value in figures.items():
         if isinstance(value, float | int):
-            show(key.replace("_", " "), value, at_most=aim if key == "tracked_ms" else None)
+            show(key.replace("_", " "), value, at_most=aims.get(key))
     print("  by room, ms:", ", ".join(f"{k} {v:.3g}" for k, v in figures["rooms_ms"].items()))
     return figures
 

@@ -41,6 +41,7 @@ def session_text(
     markers: int | None = None,
     points: Sequence[Sequence[float]] | None = None,
     shape: str = "",
+    eyes: Sequence[Sequence[float]] = EYES,
 ) -> str:
     """A session of one camera to four, the body's first pose given."""
     turn = Rotation.from_euler("xyz", [0.2, -0.3, 0.4]).as_rotvec().tolist()
@@ -52,7 +53,7 @@ def session_text(
     ]  # fmt: skip
     centre = [(side - 1) / 2 for side in resolution]
     K = [[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]]
-    for name, source, eye in zip(NAMES, sources, EYES):
+    for name, source, eye in zip(NAMES, sources, eyes):
         T = looking_at(np.array(eye), np.zeros(3))
         lines += [
             "[[sensor]]", f'name = "{name}"', 'model = "pinhole"', f"source = {source}",

@@ -45,8 +45,8 @@ _NEAR = (
     Mutant(
         "fit-false-spots-draw-unnoticed",
         "fit/near.py",
-        "far | (matches.beside < errors.met",
-        "far | (matches.beside < 0 * errors.met",
+        "np.count_nonzero(matches.beside < errors.met",
+        "np.count_nonzero(matches.beside < 0 * errors.met",
         "the pose is drawn to a false spot beside a feature that is met, or to a neighbour's",
     ),
     Mutant(
@@ -62,8 +62,8 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "return not np.count_nonzero(far | (matches.beside < errors.met * blurs[:, None]))",
-        "return True",
+        "return not (far or others), ",
+        "return True, ",
         "a cut spot bends the pose",
         ("test_fit_noise.py",),
     ),

@@ -151,8 +151,8 @@ _SHAPES = (
     Mutant(
         "extraction-many-spots-swap-u-and-v",
         "extraction/single_spots.py",
-        "centres + np.stack([first_u, first_v], axis=1)",
-        "centres + np.stack([first_v, first_u], axis=1)",
+        "centres + corners, off",
+        "centres + corners[:, ::-1], off",
         "three spots and more are found at mirrored places",
         (_BLOBS,),
     ),
@@ -175,7 +175,7 @@ _SHAPES = (
     Mutant(
         "extraction-scraps-within-disks",
         "extraction/blobs.py",
-        "within & (areas < np.array(disk_areas)[:, None])",
+        "within & (areas < disks.area[near, None])",
         "within & (areas < 0)",
         "the islands in a ring count as features beside it",
         (_BLOBS,),

@@ -140,9 +140,15 @@ class Atlas:
             of, which = np.nonzero(inside[..., 0] & inside[..., 1] & of_sensor)
             return of, which
         apart = 2 * self._reach  # along a third coordinate: no sensor reaches another
-        tiles = cKDTree(np.column_stack([middles, apart * sensors]))
+        tiles = np.column_stack([middles, apart * sensors])
         tree = cKDTree(np.column_stack([self._q, apart * self._sensor]))
-        pairs = tiles.sparse_distance_matrix(tree, self._reach, np.inf, output_type="ndarray")
+        away, nearest = tree.query(tiles, k=3, p=np.inf, distance_upper_bound=self._reach)
+        near = np.isfinite(away)
+        if not near[:, -1].any():  # two at most, as where blurs are narrow
+            of, place = near.nonzero()
+            return of, nearest[of, place]
+        all_of_them = cKDTree(tiles)
+        pairs = all_of_them.sparse_distance_matrix(tree, self._reach, np.inf, output_type="ndarray")
         order = np.lexsort((pairs["j"], pairs["i"]))
         return pairs["i"][order], pairs["j"][order]
 

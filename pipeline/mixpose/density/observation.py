@@ -200,12 +200,19 @@ def peak(variance: Any, dimension: Any) -> Any:
 
 def close_pairs(places: Floats, variances: Floats) -> Indices:
     """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m), each blurred."""
-    reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
-    each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
     n = places.shape[1]
-    numbers = np.sort(np.concatenate(each) @ [n, 1])
+    _, i, j = pairs_by_picture(places, variances)
+    numbers = np.sort(n * i + j)
     is_first = np.append(True, numbers[1:] > numbers[:-1])[: len(numbers)]
     return np.stack(np.divmod(numbers[is_first], n), axis=1)
+
+
+def pairs_by_picture(places: Floats, variances: Floats) -> tuple[Indices, Indices, Indices]:
+    """The same by pictures: numbers (P,) of these, ascending, and of the points i < j."""
+    reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
+    each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
+    i, j = np.concatenate(each).T
+    return np.arange(len(each)).repeat([len(pairs) for pairs in each]), i, j
 
 
 @lru_cache

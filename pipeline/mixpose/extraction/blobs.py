@@ -18,28 +18,30 @@ import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mixpose.constants import constant
-from mixpose.extraction.conics import distances, together
+from mixpose.extraction.conics import Ellipses, distances, joined, none, together
 from mixpose.extraction.contours import (
     Box,
     Contour,
     ContourRules,
     cut_out,
     filled_area,
-    is_oval,
     is_solid,
     length_by_width,
     neighbours,
     on_border,
     outlines,
+    ovals,
     pieces,
 )
-from mixpose.extraction.ellipse import EllipseRules, Rim, find_rims, is_waisted
+from mixpose.extraction.ellipse import EllipseRules, Rim, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import off_centre
 from mixpose.extraction.single_spots import all_spots
@@ -80,8 +82,7 @@ class BlobRules:
     finest: float = constant(0.01, "px, that this is at least: pixels alone make as much")
 
 
-@dataclass(frozen=True)
-class Blob:
+class Blob(NamedTuple):
     """One blob: centre in pixels of the window, area in px, and the rim of a disk."""
 
     u: float
@@ -90,12 +91,6 @@ class Blob:
     length: float = 1.0  # by width
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
-
-    @classmethod
-    def of_rim(cls, rim: Rim, off: float | None) -> Blob:
-        """A disk."""
-        ellipse = rim.ellipse
-        return cls(*ellipse.centre, ellipse.area, ellipse.length, rim, off)
 
 
 def extract_blobs(
@@ -186,12 +181,15 @@ def find_blobs(
         _parts(scene, outlines(scene), scene.level, options.min_area) for scene, options in scenes
     ]
     parts = list(chain(*found))
-    shapeless = [p for p in parts if p.area > rules.small_area and not is_oval(p.contour)]
+    large = [part for part in parts if part.area > rules.small_area]
+    are_oval = ovals([part.contour for part in large])
+    shapeless = [part for part, is_oval in zip(large, are_oval.sound.tolist()) if not is_oval]
     for _ in range(2):
         for part in shapeless:
             _take_apart(part, rules, islands=True)
-        rest = _without_disks([*parts, *_below(shapeless)], rules)
-        parts, shapeless = [], [part for part in rest if not part.is_apart]
+        rest = _without_disks([*parts, *_below(shapeless)], are_oval, rules)
+        parts, are_oval = [], none(0)
+        shapeless = [part for part in rest if not part.is_apart]
     blobs = []
     for (scene, options), parts in zip(scenes, found, strict=True):
         _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
@@ -220,11 +218,17 @@ def _below(parts: Sequence[Part]) -> Iterator[Part]:
             yield from _below(layer)
 
 
-def _without_disks(parts: Sequence[Part], rules: BlobRules) -> list[Part]:
-    """The large ones that are no disks; the others know their disk."""
+def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) -> list[Part]:
+    """The large ones that are no disks; the others know their disk.
+
+    The ovals are of the first of them.
+    """
     large = [part for part in parts if part.area > rules.small_area]
-    disks = _disks([(part.scene, part.contour) for part in large], rules)
-    for part, disk in zip(large, disks, strict=True):
+    if not large:
+        return []
+    begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
+    outlined = [(part.scene, part.contour) for part in large]
+    for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):
         part.found = [disk] if disk else []
     return [part for part in large if not part.found]
 
@@ -245,8 +249,9 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
     shapeless = [part for part in parts if part.area > rules.small_area and not part.found]
     for group in neighbours([part.contour for part in shapeless], rules.contours):
         some = [shapeless[k] for k in group]
-        joined = [(some[0].scene, np.concatenate([part.contour for part in some]))]
-        rims = [disk for disk in _disks(joined if len(some) > 1 else [], rules) if disk]
+        several = [(some[0].scene, np.concatenate([part.contour for part in some]))]
+        several = several if len(some) > 1 else []
+        rims = [disk for disk in _disks(several, none(len(several)), rules) if disk]
         blobs += rims
         for part in some if not rims else []:
             inner = [blob for layer in part.inner for blob in _blobs_of(layer, rules)]
@@ -254,43 +259,53 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
     return blobs
 
 
-def _disks(outlined: Sequence[tuple[Foreground, Contour]], rules: BlobRules) -> list[Blob | None]:
+def _disks(
+    outlined: Sequence[tuple[Foreground, Contour]], are_oval: Ellipses, rules: BlobRules
+) -> list[Blob | None]:
     """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
+    disks: list[Blob | None] = [None] * len(outlined)
     if not outlined:
-        return []
-    scenes, contours = zip(*outlined, strict=True)
-    levels = np.array([scene.level for scene in scenes])
-    rims = find_rims([scene.grey for scene in scenes], contours, levels, rules.rims)
-    disks = [
-        rim if rim is not None and _is_disk(scene, contour, rim, rules) else None
-        for (scene, contour), rim in zip(outlined, rims, strict=True)
-    ]
+        return disks
+    of_all, contours = zip(*outlined, strict=True)
+    scenes = list({id(scene): scene for scene in of_all}.values())
+    numbers = {id(scene): number for number, scene in enumerate(scenes)}
+    which = np.array([numbers[id(scene)] for scene in of_all])
+    levels, greys = np.array([scene.level for scene in scenes]), [scene.grey for scene in scenes]
+    rims = find_rims(greys, which, contours, levels[which], are_oval, rules.rims)
+    some = np.flatnonzero(rims.are_good(rules.rims))
+    some = some[~are_waisted(greys, which[some], rims.ellipses.select(some), rules.rims)]
+    contrasts = rims.contrast[some]
+    # mostly the brightest row of all tells, or pixel, which is quicker than the median
+    doubted = contrasts < np.array([_usual_step(scene, rules) for scene in scenes])[which[some]]
+    for row, k in [(row, some[row]) for row in np.flatnonzero(doubted).tolist()]:
+        doubted[row] = not _stands_out(of_all[k], contours[k], float(contrasts[row]), rules)
+    some = some[~doubted]
+    ellipses = rims.ellipses.select(some)
     # a larger one is told by its rim
-    told = {
-        k: (scene, rim.ellipse)
-        for k, (scene, rim) in enumerate(zip(scenes, disks, strict=True))
-        if rim and rim.ellipse.area < math.pi * rules.large**2
-    }
-    off = off_centre([*told.values()], rules.spots.margin, rules.spots.centroid, rules.beside)
-    by_number = dict(zip(told, off.tolist(), strict=True))
-    return [
-        None if rim is None else Blob.of_rim(rim, by_number.get(k)) for k, rim in enumerate(disks)
-    ]
+    told = np.flatnonzero(ellipses.half_axes.prod(axis=1) < rules.large**2)
+    beside = rules.spots.margin, rules.spots.centroid, rules.beside
+    off = off_centre(scenes, which[some[told]], ellipses.select(told), *beside)
+    by_number = dict(zip(told.tolist(), off.tolist(), strict=True))
+    areas, lengths = (part.tolist() for part in (ellipses.area, ellipses.length))
+    for k, (place, rim) in enumerate(zip(some.tolist(), rims.each(some), strict=True)):
+        disks[place] = Blob(rim.u, rim.v, areas[k], lengths[k], rim, by_number.get(k))
+    return disks
 
 
-def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) -> bool:
-    """Whether what a contour encloses is a disk with a rim."""
-    if not rim.is_good(rules.rims) or is_waisted(scene.grey, rim.ellipse, rules.rims):
-        return False
-    if not scene.judged:
-        return True
-    # mostly the brightest pixel tells, which is quicker than the median
+def _usual_step(scene: Foreground, rules: BlobRules) -> float:
+    """The step at a rim with which anything in a scene is a disk."""
+    return rules.spots.min_step * (scene.highest - scene.zero) if scene.judged else -math.inf
+
+
+def _stands_out(scene: Foreground, contour: Contour, contrast: float, rules: BlobRules) -> bool:
+    """Whether what a contour with a rim encloses is a disk, by the step there."""
+    least = rules.spots.min_step
     u, v, width, height = box = cv2.boundingRect(contour)
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
-    if rim.contrast >= rules.spots.min_step * (highest - scene.zero):
+    if contrast >= least * (highest - scene.zero):
         return True
     patch, inside, _ = cut_out(scene, contour, box, 0)
-    return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)
+    return contrast >= least * _brightness(scene, patch, inside)
 
 
 def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
@@ -360,12 +375,14 @@ def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:
 
 def _outside_disks(blobs: list[Blob]) -> list[Blob]:
     """Blobs without those inside of a larger disk: scraps of its own broken rim."""
-    disks = [(blob.rim.ellipse, blob.area) for blob in blobs if blob.rim is not None]
-    if not disks:
+    rims = [blob.rim[:5] for blob in blobs if blob.rim is not None]
+    if not rims:
         return blobs
-    rims, disk_areas = zip(*disks, strict=True)
-    centres = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64)
-    areas = np.array([blob.area for blob in blobs])
-    within = distances(together(list(rims)), centres) < 0
-    scrap = np.any(within & (areas < np.array(disk_areas)[:, None]), axis=0)
+    centres, areas = np.array([blob[:2] for blob in blobs]), np.array([blob[2] for blob in blobs])
+    disks = together(rims)
+    # few have another's centre in reach
+    apart, _ = cKDTree(centres).query(disks.centre, k=2)
+    near = np.flatnonzero(apart[:, 1] <= disks.half_axes.max(axis=1))
+    within = distances(disks.select(near), centres) < 0
+    scrap = np.any(within & (areas < disks.area[near, None]), axis=0)
     return [blob for blob, inner in zip(blobs, scrap.tolist(), strict=True) if not inner]

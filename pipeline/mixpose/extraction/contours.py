@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, TypeAlias
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
+from mixpose.extraction.conics import Ellipses, none
 from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
@@ -24,6 +26,8 @@ Box: TypeAlias = Sequence[int]
 MOST_ROWS_SHARE = 0.5
 
 CONTOUR_SAMPLES = 64
+
+_MOMENTS = itemgetter("m00", "m10", "m01", "mu20", "mu02", "mu11")
 
 # Of an ellipse's area for its moments, from which it is taken for one until rims tell.
 OVAL = 0.985
@@ -93,11 +97,23 @@ def length_by_width(contour: Contour) -> float:
     return (math.sqrt(scale * long) + 0.5) / (math.sqrt(scale * short) + 0.5)
 
 
-def is_oval(contour: Contour) -> bool:
-    """Whether a contour may be an ellipse, by its area and moments: of most, rims say the same."""
-    m = cv2.moments(contour)
-    spread = math.sqrt(max(m["mu20"] * m["mu02"] - m["mu11"] ** 2, 0.0))
-    return bool(m["m00"] ** 2 >= OVAL * 4 * math.pi * spread)
+def ovals(contours: Sequence[Contour]) -> Ellipses:
+    """The ellipses that have the moments of contours; sound where they may be those by their area.
+
+    Of most, rims say the same.
+    """
+    if not contours:
+        return none(0)
+    rows = [_MOMENTS(cv2.moments(contour)) for contour in contours]
+    area, u, v, uu, vv, uv = np.array(rows, dtype=np.float64).T
+    spread = np.sqrt(np.maximum(uu * vv - uv * uv, 0.0))
+    sound = (area > 0) & (area * area >= OVAL * 4 * math.pi * spread)
+    area = np.where(sound, area, 1.0)
+    middle, half = (uu + vv) / 2, np.hypot((uu - vv) / 2, uv)
+    # the contour runs through the centres of the outermost pixels: it is half a pixel inside
+    squares = np.maximum(np.stack([middle + half, middle - half], axis=1), 0.0) / area[:, None]
+    centres = np.stack([u, v], axis=1) / area[:, None]
+    return Ellipses(centres, 2 * np.sqrt(squares) + 0.5, 0.5 * np.arctan2(2 * uv, uu - vv), sound)
 
 
 def is_solid(contour: Contour, least: float) -> bool:

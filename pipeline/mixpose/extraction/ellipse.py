@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,19 +24,28 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
-from mixpose.extraction.conics import FEWEST, Ellipse, Ellipses, distances, fit_conics, turns
+from mixpose.extraction.conics import (
+    FEWEST,
+    Ellipses,
+    distances,
+    fit_conics,
+    turns,
+)
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.sampling import sample, sample_each
-from mixpose.records import Floats, Mask
+from mixpose.extraction.sampling import sample_each
+from mixpose.records import Floats, Indices, Mask, Singles
 
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
+
+# One in so many of these is looked at first: an ellipse through half of the edges is near enough.
+FIRST = 2
 
 # Times that an ellipse is fitted again to the points near it.
 REFITS = 3
 
 _ANGLES = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
-_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_CIRCLE = np.array([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 @dataclass(frozen=True)
@@ -73,51 +82,78 @@ class EllipseRules:
     hidden_arcs: int = constant(8, "arcs, of which three that follow each other may be hidden")
 
 
-@dataclass(frozen=True)
-class Rim:
-    """An ellipse found in an image."""
+class Rim(NamedTuple):
+    """An ellipse found in an image, in px, as `conics.together` takes it."""
 
-    ellipse: Ellipse
+    u: float
+    v: float
+    half_axis: float  # in the direction of the angle, which is in radians
+    other: float
+    angle: float
     coverage: float  # share of the directions in which an edge lies on the ellipse
     residual: float  # RMS distance in px of these edges from it
-    contrast: float  # median step of the signal across the edges
 
-    def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
-        """Whether the rim is an ellipse."""
-        minor, major = sorted(self.ellipse.half_axes)
-        least = rules.coverage if major < rules.long * minor else rules.long_coverage
-        return self.coverage >= least and bool(self.residual <= tolerance(minor, rules) / 2)
+
+@dataclass(frozen=True)
+class Rims:
+    """Those of B features; not sound where nothing is like an ellipse."""
+
+    ellipses: Ellipses
+    coverage: Floats  # (B,) as of a `Rim`
+    residual: Floats  # (B,) likewise
+    contrast: Floats  # (B,) median step of the signal across the edges
+
+    def are_good(self, rules: EllipseRules = EllipseRules()) -> Mask:
+        """Which (B,) are ellipses."""
+        minor, major = np.sort(self.ellipses.half_axes, axis=1).T
+        least = np.where(major < rules.long * minor, rules.coverage, rules.long_coverage)
+        near = self.residual <= tolerance(minor, rules) / 2
+        return np.asarray(self.ellipses.sound & (self.coverage >= least) & near)
+
+    def each(self, chosen: Indices) -> list[Rim]:
+        """Some of them, one by one."""
+        ellipses = self.ellipses
+        parts = ellipses.centre, ellipses.half_axes, ellipses.angle, self.coverage, self.residual
+        table = np.column_stack([part[chosen] for part in parts])
+        return [Rim(*row) for row in table.tolist()]
 
 
 def find_rims(
     signals: Sequence[Grey],
+    which: Indices,
     outlines: Sequence[Contour],
     contrasts: Floats,
+    ovals: Ellipses,
     rules: EllipseRules = EllipseRules(),
-) -> list[Rim | None]:
-    """The elliptical rims of bright features, each by its outline in pixels of a signal (H, W).
+) -> Rims:
+    """The elliptical rims of bright features, by their outlines in pixels of signals (H, W).
 
-    An edge is a step of at least such `contrasts` (B,).  None where nothing is like an ellipse.
+    `which` (B,) is the signal of each; an edge is a step of at least `contrasts` (B,).  Where
+    outlines are sound `ovals` (B), rims are looked for at these.
     """
-    rims: list[Rim | None] = [None] * len(outlines)
+    ellipses = _begun(outlines, ovals, rules)
+    edges, found = np.zeros((3, len(outlines))), np.arange(len(outlines))
+    # Roughly first, then from the better ellipse, which has all of a soft or broken rim in reach.
+    for least, circle in ((rules.coverage / 2, _CIRCLE[:, ::FIRST]), (rules.coverage, _CIRCLE)):
+        found = found[ellipses.sound[found]]
+        if not found.size:
+            break
+        at = signals, which[found], ellipses.select(found), contrasts[found]
+        better, edges[:, found] = _rims_near(*at, circle, least, rules)
+        ellipses = ellipses.replaced(found, better)
+    return Rims(ellipses, *edges)
+
+
+def _begun(outlines: Sequence[Contour], ovals: Ellipses, rules: EllipseRules) -> Ellipses:
+    """The ellipses near which rims are looked for: ovals, else those through hulls."""
+    minor, major = np.sort(ovals.half_axes, axis=1).T
+    rest = np.flatnonzero(~(ovals.sound & (minor >= rules.oblique * major)))
+    if not rest.size:
+        return ovals
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
-    hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
-    ellipses, _ = fit_ellipses(*_side_by_side(hulls), rules)
-    found = np.arange(len(outlines))
-    # Once more from the better ellipse, which has all of a soft or broken rim within reach.
-    for least in (rules.coverage / 2, rules.coverage):
-        some, sound = ellipses.select(ellipses.sound), found[ellipses.sound]
-        if not sound.size:
-            return rims
-        of_sound = [signals[k] for k in sound.tolist()]
-        ellipses, edges = _rims_near(of_sound, some, contrasts[sound], least, rules)
-        found = sound
-    for k, i in enumerate(found.tolist()):
-        if ellipses.sound[k]:
-            numbers = (float(one[k]) for one in edges)
-            rims[i] = Rim(ellipses.one(k), *numbers)
-    return rims
+    hulls = [cv2.convexHull(outlines[k])[:, 0] for k in rest.tolist()]
+    return ovals.replaced(rest, fit_ellipses(*_side_by_side(hulls), rules)[0])
 
 
 def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
@@ -130,14 +166,20 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signals: Sequence[Grey], others: Ellipses, contrasts: Floats, least: float, rules: EllipseRules
+    signals: Sequence[Grey],
+    which: Indices,
+    others: Ellipses,
+    contrasts: Floats,
+    circle: Floats,
+    least: float,
+    rules: EllipseRules,
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each.
 
-    Those that have edges in less than a share `least` of the directions are not fitted.
+    Those that have edges in less than a share `least` of the directions (2, n) are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, others, contrasts, rules)
-    found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
+    edges, found, steps, lows = _edges(signals, which, others, contrasts, circle, rules)
+    found &= (found.sum(axis=1) >= least * circle.shape[1])[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
@@ -148,21 +190,30 @@ def _rims_near(
     squares = np.where(on_rim, distance, 0.0) ** 2
     residual = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
     better = replace(better, sound=better.sound & (count > 0))
-    return better, (count / DIRECTIONS, residual, _medians(steps, on_rim))
+    return better, (count / circle.shape[1], residual, _medians(steps, on_rim))
 
 
-def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRules()) -> bool:
-    """Whether a long ellipse is two spots that touch: dim in the middle, but not hollow."""
-    a, b = ellipse.half_axes
-    if max(a, b) < rules.long * min(a, b):
-        return False
-    directions = turns(np.array(ellipse.angle)).T * np.array([[a], [b]])
-    major, minor = directions if a >= b else directions[::-1]
-    along = np.stack([0 * major, major / 2, -major / 2, rules.waist * minor, -rules.waist * minor])
-    middle, one, other, *sides = sample(signal, (ellipse.centre + along)[:, None])[:, 0]
-    height = max(one, other) - min(sides)
-    dips = min(one, other) - middle > rules.dip * height
-    return bool(dips and middle - max(sides) > rules.ridge * height)
+def are_waisted(
+    signals: Sequence[Grey],
+    which: Indices,
+    ellipses: Ellipses,
+    rules: EllipseRules = EllipseRules(),
+) -> Mask:
+    """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow."""
+    axes, waisted = ellipses.half_axes, np.zeros(len(which), dtype=np.bool_)
+    own = np.flatnonzero(axes.max(axis=1) >= rules.long * axes.min(axis=1))
+    if not own.size:
+        return waisted
+    directions = turns(ellipses.angle[own]).swapaxes(1, 2) * axes[own, :, None]
+    order = np.argsort(-axes[own], axis=1, kind="stable")[..., None]
+    along = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, rules.waist], [0.0, -rules.waist]])
+    places = ellipses.centre[own, None] + along @ np.take_along_axis(directions, order, axis=1)
+    lines = places.transpose(2, 0, 1), np.zeros((2, *places.shape[:2])), np.zeros(1)
+    middle, *ends = sample_each(signals, which[own], *lines)[0].T
+    (low, high), (left, right) = np.sort(ends[:2], axis=0), np.sort(ends[2:], axis=0)
+    height = high - left
+    waisted[own] = (low - middle > rules.dip * height) & (middle - right > rules.ridge * height)
+    return waisted
 
 
 def tolerance(minor: Any, rules: EllipseRules) -> Any:
@@ -245,60 +296,68 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signals: Sequence[Grey], ellipses: Ellipses, contrasts: Floats, rules: EllipseRules
+    signals: Sequence[Grey],
+    which: Indices,
+    ellipses: Ellipses,
+    contrasts: Floats,
+    circle: Floats,
+    rules: EllipseRules,
 ) -> tuple[Floats, Mask, Floats, Floats]:
-    """Edges (B, DIRECTIONS, 2) along the normals of ellipses, to parts of a pixel.
+    """Edges (B, n, 2) along the normals of ellipses, to parts of a pixel, in directions (2, n).
 
     There the signal falls through half the height of the edge; whether by one of `contrasts`, well
-    within reach, by how much, and down to what (B, DIRECTIONS).
+    within reach, by how much, and down to what (B, n).
     """
-    axes = ellipses.half_axes[:, None]
-    turned = turns(ellipses.angle).swapaxes(1, 2)
-    on_rim = ellipses.centre[:, None] + (_CIRCLE * axes) @ turned
-    normals = (_CIRCLE / axes) @ turned
-    normals /= np.hypot(normals[..., 0], normals[..., 1])[..., None]
+    (a, b), angle = ellipses.half_axes.T[..., None], ellipses.angle[:, None]
+    (x, y), c, s = circle, np.cos(angle), np.sin(angle)
+    on_rim = np.array([c * a * x - s * b * y, s * a * x + c * b * y])
+    on_rim += ellipses.centre.T[..., None]
+    # as long as one, across the rim
+    length = np.sqrt((b * x) ** 2 + (a * y) ** 2)
+    x, y = b * x / length, a * y / length
+    normals = np.array([c * x - s * y, s * x + c * y])
     reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
     reach = reach.astype(np.intp)
-    where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
+    where, found, steps, lows = np.zeros((4, len(reach), circle.shape[1]))
     for whole in sorted(set(reach.tolist())):
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
         offsets = np.arange(-whole - 1.5, whole + 2)
-        u, v = (
-            (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
-            for k in (0, 1)
-        )
-        profiles = sample_each([signals[k] for k in some.tolist()], u, v)
-        step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
-        shape = (len(some), DIRECTIONS)
-        sure = step >= np.repeat(contrasts[some], DIRECTIONS).astype(np.float32)
+        lines = on_rim[:, some], normals[:, some], offsets
+        profiles = sample_each(signals, which[some], *lines)
+        step, place, below, low = _fall(profiles.reshape(len(offsets), -1), offsets)
+        shape = (len(some), circle.shape[1])
+        sure = step >= np.repeat(contrasts[some], shape[1]).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
-    return on_rim + normals * where[..., None], found > 0, steps, lows
+    edges = np.stack(tuple(on_rim + normals * where), axis=2)
+    return edges, found > 0, steps, lows
 
 
-def _fall(
-    profiles: NDArray[np.float32], offsets: Floats
-) -> tuple[Floats, Floats, Mask, NDArray[np.float32]]:
-    """Of profiles (n, k) how far each falls, where it is at half the height, whether it is.
+def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Singles, Floats, Mask, Singles]:
+    """Of profiles (k, n) how far each falls, where it is at half the height, whether it is.
 
-    And how low it is outside.
+    And how low it is outside.  Row by row, as there are many profiles and each is short.
     """
     # The rim is near where the signal falls most over a width that optics blur an edge to...
-    fall = profiles[:, :-3] - profiles[:, 3:]
-    rows = np.arange(len(profiles))
-    steepest = fall.argmax(axis=1)
+    steepest, (fall, *falls) = np.zeros(profiles.shape[1], np.int8), profiles[:-3] - profiles[3:]
+    for k, one in enumerate(falls, 1):
+        np.putmask(steepest, one > fall, k)
+        np.maximum(fall, one, out=fall)
     # ... and at half the height there, which noise moves less than the steepest place.
-    column = np.arange(profiles.shape[1])
-    outside = column > (steepest + 1)[:, None]
-    high = np.where(outside, -np.inf, profiles)
-    summit = high.argmax(axis=1)
-    # of long columns, which is quicker than of short rows
-    low = np.ascontiguousarray(np.where(outside, profiles, np.inf).T).min(axis=0)
-    half = (high[rows, summit] + low) / 2
-    below = (column > summit[:, None]) & (profiles < half[:, None])
-    after = np.maximum(below.argmax(axis=1), 1)
-    upper, lower = profiles[rows, after - 1].astype(np.float64), profiles[rows, after]
+    summit, high, low = np.zeros_like(steepest), profiles[0].copy(), profiles[-1].copy()
+    for k, one in enumerate(profiles):
+        outside = steepest + 1 < k
+        inner = np.where(outside, -np.inf, one)
+        np.putmask(summit, inner > high, k)
+        np.maximum(high, inner, out=high)
+        np.minimum(low, np.where(outside, one, np.inf), out=low)
+    half, after = (high + low) / 2, np.zeros_like(steepest)
+    for k in range(len(profiles) - 1, 0, -1):
+        np.putmask(after, (profiles[k] < half) & (summit < k), k)
+    below, rows = after > 0, np.arange(len(after))
+    after = np.maximum(after, 1).astype(np.intp)
+    upper, lower = profiles[after - 1, rows].astype(np.float64), profiles[after, rows]
     where = offsets[after - 1] + (upper - half) / np.maximum(upper - lower, 1e-12)
-    return fall[rows, steepest], where, below[rows, after], low
+    return fall, where, below, low

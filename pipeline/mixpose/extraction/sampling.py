@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.stride_tricks import as_strided
 
 from mixpose.extraction.background import Grey
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, Singles
 
 # OpenCV takes maps with sides below 32767.
 MOST_ROWS = 30000
@@ -42,38 +42,53 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
     return cv2.remap(patch, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def sample_each(greys: Sequence[Grey], u: Floats, v: Floats) -> NDArray[np.float32]:
-    """As `sample`, at u and v (B, n) of B features, of each near each other, in an image for each.
+def parts_of(grey: Grey, shape: tuple[int, int]) -> Grey:
+    """All parts of a shape of an image, by their first pixel, of its memory: not to be written to.
 
-    Only what is around each feature is turned into single precision, not all between them.
+    As `np.lib.stride_tricks.sliding_window_view`, which takes longer than to copy a few.
     """
-    heights, widths = np.array([grey.shape for grey in greys]).T
-    across, left, columns = _part(u, widths)
-    down, top, rows = _part(v, heights)
-    samples = np.empty(u.shape, np.float32)
-    order = np.argsort(np.maximum(rows, columns))
-    while order.size:
-        # parts as large as the largest of them, in a stack that is not too high
-        stacked = np.maximum.accumulate(rows[order]) * np.arange(1, order.size + 1)
-        count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
-        some, order = order[:count], order[count:]
-        height, width = int(rows[some].max()), int(columns[some].max())
-        parts = np.zeros((count, height, width), np.float32)
-        corners = zip(some.tolist(), left[some].tolist(), top[some].tolist(), strict=True)
-        for part, (k, u0, v0) in zip(parts, corners, strict=True):
-            patch = greys[k][v0 : v0 + height, u0 : u0 + width]
-            part[: patch.shape[0], : patch.shape[1]] = patch
-        below = (np.arange(count, dtype=np.float32) * height)[:, None]
-        samples[some] = _remap(parts.reshape(-1, width), across[some], down[some] + below)
+    rows, columns = (whole - side + 1 for whole, side in zip(grey.shape, shape, strict=True))
+    return as_strided(grey, (rows, columns, *shape), grey.strides * 2, writeable=False)
+
+
+def sample_each(
+    greys: Sequence[Grey], which: Indices, places: Floats, steps: Floats, offsets: Floats
+) -> Singles:
+    """As `sample`, of features (B,) `which` image, at so many steps (k,) beside their places.
+
+    Places and steps are (2, B, n), u and v, samples (k, B, n).  Only what is around each feature is
+    turned into single precision, not all between them.
+    """
+    samples = np.empty((len(offsets), *places.shape[1:]), np.float32)
+    ends = places + steps * offsets.min(), places + steps * offsets.max()
+    lower, upper = np.minimum(*ends).min(axis=2).T, np.maximum(*ends).max(axis=2).T
+    beside = offsets.astype(np.float32)[:, None, None]
+    for number in sorted(set(which.tolist())):
+        own, grey = (which == number).nonzero()[0], greys[number]
+        last = np.array(grey.shape[::-1]) - 1
+        inside = np.minimum(np.maximum([lower[own], upper[own]], 0.0), last)
+        first, end = inside.astype(np.intp)
+        # the last pixel's neighbour is not looked at, but has to be there
+        sides = np.minimum(end - first + 2, last + 1)
+        order = np.argsort(sides.max(axis=1))
+        while order.size:
+            # parts as large as the largest of them, in a stack that is not too high
+            stacked = np.maximum.accumulate(sides[order, 1]) * np.arange(1, order.size + 1)
+            count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
+            chosen, order = order[:count], order[count:]
+            some, (width, height) = own[chosen], sides[chosen].max(axis=0).tolist()
+            corners = np.minimum(first[chosen], last + 1 - (width, height))
+            parts = parts_of(grey, (height, width))[corners[:, 1], corners[:, 0]]
+            parts = parts.astype(np.float32)
+            maps = []
+            for axis in (0, 1):
+                near = (places[axis, some] - corners[:, axis, None]).astype(np.float32)
+                maps.append(near + steps[axis, some].astype(np.float32) * beside)
+                if lower[some, axis].min() < 0 or upper[some, axis].max() > last[axis]:
+                    ends = -corners[:, axis], last[axis] - corners[:, axis]
+                    np.clip(maps[-1], *(one[:, None] for one in ends), out=maps[-1])
+            maps[1] += (np.arange(count, dtype=np.float32) * height)[:, None]
+            u, v = (one.reshape(-1, count * places.shape[2]) for one in maps)
+            stack = parts.reshape(-1, width)
+            samples[:, some] = _remap(stack, u, v).reshape(-1, count, places.shape[2])
     return samples
-
-
-def _part(
-    places: Floats, sizes: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
-    """Places (B, n) within parts of one side (B,) of images, where these begin, their lengths."""
-    inside = np.minimum(np.maximum(places, 0), sizes[:, None] - 1.0)
-    first = inside.min(axis=1).astype(np.intp)
-    # the last pixel's neighbour is not looked at, but has to be there
-    lengths = (inside.max(axis=1) - first).astype(np.intp) + 2
-    return (inside - first[:, None]).astype(np.float32), first, lengths

@@ -10,18 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.extraction.conics import Ellipse, together, turns
-from mixpose.extraction.contours import Box, signal_about
+from mixpose.extraction.conics import Ellipses, turns
+from mixpose.extraction.sampling import parts_of
 from mixpose.extraction.threshold import Foreground
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 
 # Patches of so many shapes are prepared for.
 SHAPES = 256
+
+# Boxes whose longer sides differ by less, px, are looked at together.
+ALIKE = 8
 
 
 def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats, Floats]:
@@ -61,40 +64,83 @@ def _border(rows: int, columns: int) -> NDArray[np.intp]:
     return np.concatenate([places[0], places[-1], places[:, 0], places[:, -1]])
 
 
+class Patches(NamedTuple):
+    """Signals about K features, in parts of one size."""
+
+    signal: NDArray[np.float32]  # (K, h, w); 0 where a feature has a smaller part
+    corners: NDArray[np.intp]  # (K, 2) of the first pixel, (u, v)
+    base: Floats  # (K,) medians of the outermost pixels, as `background` has them
+    peak: Floats  # (K,)
+
+    @classmethod
+    def about(cls, scene: Foreground, boxes: NDArray[np.intp], margin: int) -> Patches:
+        """Of boxes (K, 4), with a margin in px as far as the window goes."""
+        size = np.array(scene.grey.shape[::-1])
+        first = np.maximum(boxes[:, :2] - margin, 0)
+        sides = np.minimum(boxes[:, :2] + boxes[:, 2:] + margin, size) - first
+        most = sides.max(axis=0)
+        # those at the end of the window begin before their first pixel
+        corners = np.minimum(first, size - most)
+        parts = parts_of(scene.grey, (int(most[1]), int(most[0])))[corners[:, 1], corners[:, 0]]
+        signal = parts.astype(np.float32) - np.float32(scene.zero)
+        skipped = (first - corners)[..., None]
+        place = [np.arange(one) - left for one, left in zip(most.tolist(), skipped.swapaxes(0, 1))]
+        across, down = ((at >= 0) & (at < own[:, None]) for at, own in zip(place, sides.T))
+        signal *= down[:, :, None] & across[:, None, :]
+        each = np.arange(len(boxes))
+        (left, top), (right, bottom) = skipped[..., 0].T, (skipped[..., 0] + sides - 1).T
+        ends = [signal[each, k] for k in (top, bottom)], [signal[each, :, k] for k in (left, right)]
+        frame = np.concatenate([*ends[0], *ends[1]], axis=1)
+        frame[~np.concatenate([across, across, down, down], axis=1)] = np.inf  # put last
+        frame.sort(axis=1)
+        base = frame[each, sides.sum(axis=1)].astype(np.float64)
+        return cls(signal, corners, base, signal.max(axis=(1, 2)).astype(np.float64))
+
+
 def off_centre(
-    disks: Sequence[tuple[Foreground, Ellipse]], margin: int, least: float, beside: float
+    scenes: Sequence[Foreground],
+    which: Indices,
+    rims: Ellipses,
+    margin: int,
+    least: float,
+    beside: float,
 ) -> Floats:
     """How far the centres of ellipses (K,) may be off, px: from their grey values and of these.
+
+    `which` (K,) is the scene of each.
 
     Up to `beside` px outside of an ellipse, what is brighter than a share of the peak counts, above
     the background `margin` px around it.  0 where nothing is, so that nothing is told.
     """
-    if not disks:
-        return np.zeros(0)
-    patches, corners = [], []
-    for scene, ellipse in disks:
-        patch, corner = signal_about(scene, _box(ellipse), margin)
-        base, peak = background(patch), cv2.minMaxLoc(patch)[1]
-        patches.append(np.maximum(patch - np.float32(base + least * (peak - base)), 0))
-        corners.append(corner)
-    side = max(max(patch.shape) for patch in patches)
-    weights = np.zeros((len(patches), side, side), np.float32)
-    for own, patch in zip(weights, patches, strict=True):
-        own[: patch.shape[0], : patch.shape[1]] = patch
-    rims = together([ellipse for _, ellipse in disks])
-    axes = turns(rims.angle) / (rims.half_axes + beside)[:, None]
+    off, boxes = np.zeros(len(which)), _boxes(rims)
+    kinds = len(scenes) * (boxes[:, 2:].max(axis=1, initial=0) // ALIKE) + which
+    for kind in np.unique(kinds).tolist():
+        own = np.flatnonzero(kinds == kind)
+        patches = Patches.about(scenes[kind % len(scenes)], boxes[own], margin)
+        off[own] = _off(patches, rims.select(own), least, beside)
+    return off
+
+
+def _off(patches: Patches, rims: Ellipses, least: float, beside: float) -> Floats:
+    """The same of ellipses (K,) with a patch for each."""
+    signal, corners, base, peak = patches
+    rows, columns = signal.shape[1:]
+    weights = signal - (base + least * (peak - base)).astype(np.float32)[:, None, None]
     centres = rims.centre - corners
-    places = np.indices((side, side), dtype=np.float64)[::-1].reshape(2, -1).T
-    scaled = (places - centres[:, None]) @ axes
-    weights[(np.vecdot(scaled, scaled) > 1).reshape(weights.shape)] = 0
-    found, off = centroids(weights)
-    return np.asarray(np.nan_to_num(np.hypot(off, np.linalg.norm(found - centres, axis=1))))
+    axes = turns(rims.angle) / (rims.half_axes + beside)[:, None]
+    # squared distances from centres, 1 on the rims, as sums of what `_monomials` has
+    form = axes @ axes.swapaxes(1, 2)
+    pull = (form @ centres[..., None])[..., 0]
+    (a, b), c = form.diagonal(axis1=1, axis2=2).T, form[:, 0, 1]
+    terms = np.vecdot(pull, centres), *(-2 * pull.T), (a + b) / 2, (a - b) / 2, c
+    squares = np.stack(terms, axis=1) @ _monomials(rows, columns)[:6]
+    weights[(squares > 1).reshape(weights.shape) | (weights < 0)] = 0
+    found, apart = centroids(weights)
+    return np.asarray(np.nan_to_num(np.hypot(apart, np.linalg.norm(found - centres, axis=1))))
 
 
-def _box(ellipse: Ellipse) -> Box:
-    """Of the pixels in an ellipse."""
-    (u, v), (a, b) = ellipse.centre, ellipse.half_axes
-    c, s = np.cos(ellipse.angle), np.sin(ellipse.angle)
-    half_u, half_v = float(np.hypot(a * c, b * s)), float(np.hypot(a * s, b * c))
-    u0, v0 = int(np.floor(u - half_u)), int(np.floor(v - half_v))
-    return u0, v0, int(np.ceil(u + half_u)) - u0 + 1, int(np.ceil(v + half_v)) - v0 + 1
+def _boxes(rims: Ellipses) -> NDArray[np.intp]:
+    """Of the pixels in ellipses: first column and row, width and height (K, 4)."""
+    half = np.linalg.norm(turns(rims.angle) * rims.half_axes[:, None], axis=2)
+    first = np.floor(rims.centre - half).astype(np.intp)
+    return np.concatenate([first, np.ceil(rims.centre + half).astype(np.intp) - first + 1], axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.shape import centroids
+from mixpose.extraction.shape import Patches, centroids
 from mixpose.extraction.spots import SpotRules, find_spots, is_long
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats
@@ -77,25 +77,9 @@ def _together(
     scene: Foreground, boxes: NDArray[np.intp], areas: Floats, levels: Floats, rules: SpotRules
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Centres (K, 2), how far they may be off, which need no mask, and which stand out."""
-    first_u, first_v = (boxes[:, :2] - rules.margin).T
-    width, height = (boxes[:, 2:] + 2 * rules.margin).T
-    each = np.arange(len(boxes))
-    side = np.arange(int(max(width.max(), height.max())))
-    in_row, in_column = side < width[:, None], side < height[:, None]
-    places = (first_v[:, None] + side)[:, :, None], (first_u[:, None] + side)[:, None, :]
-    signal = scene.grey[places].astype(np.float32) - np.float32(scene.zero)
-    signal *= in_column[:, :, None] & in_row[:, None, :]
-    # The median of the outermost pixels; those that a smaller patch has not are put last.
-    frame = np.concatenate(
-        [signal[:, 0], signal[each, height - 1], signal[:, :, 0], signal[each, :, width - 1]],
-        axis=1,
-    )
-    frame[~np.concatenate([in_row, in_row, in_column, in_column], axis=1)] = np.inf
-    frame.sort(axis=1)
-    base = frame[each, width + height].astype(np.float64)
+    signal, corners, base, peak = Patches.about(scene, boxes, rules.margin)
     level = levels.astype(np.float32)[:, None, None]
     alone = (signal > level).reshape(len(boxes), -1).sum(axis=1) == areas
-    peak = signal.max(axis=(1, 2)).astype(np.float64)
     bright = np.ones(len(boxes), dtype=np.bool_)
     if scene.judged:
         bright = (peak - base >= rules.min_step * peak) & (peak - levels >= rules.prominence * peak)
@@ -104,4 +88,4 @@ def _together(
     weights = np.maximum(signal - cut[:, None, None], 0)
     centres, off = centroids(weights)
     alone &= np.isfinite(off)
-    return centres + np.stack([first_u, first_v], axis=1), off, alone, bright
+    return centres + corners, off, alone, bright

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias, cast
 
 import cv2
@@ -85,6 +86,11 @@ class Foreground:
     # all that is above it counts.
     judged: bool
     tops: Grey  # (H,) highest grey values of rows: most have nothing to look for
+
+    @cached_property
+    def highest(self) -> float:
+        """The highest grey value."""
+        return float(self.tops.max())
 
 
 def above(signal: Grey, level: float) -> NDArray[np.uint8]:

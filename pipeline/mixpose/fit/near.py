@@ -232,7 +232,7 @@ def _to_the_noise(
     """
     sigmas = np.array([view.observation.sigma for view in finest.views])
     blurs, count, first = np.array([blur] * len(sigmas)), int(np.count_nonzero(free)), ascent
-    likeliest, best = -np.inf, None
+    likeliest, best, counted = -np.inf, None, np.ones(len(sigmas))
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
         if beside:
@@ -244,12 +244,18 @@ def _to_the_noise(
         variances = np.minimum(variances, (before / errors.blur) ** 2)
         weighed = errors.counted(variances, fields)
         end = np.minimum(np.minimum(narrow, before), blurs)
-        narrower = np.maximum(end, blurs / rules.ratio)
-        is_noise = _are_noise(matches, variances, blurs, errors, rules)
-        is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
-        if best is None:
-            is_end &= bool(weighed.min() > rules.narrower**2 * weighed.max())  # weights are right
-            is_end = is_end or _moved(matches, free, end, variances) < rules.moved**2
+        is_noise, others = _are_noise(matches, variances, blurs, errors, rules)
+        unlike, counted = weighed / counted, weighed
+        are_right = bool(unlike.min() > rules.narrower**2 * unlike.max())  # weights by noise
+        is_end = is_noise or bool((end > rules.narrower * blurs).all())
+        is_end = is_end and (are_right or best is not None)
+        straight, is_clear = np.inf, are_right and not others
+        if not is_end and (best is None or is_clear):
+            moved, shift = _moved(matches, free, end, variances)
+            is_end = best is None and moved < rules.moved**2
+            # as narrow as features are off by then at once, if nothing else pulls them
+            straight = shift if is_clear else np.inf
+        narrower = np.maximum(end, np.minimum(blurs / rules.ratio, straight))
         is_only = best is None and is_end
         likelihood = np.inf if is_only else log_likelihood(narrow, matches, count, errors)
         if best is None or likelihood > likeliest:
@@ -266,16 +272,17 @@ def _to_the_noise(
 
 def _are_noise(
     matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules, rules: FitRules
-) -> bool:
-    """Whether no offset is too large for noise (L,), and no other detection pulls at blurs (L,).
+) -> tuple[bool, bool]:
+    """Whether all offsets are as noise (L,) makes them and nothing else pulls at blurs (L,).
 
-    A pose moves by no more deviations than pulls together are of the noise.
+    And whether any other detection does: a pose moves by no more deviations than pulls together are
+    of the noise.
     """
-    if np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)):
-        return False
+    far = np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)) > 0
     beside = matches.beside * matches.beside  # NaN of features that are not in view
     pulls = beside * np.exp(beside / (-2 * blurs * blurs)[:, None])
-    return bool((np.nansum(pulls, axis=1) < rules.moved**2 * variances).all())
+    others = bool((np.nansum(pulls, axis=1) >= rules.moved**2 * variances).any())
+    return not (far or others), others
 
 
 def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:
@@ -287,8 +294,13 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
     ]
 
 
-def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:
-    """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
+def _moved(
+    matches: Matches, free: Mask, narrower: Floats, variances: Floats
+) -> tuple[float, float]:
+    """About how far narrower blurs (L,) move the pose, in squared standard deviations.
+
+    And by how much any feature that is met, in σ_ε.
+    """
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])
     # two steps of least squares go 0.80 of the way, of 70 features 0.89; one goes 0.62 and 0.77
@@ -298,4 +310,6 @@ def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) ->
         information = rows.T @ J
         twist += np.linalg.lstsq(information, rows.T @ offsets.ravel())[0]
         offsets = matches.offsets - (J @ twist).reshape(offsets.shape)
-    return float(twist @ information @ twist)
+    away = matches.offsets - offsets
+    shift = np.sqrt(np.vecdot(away, away).max(initial=0.0, where=matches.shares > 0))
+    return float(twist @ information @ twist), float(shift)

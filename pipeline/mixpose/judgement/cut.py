@@ -101,6 +101,8 @@ def _larger(
     halves = variance + np.concatenate([varied.ravel(), [0.0]])
     degrees, limits = means**2 / halves, float(chdtri(len(C), outside)) * means / halves
     shares = np.concatenate([chances.ravel(), [1 - float(chances.sum())]])
+    some = shares > 1e-12  # of many cases most are next to impossible
+    degrees, limits, shares = degrees[some], limits[some], shares[some]
     # the first or the second of most poses
     enough = (one for one in LARGER[:-1] if chdtrc(degrees, one * limits) @ shares <= outside)
     return next(enough, LARGER[-1])

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING, Observation, peak
@@ -179,24 +180,61 @@ def _to_nearest(
     Returns squared distances (L, n) to the nearest detections but these.
     """
     shares, offsets, by, _ = met
-    away = detections[:, None] - y[:, :, None]
-    squared = np.vecdot(away, away)
-    for planes in clouds:  # each coordinate is in two of them
-        squared[planes] = squared[planes].sum(axis=0) / 2
-    pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
-    order, taken = squared[pairs].argsort(kind="stable"), set[tuple[int, int]]()
-    for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
-        if by[k, i] < 0 and (k, j) not in taken:
-            taken.add((k, j))
-            shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
-    if merged and len(taken) < len(order):
+    which, squared = _neighbours(y, detections, reach, clouds)
+    k, i, at = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
+    order = squared[k, i, at].argsort(kind="stable")
+    pairs = k, i, j = np.array([k, i, which[k, i, at]])[:, order]
+    own = _in_turn(k * by.shape[1] + i, k * detections.shape[1] + j)
+    k, i, j = pairs[:, own]
+    shares[k, i], offsets[k, i], by[k, i] = weights[k, i], detections[k, j] - y[k, i], j
+    if merged and len(own) < len(order):
         # only a feature near a detection that is taken can share it
         in_clouds = {k for planes in clouds for k in planes}  # where points do not run together
-        for k in set(np.unique(pairs[0][by[pairs[:2]] < 0]).tolist()) - in_clouds:
+        for k in set(np.unique(pairs[0][by[*pairs[:2]] < 0]).tolist()) - in_clouds:
             _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
-    own = (by >= 0).nonzero()
-    squared[*own, by[own]] = np.nan
+    squared[which == by[..., None]] = np.nan
     return np.asarray(np.fmin.reduce(squared, axis=2))
+
+
+def _neighbours(
+    y: Floats, detections: Floats, reach: Floats, clouds: Sequence[Sequence[int]]
+) -> tuple[Indices, Floats]:
+    """The detections (L, n, K) that are nearest to features, and their squared distances.
+
+    Two at least, and all within reach; NaN is the distance of those that there are not.
+    """
+    most = detections.shape[1]
+    if clouds or y.shape[1] * most <= DRAWING.few_pairs:
+        away = detections[:, None] - y[:, :, None]
+        squared = np.vecdot(away, away)
+        for planes in clouds:  # each coordinate is in two of them
+            squared[planes] = squared[planes].sum(axis=0) / 2
+        return np.broadcast_to(np.arange(most), squared.shape), squared
+    trees = [cKDTree(own[own[:, 0] == own[:, 0]]) for own in detections]
+    count, limit = 2, math.sqrt(float(reach.max(initial=0.0)))
+    while True:
+        each = [tree.query(own, k=count) for tree, own in zip(trees, y)]
+        distances, which = (np.array(part) for part in zip(*each))
+        if count >= most or float(distances[..., -1].min(initial=np.inf)) > limit:
+            break
+        count *= 2
+    return which, np.where(np.isfinite(distances), distances * distances, np.nan)
+
+
+def _in_turn(one: Indices, other: Indices) -> Indices:
+    """Which pairs (P,) come to be, of those before which neither of the two was taken."""
+    taken, left = [], np.arange(len(one))
+    if len({*one.tolist()}) == len(one) == len({*other.tolist()}):
+        return left  # as a rule each has one
+    while len(left):
+        first, also = np.zeros(one.max() + 1, np.intp), np.zeros(other.max() + 1, np.intp)
+        first[one[left][::-1]] = also[other[left][::-1]] = left[::-1]
+        some = left[(first[one[left]] == left) & (also[other[left]] == left)]
+        taken.append(some)
+        first[:], also[:] = 0, 0
+        first[one[some]] = also[other[some]] = 1
+        left = left[(first[one[left]] | also[other[left]]) == 0]
+    return np.sort(np.concatenate(taken)) if taken else left
 
 
 def _run_together(
@@ -310,7 +348,9 @@ def _surroundings(
         near = np.abs(detections - middle[:, None]) <= half[:, None]
         beside = np.count_nonzero(near.all(axis=2), axis=1) - met
         unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
-    finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
+    finest = np.zeros(len(sigmas))
+    if seen.size > DRAWING.own_tiles:  # on pages
+        finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
     for k, one in enumerate(observations):
         if one.cell is not None:  # as many equal features as would give the energy of grey values
             near, far = (corner / one.sigma for corner in one.extent)

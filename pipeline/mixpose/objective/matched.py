@@ -25,7 +25,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import DRAWING, Atlas, all_pairs, close_pairs, matched_atlas, peak
+from mixpose.density import (
+    DRAWING,
+    Atlas,
+    all_pairs,
+    close_pairs,
+    matched_atlas,
+    pairs_by_picture,
+    peak,
+)
 from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Indices
@@ -64,6 +72,20 @@ def overlaps(
     products = weights.take(pairs[:, 0], axis=2) * weights.take(pairs[:, 1], axis=2)
     bells = overlap * products * np.exp(exponents) * tops[..., None]
     return np.maximum(norm + 2 * bells.sum(axis=2), _NONE), pairs, bells, away
+
+
+def norms(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Floats:
+    """⟨h, h⟩ (L, H) as `overlaps` has them, where pairs of one picture are few beside all pairs."""
+    L, H, n = weights.shape
+    if L * H == 1 or n * n <= DRAWING.few_pairs:
+        return overlaps(y, weights, variances, tops)[0]
+    of_all, variance = weights.reshape(-1), variances.repeat(H)
+    picture, i, j = pairs_by_picture(y.reshape(-1, n, 2), variance)
+    i, j = n * picture + i, n * picture + j
+    away = y.reshape(-1, 2).take(i, axis=0) - y.reshape(-1, 2).take(j, axis=0)
+    bells = np.exp(np.vecdot(away, away) * (-0.5 / variance)[picture])
+    both = np.bincount(picture, of_all[i] * of_all[j] * bells, L * H).reshape(L, H)
+    return np.asarray(np.maximum(tops * (np.vecdot(weights, weights) + 2 * both), _NONE))
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
@@ -143,11 +165,12 @@ class MatchedObjective:
         moving features that meet nothing out of the picture.
         """
         parts = [np.zeros((len(self.views), 0))]
-        for match in map(self.match, self._blocks(poses)):
-            product, norm = np.vecdot(match.sampled[..., 0], match.weights), match.norm
+        for at in map(self.projection.project, self._blocks(poses)):
+            product = np.vecdot(self.atlas.look_up(at.y)[..., 0], at.weights)
+            norm = norms(at.y, at.weights, self.variances, self.tops)
             own = self.weights / self.energies * product**2 / norm
             if whole:
-                hidden = np.where(match.seen, 0.0, self.projection.body.nodes.weights)
+                hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
                 own = own * (norm / (norm + self.tops * np.vecdot(hidden, hidden)))
             parts.append(own)
         return np.concatenate(parts, axis=1)

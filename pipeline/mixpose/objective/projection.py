@@ -139,9 +139,8 @@ class BodyProjection:
         nodes = np.concatenate([middle + steps, middle - steps], axis=1)
         y, J, seen = self._batch.linearise(nodes.reshape(-1, 4 * count, 3))
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
-        by_axes = J @ axes.transpose(0, 2, 3, 1)[:, None]
-        weights = by_axes[..., 0, 0] * by_axes[..., 1, 1] - by_axes[..., 0, 1] * by_axes[..., 1, 0]
-        weights = np.abs(weights)
+        along, across = (np.vecdot(J, axes[:, k, None, :, None]) for k in (0, 1))
+        weights = np.abs(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
         total = weights.sum(axis=1)
         visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
         weights /= np.where(visible, total, 1.0)[:, None]

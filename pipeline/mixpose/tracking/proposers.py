@@ -15,14 +15,16 @@ from operator import add
 from typing import TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
+from mixpose.density import DRAWING
 from mixpose.fit import Fit, blur_schedule
-from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, is_sure
+from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
@@ -137,10 +139,13 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     that is small in an image looks almost the same tilted the other way.
     """
     kinds, most = frame.rules.look_alikes.kinds, -np.inf
-    # once more, where what is moved is better: two that are as good would take turns for ever
+    # from where what is moved is better on: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
-        yield from _as_evident(frame, ranked[0])
+        for start in _as_evident(frame, ranked[0]):
+            yield start
+            if ranked[0].log_evidence > most:
+                break
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
@@ -183,15 +188,40 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     if not alike:
         return
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
+    most, own, limits = best.matches.met.max(), frame.prior(T)[0], []
+    for one, pose in zip(alike, poses[1:], strict=True):
+        moved = _moves_alike(frame, T) if one.is_step else None
+        against = own - frame.prior(pose if moved is None else moved)[0]
+        limits.append(1 + max(against, 0.0) / rules.acceptance.log_doubt)
+    least = rules.look_alikes.fewer * np.array(limits)
+    # mostly what has no detection near it tells, which is less than to look all up
+    near = _near_any(frame, poses)
+    (few,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()
+    if not few.size:
+        return
     # the value grows as the square of the features met
-    values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
-    fewer = best.matches.met.max() * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
-    for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
-        moved = _moves_alike(frame, T) if alike[k].is_step else None
-        against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
-        least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
-        if fewer[k] < rules.look_alikes.fewer * least:
-            yield frame.rival(best, poses[1 + k], frame.close, T_moved=moved)
+    values = np.sqrt(frame.finest.shares(poses[[0, *(1 + few)]], whole=True).sum(axis=0))
+    fewer = most * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
+    for k in np.argsort(fewer, kind="stable").tolist():  # the best first
+        if fewer[k] < least[few[k]]:
+            moved = _moves_alike(frame, T) if alike[few[k]].is_step else None
+            yield frame.rival(best, poses[1 + few[k]], frame.close, T_moved=moved)
+
+
+def _near_any(frame: Frame, poses: Floats) -> Floats:
+    """How many features have a detection near them at poses (H, 4, 4), or grey values may be.
+
+    The root of the sum of squares over sensors, as the value goes.
+    """
+    at = frame.finest.projection.project(poses)
+    near = at.seen.copy()
+    for k, (view, variance) in enumerate(zip(frame.views, frame.finest.variances[:, 0])):
+        points, m = view.observation.points, view.sensor.dimension
+        if points is not None:
+            reach = DRAWING.reach * np.sqrt(variance)
+            away, _ = cKDTree(points).query(at.y[k, ..., :m], distance_upper_bound=reach)
+            near[k] &= np.isfinite(away)
+    return np.asarray(np.linalg.norm(near.sum(axis=2), axis=0))
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
@@ -315,8 +345,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     has_cells = any(view.observation.cell is not None for view in frame.views)
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # what is known to be cut pulls as well
-    are_noise = not errors.are_off(used, judged.variances[:, None]).any()
-    if has_cells or (judged.residual_ratio <= 1 and are_noise):
+    off = errors.are_off(used, judged.variances[:, None])
+    if has_cells or (judged.residual_ratio <= 1 and not _carry(off, judged, frame)):
         return
     narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
@@ -327,6 +357,21 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
         off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
         if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
             yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
+
+
+def _carry(off: Mask, judged: ScoredPose, frame: Frame) -> bool:
+    """Whether features (L, N) that are off carry any away, by a part of the noise that matters.
+
+    They do so by least squares at the most.  What stays nearer meets the same at narrow blurs.
+    """
+    if not np.count_nonzero(off):
+        return False
+    used, noise = judged.used, np.sqrt(judged.variances)[:, None, None]
+    J = used.J[..., frame.free] / noise[..., None]
+    met = J[used.shares > 0].reshape(-1, J.shape[-1])
+    pull = np.einsum("nmk,nm->k", J[off], (used.offsets / noise)[off])
+    moved = (met @ (inverted(met.T @ met) @ pull)).reshape(-1, J.shape[-2])
+    return bool(np.vecdot(moved, moved).max() > frame.rules.fit.moved**2)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)

@@ -15,12 +15,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
+from mixpose.density import DRAWING
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, PointPattern
+from mixpose.records import Floats, Indices, PointPattern
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,7 @@ def weighed_by_size(
         if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
-        away = pattern.points[:, None] - at.y[k, 0, seen]
-        scales = every[k, seen[np.vecdot(away, away).argmin(axis=1)]]
+        scales = every[k, seen[_nearest(pattern.points, at.y[k, 0, seen])]]
         logs = np.log(pattern.radii / scales)
         whole = scales * np.exp(sizes.mean)
         smaller = np.exp(-2 * np.hypot(logs - sizes.mean, scatter))
@@ -98,6 +99,14 @@ def weighed_by_size(
         known = pattern.erring(np.maximum(pattern.deviations, own), cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
+
+
+def _nearest(points: Floats, places: Floats) -> Indices:
+    """Which of places (n, 2) is nearest to each of points (M, 2)."""
+    if len(points) * len(places) > DRAWING.few_pairs:
+        return np.asarray(cKDTree(places).query(points)[1])
+    away = points[:, None] - places
+    return np.asarray(np.vecdot(away, away).argmin(axis=1))
 
 
 def are_less_exact(views: Sequence[View], known: Sequence[View]) -> bool:

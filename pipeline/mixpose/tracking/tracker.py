@@ -230,10 +230,16 @@ def estimate_pose(
 def judged_again(
     data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> list[ScoredPose]:
-    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first."""
+    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first.
+
+    Those that were far behind the first stay where they are.
+    """
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
+    behind = data.rules.look_alikes.behind
     for one in poses if data.views else ():
-        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
+        is_near = one.log_evidence > poses[0].log_evidence - behind
+        wide = data.close if fitted and is_near else None
+        start = Start(one.T_world_object, wide, left_out=one.left_out)
         fit = likelihood.fit(start)
         judged = replace(
             likelihood.judge(fit, start), proposer=one.proposer, blurs=fit.blurs or one.blurs
