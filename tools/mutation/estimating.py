@@ -45,8 +45,8 @@ _NEAR = (
     Mutant(
         "fit-false-spots-draw-unnoticed",
         "fit/near.py",
-        "np.count_nonzero(matches.beside < errors.met",
-        "np.count_nonzero(matches.beside < 0 * errors.met",
+        ">= rules.moved**2 * variances).any()",
+        ">= 1e9 * rules.moved**2 * variances).any()",
         "the pose is drawn to a false spot beside a feature that is met, or to a neighbour's",
     ),
     Mutant(

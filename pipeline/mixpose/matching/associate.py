@@ -73,6 +73,7 @@ def associate(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
     is_grid = [view.observation.cell is not None for view in views]
+    J = J.copy() if any(is_grid) else J  # what was projected is used again
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
