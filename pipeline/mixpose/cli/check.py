@@ -111,15 +111,17 @@ def check_session(
     sizes = {name: each.size for name, each in surveys.items()}
     given = _of_geometry(with_image_sizes(session, sizes))
     doubts = geometry_doubts(session, opened, surveys)
-    report.lines += given.lines
     if doubts.mended is None:
+        report.lines += given.lines
         report.warnings = told_apart(report.of_counts) + report.warnings + given.warnings
         report.warnings += doubts.warnings
         if doubts.unexplained and not (report.of_counts or doubts.warnings):
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings]
-        report.warnings += _of_geometry(with_image_sizes(doubts.mended, sizes)).warnings
+        mended = _of_geometry(with_image_sizes(doubts.mended, sizes))
+        report.lines += mended.lines
+        report.warnings += mended.warnings
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
     report.write(doubts.tried or not_tried)

@@ -61,6 +61,8 @@ def design_sessions(asked: DesignRequest) -> None:
         with appearing_whole(asked.plot) as draft:
             draw_study(found, draft)
             sign_figure(draft)
+    if written := [str(path) for path in (asked.json, asked.plot) if path is not None]:
+        say(f"{len(names)} system{'s' * (len(names) != 1)} -> {', '.join(written)}")
 
 
 def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:

@@ -22,6 +22,7 @@ from mixpose.session.setup import ObjectSetup, Session, Start
 from mixpose.session.text_files import as_text, parse_toml, read_bytes
 from mixpose.session.validation import validate
 
+_LISTED = 5  # files that are named
 _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
 
 
@@ -47,9 +48,19 @@ def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     return _loaded(Path(path), allow_code=allow_code, bodies=True)
 
 
+def _no_such_file(path: Path) -> str:
+    """In words, with what else is in its folder."""
+    others = sorted(other.name for other in path.parent.glob("*.toml"))
+    more = f" and {len(others) - _LISTED} more" if len(others) > _LISTED else ""
+    found = f"{', '.join(others[:_LISTED])}{more}" if others else "no .toml file"
+    return f"{path}: no such file; in {path.parent} there is {found}"
+
+
 def _loaded(path: Path, *, allow_code: bool, bodies: bool) -> Session:
     data: dict[str, Any] = {}
     try:
+        if "\0" not in str(path) and not path.exists():
+            raise SessionError(_no_such_file(path))
         content = read_bytes(path)
         data = parse_toml(as_text(content))
         if not bodies:
