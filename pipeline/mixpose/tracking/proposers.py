@@ -138,14 +138,14 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    kinds, most = frame.rules.look_alikes.kinds, -np.inf
-    # from where what is moved is better on: two that are as good would take turns for ever
+    kinds, behind, most = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind, -np.inf
+    # once more, where what is moved is better: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
         for start in _as_evident(frame, ranked[0]):
             yield start
-            if ranked[0].log_evidence > most:
-                break
+            if ranked[0].log_evidence > most + behind:
+                break  # the rest are rivals of what is no rival
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
