@@ -77,3 +77,9 @@ def test_of_triangles_that_symmetries_map_to_each_other_one_is_tried() -> None:
     assert len(TRIANGLE.symmetries) == 6
     assert corners.tolist() == [[0, 1, 2]]
     assert len(feature_triangles(HEAD, 48, 0.02)[0]) == 6
+
+
+def test_features_on_a_line_have_no_triangles_and_are_not_found_by_them() -> None:
+    line = body("line", np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [100.0, 0.5, 0.0]]))
+    assert not len(feature_triangles(line, 36, 0.1)[0])
+    assert search_copies(seen([line], [at(0.0)], 0), [line], ALL_FREE) == []

@@ -79,7 +79,7 @@ def search_copies(
     triples = _near_triples(points, longest, budget.batch)
     images = [label_image(problems[0], *camera) for camera in cameras]
     poses = [
-        of_triples(problem, points, own, triples if len(own[0]) else triples[:0])
+        of_triples(problem, points, own, triples)
         for problem, own in zip(problems, triangles, strict=True)
     ]
     found = [_candidates(*case, images) for case in zip(problems, poses, strict=True)]

@@ -191,6 +191,8 @@ def of_triples(
 ) -> Floats:
     """Poses that bring triangles of features onto those of triples (K, 3) of points."""
     budget, body, (corners, tree) = problem.budget, problem.body, triangles
+    if not (len(triples) and len(corners)):  # features on a line have no triangles
+        return np.zeros((0, 4, 4))
     # of a side between two features that give way
     bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
     sides, is_wide = _sides(points.points, triples, budget.min_sine)
