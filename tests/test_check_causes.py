@@ -151,6 +151,24 @@ def test_what_follows_from_the_cause_is_not_told(
     assert "with points 1000 times as large, 4 of 4 frames are explained" in warnings[0]
 
 
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_where_the_body_is_another_one_it_is_said_that_no_frame_is_explained(
+    sensors: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No single change mends it; of one camera nothing contradicts it either."""
+    rows = np.random.default_rng(5).uniform(-90, 90, (7, 3)).round(1).tolist()
+    text = SESSION.read_text(encoding="utf-8")
+    before, after = text.split("points = [", 1)[0], text.split("\n]\n", 1)[1]
+    parts = f"{before}points = {rows}\n{after}".split("[[sensor]]")
+    path = tmp_path / "session.toml"
+    text = re.sub(r"\[start\]\n(?:[^\[\n].*\n)*", "", "[[sensor]]".join(parts[: 1 + sensors]))
+    path.write_text(text.replace('source = "', f'source = "{SESSION.parent}/'), encoding="utf-8")
+    check_session(path, quick=True)
+    out = capsys.readouterr().out
+    assert "the body is not found, by the session as it is or with any one change of it" in out
+    assert "warnings  none" not in out
+
+
 @pytest.mark.parametrize(("status", "told_of"), [("lost", True), ("ambiguous", False)])
 def test_frames_that_are_lost_ask_for_the_cause_as_those_in_doubt_do(
     status: Any, told_of: bool, right: Session

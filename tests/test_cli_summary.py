@@ -98,6 +98,23 @@ def test_a_sensor_that_meets_nothing_is_named_whatever_else_is_odd_about_it(
     assert warning in found.warnings()
 
 
+def test_doubts_about_frames_do_not_hide_a_sensor_that_explains_nothing(session: Session) -> None:
+    nothing = SensorReport(False, 0.0, None, MEETS_NOTHING)
+    found = summary(session, *[[met(0.9), nothing]] * 20)
+    T = np.eye(4)
+    for frame in range(20, 30):
+        doubted = Estimate(frame, None, session.labels[0], "ambiguous", T, None, 0.5, {})
+        found.findings.add(replace(doubted, doubt="features that would fix it are hidden or cut"))
+    first, second = found.warnings()
+    assert first.startswith("sensor 'right' explained less than 1 % in 20 of 20 frames")
+    assert second.startswith("features that would fix it are hidden or cut in 10 of")
+    # sensors that contradict each other are said to do so, once
+    for frame in range(30, 45):
+        doubted = Estimate(frame, None, session.labels[0], "ambiguous", T, None, 0.5, {})
+        found.findings.add(replace(doubted, doubt="sensors contradict each other"))
+    assert not any("explained less" in line for line in found.warnings())
+
+
 def test_of_more_sensors_those_not_explained_are_named() -> None:
     session = load_session(SYNTHETIC / "range_profiles" / "session.toml")
     (warning,) = summary(

@@ -76,6 +76,22 @@ def test_two_features_that_share_a_detection_count_as_one_and_a_third_is_missed(
     np.testing.assert_allclose(found.J[0, 0], found.J[0, 1], atol=1e-12)
 
 
+def test_a_spot_may_be_of_a_missed_feature_within_its_radius_too() -> None:
+    """With probability 0.6; then it is half of the distance beside the feature that it meets."""
+    places = [(0.0, 0.0), (3.0, 0.0), (20.0, 0.0), (24.5, 0.0)]
+    body = Body("flat", tuple(PointFeature(np.array([*place, 0.0])) for place in places))
+    spots = np.array([(0.0, 0.0), (20.0, 0.0)]) + 500.0
+    for radius, squared in ((4.0, 9.0), (2.5, 0.0)):
+        pattern = PointPattern(spots, np.ones(2), radii=np.full(2, radius))
+        view = View("camera", CAMERA, Observation(pattern, SIGMA))
+        objective = matched_objective([view], body, [SIGMA])
+        found = associate(objective, AT, RULES, ErrorRules().narrowest)
+        assert found.detections.tolist() == [[0, -1, 1, -1]]
+        np.testing.assert_allclose(found.extra[0, 0], 0.6 * squared / 4 / SIGMA**2)
+        # the fourth is beyond the radius of the second spot
+        assert found.extra[0, 2] == 0.0
+
+
 def mixture(centres: Floats, y: Floats) -> Floats:
     """Gaussians and their gradients (n, 3) in closed form."""
     away = centres - y[:, None]

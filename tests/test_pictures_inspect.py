@@ -224,6 +224,42 @@ def test_following_the_advice_finds_the_features(
     assert "not met" not in text
 
 
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+def test_a_marker_before_something_bright_is_parted_from_it_by_a_threshold_that_is_named(
+    polarity: str, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    """A hand of grey 90 about one marker: no level above the hand is named in vain."""
+    session = mixpose.load_session(recording / "session.toml")
+    y, _ = session.sensors[0].sensor.project(transform(pose_of_frame_6, session.body.means))
+    for path in recording.glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        hand = np.zeros_like(image)
+        if path.name.startswith("left"):
+            cv2.circle(hand, np.rint(y[0]).astype(int).tolist(), 40, 90, -1)
+        image = np.maximum(image, hand)
+        cv2.imwrite(str(path), image if polarity == "bright" else 255 - image)
+    lines = f'method = "blobs"\npolarity = "{polarity}"'
+    session_file = with_options(recording, lines)
+    told = re.search(
+        r"threshold = (\d+) parts them in this frame", advice_for(session_file, 6, pose_of_frame_6)
+    )
+    assert told is not None
+    text = session_file.read_text().replace(lines, f"{lines}\nthreshold = {told[1]}")
+    session_file.write_text(text)
+    assert "7 of 7 in view, 7 of them met" in advice_for(session_file, 6, pose_of_frame_6)
+
+
+def test_a_sensor_that_sees_the_body_elsewhere_is_said_to_take_no_part(
+    recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    away = pose_of_frame_6.copy()
+    away[0, 3] += 60.0
+    text = advice_for(recording / "session.toml", 6, away)
+    assert "it takes no part in this pose" in text
+    assert "not met" not in text
+
+
 def test_for_dark_features_the_threshold_goes_the_other_way(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:

@@ -60,6 +60,15 @@ def written(name: str, *estimates: Estimate, header: Header = HEADER) -> str:
     return stream.getvalue()
 
 
+def test_why_a_frame_is_not_ok_stands_in_its_line_and_is_read_again(tmp_path: Path) -> None:
+    doubted = replace(AMBIGUOUS, doubt="features that would fix it are hidden or cut")
+    lines = [json.loads(line) for line in written("jsonl", GOOD, AMBIGUOUS, doubted).splitlines()]
+    assert [line.get("why") for line in lines[1:]] == [None, None, doubted.doubt]
+    path = tmp_path / "poses.jsonl"
+    path.write_text(written("jsonl", GOOD, doubted), encoding="utf-8")
+    assert [one.doubt for one in read_poses(path).poses] == ["", doubted.doubt]
+
+
 def test_json_lines_have_the_keys_of_the_contract_in_its_order() -> None:
     header, pose = map(json.loads, written("jsonl", GOOD).splitlines())
     assert list(header) == [

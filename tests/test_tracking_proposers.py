@@ -13,10 +13,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, near
 from mixpose.judgement import RememberedNoise, ScoredPose
+from mixpose.matching import AssociationRules, ErrorRules, associate
 from mixpose.objective import MatchedObjective, View, matched_objective
-from mixpose.records import Estimate
+from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
     from_parts,
     from_rotation_vector,
@@ -32,6 +34,7 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
     PROPOSERS,
     REFINEMENTS,
+    _paired,
     look_alikes,
     merged_pair,
     narrowed,
@@ -279,6 +282,20 @@ def test_a_detection_taken_for_one_of_two_features_may_be_both_of_them() -> None
     rivals = [start.T_world_object for start in merged_pair(data, likelihood, judged)]
     assert min(float(rotation_angle_deg(rival, T)) for rival in rivals) < 0.02
     assert rotation_angle_deg(bent, T) > 0.1
+
+
+def test_two_features_may_share_a_spot_as_far_apart_as_disks_of_its_area_touch() -> None:
+    """Detections without a size are looked for within 2.2 σ_ε = 3.3 px; 5 px are √2 times 3.5."""
+    camera = PinholeCamera(np.eye(3), np.zeros(4), (100, 100), np.eye(4))
+    places = np.array([[40.0, 40.0, 1.0], [45.0, 40.0, 1.0], [80.0, 80.0, 1.0]])
+    body, rules = Body("three", tuple(map(PointFeature, places))), AssociationRules()
+    for radius, is_paired in ((0.0, False), (3.4, False), (3.7, True)):
+        pattern = PointPattern(places[[0, 2], :2], np.ones(2), radii=np.full(2, radius))
+        view = View("camera", camera, Observation(pattern, 1.5))
+        objective = matched_objective([view], body, [1.5])
+        seen = associate(objective, np.eye(4), rules, ErrorRules().narrowest)
+        paired, is_far = _paired(seen, rules.reach_squared, rules.middle, 1)
+        assert (paired.merged.tolist() == [1], is_far) == (is_paired, is_paired)
 
 
 def test_two_detections_of_one_image_may_both_be_of_two_features() -> None:
