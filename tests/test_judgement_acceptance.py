@@ -61,6 +61,18 @@ def status(*ranked: ScoredPose) -> str:
     return decide(ranked, ALL_FREE, RULES).status
 
 
+@pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.6, 0.0, 0.8], [0.58, -0.58, 0.57]])
+@pytest.mark.parametrize(("deviation_deg", "expected"), [(7.6, "ok"), (7.7, "ambiguous")])
+def test_how_widely_a_turn_may_be_open_does_not_depend_on_where_its_axis_points(
+    deviation_deg: float, expected: str, axis: list[float]
+) -> None:
+    """15 degrees either way are 1.96 of 7.65."""
+    along = np.array(axis) / np.linalg.norm(axis)
+    covariance = np.diag([1.0] * 3 + [1e-6] * 3)
+    covariance[3:, 3:] += np.radians(deviation_deg) ** 2 * np.outer(along, along)
+    assert status(replace(SURE, covariance=covariance)) == expected
+
+
 @pytest.mark.parametrize(("belief", "expected"), [(0.0009, "ok"), (0.0011, "ambiguous")])
 def test_a_rival_of_more_than_one_in_a_thousand_makes_a_frame_ambiguous(
     belief: float, expected: str

@@ -146,10 +146,15 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
 
 def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
     """Whether no wide sector of turns is left open, as by ranges, or about a line of features."""
-    variances = pose.covariance.diagonal()[3:]
+    turns = pose.covariance[3:, 3:]
     if pose.spread is not None:
-        variances = pose.spread[3:] ** 2
-    return bool(1.96 * math.sqrt(variances.max()) < math.radians(rules.widest_turn_deg))
+        turns = np.diag(pose.spread[3:] ** 2)
+    widest = math.radians(rules.widest_turn_deg) / 1.96
+    # no axis has more than all together
+    largest = float(np.trace(turns))
+    if widest**2 <= largest < math.inf:
+        largest = float(np.linalg.eigvalsh(turns)[-1])
+    return largest < widest**2
 
 
 def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseModel) -> bool:

@@ -25,7 +25,13 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.information import information_of, inverted, log_determinants, unit
+from mixpose.judgement.information import (
+    information_of,
+    inverted,
+    log_determinants,
+    unit,
+    with_wide_turn,
+)
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
@@ -189,11 +195,12 @@ def judge_together(
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent = _evidence(cases, seen, variances, free, rules.detection)
     evidence, densities = odds + [noise[-1] for noise in noises]
+    bodies = [case[0].projection.body for case in cases]
     return [
         ScoredPose(
             cases[k][1],
             whole[k],
-            covariance,
+            with_wide_turn(covariance, cases[k][1], bodies[k].means),
             float(evidence[k]),
             noise=remembered,
             log_missed=rules.detection.log_missed,
