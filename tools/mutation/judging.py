@@ -330,7 +330,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-wide-turns-are-sure",
         "judgement/acceptance.py",
-        "variances = pose.spread[3:] ** 2",
+        "turns = np.diag(pose.spread[3:] ** 2)",
         "pass",
         "ranges that leave the turn open are called sure",
         ("test_tracking_ranges.py",),

@@ -25,13 +25,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.information import (
-    information_of,
-    inverted,
-    log_determinants,
-    unit,
-    with_wide_turn,
-)
+from mixpose.judgement.information import information_of, inverted, log_determinants, with_wide_turn
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
@@ -290,7 +284,7 @@ def log_evidence(
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
     (chosen,) = free.nonzero()
     inner, before = information[..., chosen[:, None], chosen], 1 / wide[:, chosen] ** 2
-    inner = inner + unit(len(chosen)) * before[..., None]
+    inner = inner + np.eye(len(chosen)) * before[..., None]
     laplace = -0.5 * log_determinants(inner / (2 * np.pi), before / (2 * np.pi))
     by_volume = odds[0] + odds[1] + laplace + log_densities
     evidence = by_volume
