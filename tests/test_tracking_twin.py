@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies_in_view import OTHER, TOOL, at, body, scene_of, views_of
+from bodies_in_view import OTHER, TOOL, at, body, off, scene_of, views_of
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
@@ -75,3 +75,18 @@ def test_where_there_are_mirrors_a_flat_body_is_never_ok() -> None:
     found = estimates_of(FLAT, [[HERE]] * 6, options)
     assert {(one.status, one.doubt) for one in found} == {("ambiguous", IN_A_MIRROR)}
     assert all(one.status == "ok" for one in estimates_of(SOLID, [[HERE]] * 6, options))
+
+
+def test_where_nothing_is_left_beside_the_body_nothing_is_sought() -> None:
+    """Three markers before two cameras, without the false spot."""
+    few = body("few", TOOL[:3])
+    scene = scene_of(few)
+    tracks = scene.begin()
+    for frame in range(4):
+        views = []
+        for view in views_of([few], [HERE], frame):
+            assert view.observation.points is not None
+            own = view.observation.points[:, 0] > 60.0
+            views.append(replace(view, observation=view.observation.only(own)))
+        tracks, (estimate,) = scene.advance(tracks, frame, None, views)
+        assert off(estimate, HERE)[0] < 5.0

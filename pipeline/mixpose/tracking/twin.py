@@ -101,8 +101,9 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     if (used.dimensions != 2).any():
         return False
     rest = np.array([left.get(name, 0) for name in used.names])
-    # as much as would cast doubt, by as many sensors
-    if np.minimum(rest, used.met).sum() < used.met.sum() - _most_missed(data):
+    # as much as fixes a pose, and would cast doubt, by as many sensors
+    most = float(np.minimum(rest, used.met).sum())
+    if 2 * most < np.count_nonzero(data.free) or most < used.met.sum() - _most_missed(data):
         return False
     track = data.track
     is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
