@@ -78,15 +78,15 @@ def test_where_there_are_mirrors_a_flat_body_is_never_ok() -> None:
 
 
 def test_where_nothing_is_left_beside_the_body_nothing_is_sought() -> None:
-    """Three markers before two cameras, without the false spot."""
+    """Three markers that were there twice, without the false spot."""
     few = body("few", TOOL[:3])
     scene = scene_of(few)
     tracks = scene.begin()
-    for frame in range(4):
-        views = []
-        for view in views_of([few], [HERE], frame):
+    for frame in range(6):
+        views, poses = [], [HERE, THERE] if frame < 3 else [HERE]
+        for view in views_of([few] * len(poses), poses, frame):
             assert view.observation.points is not None
             own = view.observation.points[:, 0] > 60.0
             views.append(replace(view, observation=view.observation.only(own)))
         tracks, (estimate,) = scene.advance(tracks, frame, None, views)
-        assert off(estimate, HERE)[0] < 5.0
+    assert off(estimate, HERE)[0] < 5.0
