@@ -39,6 +39,7 @@ from mixpose.tracking.proposers import (
     merged_pair,
     narrowed,
 )
+from mixpose.tracking.track import Track
 
 Floats = NDArray[np.float64]
 
@@ -389,16 +390,22 @@ def test_cut_spots_are_left_behind_where_the_noise_is_known(
     assert rotation_angle_deg(bent.T_world_object, T) > 0.3
 
 
+def followed(cameras: list[PinholeCamera], body: Body) -> tuple[Tracker, Track]:
+    """For six frames, of which spots were found to 0.03 px."""
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for k in range(6):
+        seen = detect(cameras, body, TRUTH, noise=0.03, seed=k)
+        track, _ = tracker.advance(track, k, k / 30, seen)
+    return tracker, track
+
+
 def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     # all spots of one camera are 1 px lower, which no pose makes up for, as where it is out of
     # step: what the other sees alone is no better for it
-    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = tracker.begin()
-    for k in range(6):
-        seen = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.03, seed=k)
-        track, _ = tracker.advance(track, k, k / 30, seen)
+    tracker, track = followed(pinhole_cameras, EIGHT)
     views = []
     for k, camera in enumerate(pinhole_cameras):
         y = camera.project(transform(TRUTH, EIGHT.means))[0]
@@ -417,11 +424,7 @@ def test_narrow_blurs_are_tried_where_a_spot_that_is_off_can_carry_the_others(
     # tells, it moves some by more than the noise; of 200 itself, the most, by a sixth of it
     many = np.random.default_rng(3).uniform(-80, 80, (200, 3))
     for body in (EIGHT, Body("many", tuple(PointFeature(point) for point in many))):
-        tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
-        track = tracker.begin()
-        for k in range(6):
-            seen = detect(pinhole_cameras, body, TRUTH, noise=0.03, seed=k)
-            track, _ = tracker.advance(track, k, k / 30, seen)
+        tracker, track = followed(pinhole_cameras, body)
         views = []
         for k, camera in enumerate(pinhole_cameras):
             y = camera.project(transform(TRUTH, body.means))[0]

@@ -82,6 +82,13 @@ def shifted(T: Floats, step: Floats) -> Floats:
     return np.asarray(T @ T_object_aside)
 
 
+def board_before(cameras: list[PinholeCamera]) -> Frame:
+    """A frame that shows a grid of 35 features."""
+    board = grid(7, 5)
+    tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
+    return data_of(tracker, detect(cameras, board, TRUTH))
+
+
 def judged_here(data: Frame, T: Floats) -> ScoredPose:
     likelihood, start = likelihood_of(data), Start(T)
     return likelihood.judge(likelihood.fit(start), start)
@@ -90,9 +97,7 @@ def judged_here(data: Frame, T: Floats) -> ScoredPose:
 def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    board = grid(7, 5)
-    tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
-    data = data_of(tracker, detect(pinhole_cameras, board, TRUTH))
+    data = board_before(pinhole_cameras)
     slipped = judged_here(data, shifted(TRUTH, np.array([20.0, 0.0, 0.0])))
     starts = [start.T_world_object for start in look_alikes(data, [slipped])]
     assert min(np.abs(T - TRUTH).max() for T in starts) < 1e-9
@@ -103,9 +108,7 @@ def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
 def test_of_places_of_a_slipped_grid_the_best_is_tried_first_and_then_only_its_own_rivals(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    board = grid(7, 5)
-    tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
-    data = data_of(tracker, detect(pinhole_cameras, board, TRUTH))
+    data = board_before(pinhole_cameras)
     ranked = [judged_here(data, shifted(TRUTH, np.array([20.0, 20.0, 0.0])))]
     assert len(list(look_alikes(data, ranked))) > 1
     starts = []

@@ -6,7 +6,7 @@ Everything is kept as sums and stretches of frames, so that a run of any length 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
@@ -237,10 +237,9 @@ class Findings:
         # a body of another size is met off at all of its markers
         return [*self._of_doubts(), *(sizes or self._of_markers())]
 
-    @property
-    def tells_of_sensors(self) -> bool:
+    def tells_of_sensors(self, causes: Iterable[str]) -> bool:
         """Whether the causes say why a sensor explains nothing."""
-        return self.change is not None or any(APART in line for line in self._of_doubts())
+        return self.change is not None or any(APART in line for line in causes)
 
     def of_sensors(self) -> list[str]:
         """What is odd about what sensors see, a line each."""
@@ -316,14 +315,11 @@ class Findings:
         """What the session should have said, where few frames are ok, and some doubted or lost."""
         doubted = sum(each.count for each in self._doubts.values())
         # a body that is there twice, most of the time, is no fault of the session
-        twice = sum(each.count for doubt, each in self._doubts.items() if doubt == TWICE)
-        if 2 * twice > doubted:
-            doubted -= twice
-        else:
-            twice = 0
+        twice = self._doubts.get(TWICE, Stretches()).count
+        twice = twice if 2 * twice > doubted else 0
         frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
-        bad = self._places + 1 - self._ok - twice if doubted or self._lost >= _LONG else 0
+        bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
         return explanation(self._session, self._frames)

@@ -166,7 +166,7 @@ class Summary:
             apart = set(self.split)
             found += [] if seen else [self._split_text()]
         # what names the cause stands for what only shows it
-        found = [*([] if self.findings.tells_of_sensors else found), *seen, *causes]
+        found = [*([] if self.findings.tells_of_sensors(causes) else found), *seen, *causes]
         found += [
             f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
             for (name, why), count in self.left_out.items()

@@ -189,12 +189,11 @@ def judge_together(
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent = _evidence(cases, seen, variances, free, rules.detection)
     evidence, densities = odds + [noise[-1] for noise in noises]
-    bodies = [case[0].projection.body for case in cases]
     return [
         ScoredPose(
             cases[k][1],
             whole[k],
-            with_wide_turn(covariance, cases[k][1], bodies[k].means),
+            with_wide_turn(covariance, cases[k][1], cases[k][0].projection.body.means),
             float(evidence[k]),
             noise=remembered,
             log_missed=rules.detection.log_missed,

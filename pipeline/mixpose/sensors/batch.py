@@ -104,13 +104,13 @@ class PinholeBatch:
         self._middle, self._half = _images(cameras)
         self._lens = _lenses(cameras)
         # straight to pixels, or to what lenses distort
-        P = np.array([camera.T_sensor_world for camera in cameras])[:, :3]
+        T = np.array([camera.T_sensor_world for camera in cameras])
+        P = T[:, :3]
         if self._lens is None:
             P = self._K @ P
         self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
         self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
         self._R = P[:, None, :, :3]
-        T = np.array([camera.T_sensor_world for camera in cameras])
         self._centres = -T[:, None, :3, 3] @ T[:, :3, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:

@@ -59,8 +59,6 @@ def _no_such_file(path: Path) -> str:
 def _loaded(path: Path, *, allow_code: bool, bodies: bool) -> Session:
     data: dict[str, Any] = {}
     try:
-        if "\0" not in str(path) and not path.exists():
-            raise SessionError(_no_such_file(path))
         content = read_bytes(path)
         data = parse_toml(as_text(content))
         if not bodies:
@@ -69,6 +67,8 @@ def _loaded(path: Path, *, allow_code: bool, bodies: bool) -> Session:
         session = _build(path, hashlib.sha256(content).hexdigest(), data)
         return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
+        if not data and isinstance(problem.__cause__, FileNotFoundError):
+            raise SessionError(_no_such_file(path)) from problem
         raise SessionError(one_line(path, problem.key, problem.text, data)) from problem
     except RecursionError as error:
         raise SessionError(f"{path}: lists or tables in it are nested too deeply") from error

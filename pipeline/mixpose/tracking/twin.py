@@ -91,8 +91,8 @@ def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     of which nothing is left misses the second one.
     """
     met = [dict(zip(one.used.names, one.used.met.tolist())) for one in (best, second)]
-    more = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
-    return -float(more) * float(logit(data.rules.judgement.detection.probability))
+    more: float = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
+    return -more * _log_odds_of_one(data)
 
 
 def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
@@ -115,9 +115,12 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
 
 def _most_missed(data: Frame) -> float:
     """How many features more a second pose misses at the most that casts doubt on the best one."""
-    return data.rules.acceptance.log_doubt / -float(
-        logit(data.rules.judgement.detection.probability)
-    )
+    return -data.rules.acceptance.log_doubt / _log_odds_of_one(data)
+
+
+def _log_odds_of_one(data: Frame) -> float:
+    """Of a feature in view, that it is met and not missed."""
+    return float(logit(data.rules.judgement.detection.probability))
 
 
 def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
@@ -141,11 +144,10 @@ def _where_it_was(data: Frame, best: ScoredPose, views: Sequence[View]) -> Score
     """The second pose of the frame before, in this one."""
     if data.track.twice == -math.inf or not views:
         return None
-    rest = data.seen_otherwise(views=views, starts=())
-    likelihood = likelihood_of(rest)
-    for start in _elsewhere(data, best):
-        return likelihood.judge(likelihood.fit(start), start)
-    return None
+    if (start := next(_elsewhere(data, best), None)) is None:
+        return None
+    likelihood = likelihood_of(data.seen_otherwise(views=views, still=(), starts=()))
+    return likelihood.judge(likelihood.fit(start), start)
 
 
 def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
