@@ -34,10 +34,11 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
     PROPOSERS,
     REFINEMENTS,
+    _carry,
     _paired,
+    agreed,
     look_alikes,
     merged_pair,
-    narrowed,
 )
 from mixpose.tracking.track import Track
 
@@ -381,10 +382,10 @@ def test_cut_spots_are_left_behind_where_the_noise_is_known(
 ) -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     estimate, T = followed_to_cut_spots(pinhole_cameras, tracker)
-    bent, _ = followed_to_cut_spots(pinhole_cameras, without(tracker, "narrowed"))
+    bent, _ = followed_to_cut_spots(pinhole_cameras, without(tracker, "agreed"))
     assert estimate.T_world_object is not None
     assert bent.T_world_object is not None
-    assert estimate.proposer == "narrowed"
+    assert estimate.proposer == "agreed"
     # six spots of 0.03 px leave 0.03 degrees; two that are 1 px off bend it by half a degree
     assert rotation_angle_deg(estimate.T_world_object, T) < 0.1
     assert rotation_angle_deg(bent.T_world_object, T) > 0.3
@@ -400,7 +401,7 @@ def followed(cameras: list[PinholeCamera], body: Body) -> tuple[Tracker, Track]:
     return tracker, track
 
 
-def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
+def test_agreement_does_not_choose_among_sensors_that_disagree(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     # all spots of one camera are 1 px lower, which no pose makes up for, as where it is out of
@@ -414,10 +415,35 @@ def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
     likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
     judged = likelihood.judge(likelihood.fit(start), start)
     assert judged.residual_ratio > 1
-    assert list(narrowed(data, likelihood, judged)) == []
+    assert list(agreed(data, likelihood, judged)) == []
 
 
-def test_narrow_blurs_are_tried_where_a_spot_that_is_off_can_carry_the_others(
+def test_three_spots_that_agree_by_chance_are_no_better_than_five_that_do(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # three spots fix a pose, wherever they are: of one camera they show the body turned by 1.5°,
+    # where the other five are up to 4 px off; those agree with one another
+    T_other = perturb(TRUTH, np.array([0.5, 0.2, -0.4, 0.02, 0.01, -0.015]))
+    tracker, track = followed(pinhole_cameras, EIGHT)
+    views = []
+    for k, (camera, count) in enumerate(zip(pinhole_cameras, (2, 6), strict=True)):
+        y = camera.project(transform(TRUTH, EIGHT.means[:count]))[0]
+        if k == 1:
+            y[:3] = camera.project(transform(T_other, EIGHT.means[:3]))[0]
+        views.append(view_of(str(k), camera, y))
+    data = tracker.data(track, 6, 6 / 30, views)
+    likelihood, there = likelihood_of(data), Start(T_other)
+    judged = likelihood.judge(likelihood.fit(there), there)
+    found = [likelihood.fit(one).T_world_object for one in agreed(data, likelihood, judged)]
+    assert min(rotation_angle_deg(T, TRUTH) for T in found) < 0.01
+    assert len(found) <= data.rules.proposals.kept
+    there = Start(TRUTH)
+    judged = likelihood.judge(likelihood.fit(there), there)
+    found = [likelihood.fit(one).T_world_object for one in agreed(data, likelihood, judged)]
+    assert all(rotation_angle_deg(T, T_other) > 0.5 for T in found)
+
+
+def test_others_are_asked_where_spots_that_are_off_can_carry_them(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     # one spot is 8 standard deviations off: of eight features, whose pose is a third of what each
@@ -433,9 +459,7 @@ def test_narrow_blurs_are_tried_where_a_spot_that_is_off_can_carry_the_others(
             views.append(view_of(str(k), camera, y))
         data = tracker.data(track, 6, 6 / 30, views)
         likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
-        judged = likelihood.judge(likelihood.fit(start), start)
-        judged = replace(judged, proposer="predicted")
-        off = data.rules.judgement.noise.errors.are_off(judged.used, judged.variances[:, None])
+        used = likelihood.judge(likelihood.fit(start), start).used
+        off = data.rules.judgement.noise.errors.are_off(used, data.variances[:, None])
         assert off[0, 2]
-        assert judged.residual_ratio <= 1
-        assert bool(list(narrowed(data, likelihood, judged))) == (body is EIGHT)
+        assert _carry(off, used, np.sqrt(data.variances), data) == (body is EIGHT)

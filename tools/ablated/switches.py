@@ -13,9 +13,9 @@ from mixpose.tracking.frame import Frame
 from mixpose.tracking.proposers import (
     Proposer,
     Refinement,
+    agreed,
     merged_pair,
     multistart,
-    narrowed,
     searched,
     without_sensor,
 )
@@ -112,7 +112,7 @@ SWITCHES = (
     Switch("no other tilt", ruled("look_alikes", kinds=("congruent", "mirrored"))),
     Switch("no mirror image", ruled("look_alikes", kinds=("congruent", "tilted"))),
     Switch("no merged_pair", without_refinement(merged_pair)),
-    Switch("no narrowed", without_refinement(narrowed)),
+    Switch("no agreed", without_refinement(agreed)),
     Switch("sizes tell nothing", ruled("sizes", cut=0.0)),
     Switch("no without_sensor", without_refinement(without_sensor)),
     Switch("nothing merged", ruled("judgement.association", merged=False)),

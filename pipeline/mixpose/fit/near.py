@@ -257,7 +257,7 @@ def _to_the_noise(
             straight = shift if is_clear else np.inf
         narrower = np.maximum(end, np.minimum(blurs / rules.ratio, straight))
         is_only = best is None and is_end
-        likelihood = np.inf if is_only else log_likelihood(narrow, matches, count, errors)
+        likelihood = np.inf if is_only else float(log_likelihood(narrow, matches, count, errors))
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit
         if is_end or likeliest < least:

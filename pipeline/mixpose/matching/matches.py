@@ -283,8 +283,8 @@ def _seen_at(
 
 def log_likelihood(
     blurs: Floats, matches: Matches, free: int, rules: ErrorRules = ErrorRules()
-) -> float:
-    """Of offsets, normal ones and some that are anywhere, less that of none being noise.
+) -> Floats:
+    """Of offsets (...), normal ones and some that are anywhere, less that of none being noise.
 
     What a pose is free to fit is paid for.  Blurs (L,) go by the noise.
     """
@@ -294,8 +294,8 @@ def log_likelihood(
     odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * matches.squared / variances)
     believed = m * matches.shares * odds / (1 + odds)
     logs = believed * np.log(2 * np.pi * variances)
-    price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), 1e-12)
-    return float((matches.shares * np.log1p(odds)).sum()) + price
+    each = np.sum([logs, believed, matches.shares * np.log1p(odds)], axis=(-2, -1))
+    return np.asarray(each[2] + 0.5 * free * each[0] / np.maximum(each[1], 1e-12))
 
 
 def pooled(

@@ -176,7 +176,7 @@ class Frame(Setup):
         """A start of what there may be instead of a pose, as far as that leaves room for it."""
         errors, count = self.rules.judgement.noise.errors, int(np.count_nonzero(self.free))
         own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
-        return Start(T_world_object, wide, least=own - self.rules.look_alikes.behind, **rest)
+        return Start(T_world_object, wide, least=float(own) - self.rules.look_alikes.behind, **rest)
 
     def nearness(self, poses: Sequence[Floats]) -> Floats:
         """Log densities (K,) of poses (4, 4) where the body moved on; 0 where nothing is known.

@@ -7,10 +7,11 @@ says itself when it applies.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import product
+from itertools import combinations, product
 from operator import add
 from typing import TypeAlias
 
@@ -22,9 +23,9 @@ from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolera
 from mixpose.density import DRAWING
 from mixpose.fit import Fit, blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
-from mixpose.matching import LEAST_VARIANCE, Matches, welsch
+from mixpose.matching import LEAST_VARIANCE, Matches, log_likelihood, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
@@ -335,44 +336,70 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matc
     return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra), is_far
 
 
-def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """The predictions at narrow blurs, where some detection is farther off than noise is.
+def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
+    """Where some of the detections that are met fix the pose, and others agree with them.
 
-    Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
+    Several that are cut, or another's, may pull a fit together; the rest agrees elsewhere.  Modes
+    of the likelihood are sought by one step of least squares from each of many sets.
     """
-    if judged.proposer != predicted.__name__:
+    errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
+    noise = np.sqrt(frame.variances)
+    if judged.left_out or not _carry(errors.are_off(used, noise[:, None] ** 2), used, noise, frame):
         return
-    has_cells = any(view.observation.cell is not None for view in frame.views)
-    errors, used = frame.rules.judgement.noise.errors, judged.used
-    # what is known to be cut pulls as well
-    off = errors.are_off(used, judged.variances[:, None])
-    if has_cells or (judged.residual_ratio <= 1 and not _carry(off, judged, frame)):
+    is_met = used.shares > 0
+    J = (used.J[..., frame.free] / noise[:, None, None, None])[is_met]
+    r = (used.offsets / noise[:, None, None])[is_met]
+    few = -(-J.shape[2] // int(used.dimensions.min()))
+    if (sets := _some_sets(len(r), few, rules.proposals.sets, frame.options.seed)) is None:
         return
-    narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
-    blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
-    for one, blur in product(predicted(frame, [])[: max(len(frame.predictions), 1)], blurs):
-        start = replace(one, blur=blur)
-        T, seen = met_at(frame, fit := likelihood.fit(start))
-        # where all of a sensor are off it is out of step, and the others no better for it
-        off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
-        if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
-            yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
+    known = frame.predictions[0].uncertainty if frame.predictions else frame.start_uncertainty
+    rows = J[sets].reshape(len(sets), -1, J.shape[2])
+    information = rows.swapaxes(1, 2) @ rows + np.diag(known[frame.free] ** -2.0)
+    twists = np.linalg.solve(information, rows.swapaxes(1, 2) @ r[sets].reshape(*rows.shape[:2], 1))
+    twists = np.concatenate([np.zeros((1, J.shape[2])), twists[..., 0]])
+    moved = np.einsum("nmk,sk->snm", J, twists)  # in deviations of the noise
+    offsets = np.zeros((len(twists), *used.offsets.shape))
+    offsets[:, is_met] = (r - moved) * noise[is_met.nonzero()[0], None]
+    others = replace(used, offsets=offsets)
+    likely = log_likelihood(errors.blur * noise, others, J.shape[2], errors)
+    # where most of a sensor are off it is out of step, and the others no better for it
+    off = errors.are_off(others, noise[:, None] ** 2 + used.extra).sum(axis=2)
+    likely[(2 * off > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf
+    least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
+    for k in np.argsort(-likely, kind="stable").tolist():
+        if not likely[k] > least or len(modes) > rules.proposals.kept:
+            break
+        apart = moved[modes] - moved[k]
+        if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
+            modes.append(k)
+            twist = np.zeros(6)
+            twist[frame.free] = twists[k]
+            T, blur = perturb(judged.T_world_object, twist), errors.blur * float(noise.max())
+            yield Start(T, frame.close, blur=blur)
 
 
-def _carry(off: Mask, judged: ScoredPose, frame: Frame) -> bool:
+def _some_sets(count: int, few: int, most: int, seed: int) -> Indices | None:
+    """All sets (S, few) of so many numbers below a count, or some at random; None for too few."""
+    if count <= few:
+        return None
+    if math.comb(count, few) <= most:
+        return np.array([*combinations(range(count), few)])
+    return np.random.default_rng(seed).random((most, count)).argsort(axis=1)[:, :few]
+
+
+def _carry(off: Mask, used: Matches, noise: Floats, frame: Frame) -> bool:
     """Whether features (L, N) that are off carry any away, by a part of the noise that matters.
 
-    They do so by least squares at the most.  What stays nearer meets the same at narrow blurs.
+    They do so by least squares at the most.  Where they do not, all modes are one.
     """
     if not np.count_nonzero(off):
         return False
-    used, noise = judged.used, np.sqrt(judged.variances)[:, None, None]
-    J = used.J[..., frame.free] / noise[..., None]
+    J = used.J[..., frame.free] / noise[:, None, None, None]
     met = J[used.shares > 0].reshape(-1, J.shape[-1])
-    pull = np.einsum("nmk,nm->k", J[off], (used.offsets / noise)[off])
+    pull = np.einsum("nmk,nm->k", J[off], (used.offsets / noise[:, None, None])[off])
     moved = (met @ (inverted(met.T @ met) @ pull)).reshape(-1, J.shape[-2])
     return bool(np.vecdot(moved, moved).max() > frame.rules.fit.moved**2)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
-REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, narrowed)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, agreed)

@@ -17,10 +17,10 @@ class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
     drawn: int = constant(512, "poses scored: one is off by less than a third in all directions")
-    kept: int = constant(5, "of these, starts that descend")
+    kept: int = constant(5, "of these, starts that descend; modes of agreeing detections")
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(3.0, "drawn poses are so much surer than starts; searched: squared")
-    blurs: tuple[float, ...] = constant((0.5, 0.25, 0.12), "σ_ε, to begin at where spots pull")
+    sets: int = constant(100, "of detections: of half wrong, three right ones are in one of 8")
     whole: int = constant(
         30,
         "poses that are ok, before which images of a flat body are looked at whole: what was "
