@@ -415,6 +415,7 @@ def test_agreement_does_not_choose_among_sensors_that_disagree(
     likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
     judged = likelihood.judge(likelihood.fit(start), start)
     assert judged.residual_ratio > 1
+    judged = replace(judged, proposer="predicted")
     assert list(agreed(data, likelihood, judged)) == []
 
 
@@ -433,12 +434,12 @@ def test_three_spots_that_agree_by_chance_are_no_better_than_five_that_do(
         views.append(view_of(str(k), camera, y))
     data = tracker.data(track, 6, 6 / 30, views)
     likelihood, there = likelihood_of(data), Start(T_other)
-    judged = likelihood.judge(likelihood.fit(there), there)
+    judged = replace(likelihood.judge(likelihood.fit(there), there), proposer="predicted")
     found = [likelihood.fit(one).T_world_object for one in agreed(data, likelihood, judged)]
     assert min(rotation_angle_deg(T, TRUTH) for T in found) < 0.01
     assert len(found) <= data.rules.proposals.kept
     there = Start(TRUTH)
-    judged = likelihood.judge(likelihood.fit(there), there)
+    judged = replace(likelihood.judge(likelihood.fit(there), there), proposer="predicted")
     found = [likelihood.fit(one).T_world_object for one in agreed(data, likelihood, judged)]
     assert all(rotation_angle_deg(T, T_other) > 0.5 for T in found)
 

@@ -90,3 +90,27 @@ def test_where_nothing_is_left_beside_the_body_nothing_is_sought() -> None:
             views.append(replace(view, observation=view.observation.only(own)))
         tracks, (estimate,) = scene.advance(tracks, frame, None, views)
     assert off(estimate, HERE)[0] < 5.0
+
+
+def test_a_second_body_before_a_late_camera_is_followed_where_it_is() -> None:
+    """Both move by 10 px a frame; the right camera takes its frame half a frame later."""
+    scene = Scene((Tracker.create(SOLID, EstimatorOptions()),))
+    tracks, late = scene.begin(), 0.5 / 30
+    for frame in range(12):
+        now, then = (
+            [at(-120.0, y), at(130.0, 60.0 - y, turn=0.4)][: 1 + (frame >= 4)]
+            for y in (12.0 * frame - 60.0, 12.0 * (frame + 0.5) - 60.0)
+        )
+        left, _ = views_of([SOLID] * len(now), now, frame)
+        _, right = views_of([SOLID] * len(now), then, frame)
+        views = [left, replace(right, delay=late)]
+        tracks, (estimate,) = scene.advance(tracks, frame, frame / 30, views)
+        if frame < 4:
+            assert estimate.status == "ok"
+            assert off(estimate, now[0])[0] < 2.0
+            continue
+        assert (estimate.status, estimate.doubt) == ("ambiguous", TWICE)
+        places = np.array([each.T_world_object[:3, 3] for each in estimate.hypotheses])
+        # in its first frame its velocity is not known: 0.3 m/s for 17 ms
+        for T, limit in zip(now, (2.0, 5.0 if frame == 4 else 2.0), strict=True):
+            assert np.linalg.norm(places - T[:3, 3], axis=1).min() < limit

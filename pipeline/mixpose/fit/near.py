@@ -145,17 +145,21 @@ def fit_near(
     noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
     fields: float = 1.0,  # share of it that is errors of calibration, in no sensor's own noise
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
+    wide: float = 1.0,  # in σ_ε, where they are off by more: it ends there
     errors: ErrorRules = ErrorRules(),
     association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
     """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
     free, sigmas = free_mask(options), [view.observation.sigma for view in views]
+    blur = blur if wide <= 1 else wide
     levels, begins = list[list[float]](), [blur * sigma for sigma in sigmas]
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
         states, spread = T_start[None], np.where(free, uncertainty, 0.0)
         for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
+            if level[0] <= begins[0]:
+                break
             levels.append(level)
             at = build_objective(options.objective, views, body, samples, level, states[0])
             states = ascend(at, states, perturb, free, rules.coarse).states
@@ -171,12 +175,15 @@ def fit_near(
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
         return replace(fit, T_world_object=T, freed=is_freed)
     first = finest if blur == 1 else matched_objective(views, body, begins)
-    ascent = begun or _at_once(first, T_start, free, rules, blur != 1)
+    ascent = begun or _at_once(first, T_start, free, rules, blur < 1)
     ascent = ascent or descended(first, rules.sharp)
     known = climbed if climbed is not None and blur == 1 else []
     for fit in known:
         if fit.begins_at(ascent, rules.sharp.tolerance):
             return fit
+    if wide > 1:
+        matches = associate(first, ascent.states[0], association, errors.narrowest)
+        return Fit.of(ascent, views, [*levels, begins], matches=matches)
     rest = finest, free, least, noise, fields, beside, errors, association, rules
     known.append(_to_the_noise(ascent, [*levels, begins], blur, first, *rest))
     return known[-1]

@@ -188,10 +188,8 @@ def insert(
         T_new = nearest_alike(new.T_world_object, body, old.T_world_object)
         away = np.where(free, twist_between(old.T_world_object, T_new), 0.0)
         if _are_one(old, new, away, free, limit, rules):
-            # that residuals are larger than those before them is as rare as that a sure pose is
-            # wrong, though more spots are off for smaller ones; of two as good the later says more
-            more = rules.log_doubt * (int(old.residual_ratio > 1) - int(new.residual_ratio > 1))
-            is_better = new.log_density > old.log_density + more - 0.01
+            # of two as good the later says more
+            is_better = _worth(new, rules, 0.01) > _worth(old, rules)
             told, other = (new, old) if is_better else (old, new)
             belief = beliefs([told, other])[1]
             if told.spread is None and belief > 1 - rules.confidence:
@@ -202,6 +200,16 @@ def insert(
     else:
         ranked.append(new)
     ranked.sort(key=lambda one: -one.log_density)
+
+
+def _worth(pose: ScoredPose, rules: AcceptanceRules, more: float = 0.0) -> tuple[bool, float]:
+    """Which of two poses on one peak stands for both: what is likelier clutter for no other.
+
+    That residuals are larger than those before them is as rare as that a sure pose is wrong, though
+    more spots are off for smaller ones.
+    """
+    doubt = rules.log_doubt * int(pose.residual_ratio > 1)
+    return pose.log_evidence > 0, pose.log_density + doubt + more
 
 
 def _are_one(

@@ -253,8 +253,7 @@ class Frame(Setup):
             return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
         if branch.course is None or elapsed > rules.longest_s:
             return rest
-        expected = branch.course.expected(moved if is_there else None, elapsed)
-        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected
+        return branch.course.expected(moved if is_there else None, elapsed)
 
 
 def given(frame: Frame, T_world_object: Floats) -> float:

@@ -66,11 +66,12 @@ class Offsets(NamedTuple):
 
 
 def fit_in_motion(
-    frame: Frame, T_start: Floats, climb: Callable[[Frame, Floats, float], Fit]
+    frame: Frame, T_start: Floats, climb: Callable[[Frame, Floats, float, float], Fit]
 ) -> Fit:
     """Climb to the most likely pose and velocity near a start (4, 4).
 
-    `climb` takes a frame as of the common time, a start, and how far off features may be, in σ_ε.
+    `climb` takes a frame as of the common time, a start, how far off features may be, and at which
+    blur it ends, in σ_ε: narrower ones choose a sensor where the velocity is not known.
     """
     motion = frame.expected(T_start, is_there=False).at(T_start)
     T, moved, count, timing = T_start, np.inf, int(frame.free.sum()), frame.rules.timing
@@ -79,7 +80,9 @@ def fit_in_motion(
         seen = frame.in_motion(motion)
         expected, matches = frame.expected(T), None
         if moved > timing.linear:
-            fit = climb(seen, T, _beside(seen, T, expected))
+            beside, by_velocity = _beside(seen, T, expected)
+            # after the first climb the velocity is known
+            fit = climb(seen, T, beside, by_velocity if moved == np.inf else 1.0)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
             matches = fit.matches if T is fit.T_world_object else None
             expected = frame.expected(T)
@@ -144,7 +147,7 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         known = model.memory * frame.track.residuals.of(matches.names)
         _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
-        blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), 1.0)
+        blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), max(beside, 1.0))
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
     kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
     pull = pull[kept[:2]]
@@ -157,11 +160,15 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
     )
 
 
-def _beside(frame: Frame, T_world_object: Floats, expected: Expected) -> float:
-    """How far features may be off at a pose by velocity and delays, in σ_ε, whatever meets them."""
+def _beside(frame: Frame, T_world_object: Floats, expected: Expected) -> tuple[float, float]:
+    """How far features may be off at a pose in σ_ε, whatever meets them.
+
+    By velocity and delays, and by velocity alone.
+    """
     at, views = frame.finest.projection.project(T_world_object[None]), frame.still or frame.views
     seen, J = at.weights[:, 0] > 0, at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
-    return _off(views, _seconds(views, at.y[:, 0], seen), J, seen, expected)
+    late, told = _seconds(views, at.y[:, 0], seen), [replace(view, unsure=None) for view in views]
+    return _off(views, late, J, seen, expected), _off(told, late, J, seen, expected)
 
 
 def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:

@@ -62,7 +62,7 @@ class MatchedLikelihood:
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, T) if self.knows_detections and frame.body.spread else 0.0
 
-        def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
+        def climb(seen: Frame, T_start: Floats, beside: float = 0.0, wide: float = 1.0) -> Fit:
             return fit_near(
                 seen.views,
                 seen.body,
@@ -78,6 +78,7 @@ class MatchedLikelihood:
                 noise=seen.noise,
                 fields=seen.track.residuals.fields,
                 beside=max(beside, spread),
+                wide=wide,
                 errors=model.noise.errors,
                 association=model.association,
                 rules=seen.rules.fit,

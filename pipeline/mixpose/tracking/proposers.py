@@ -344,7 +344,9 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     """
     errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
     noise = np.sqrt(frame.variances)
-    if judged.left_out or not _carry(errors.are_off(used, noise[:, None] ** 2), used, noise, frame):
+    if judged.proposer != predicted.__name__ or judged.left_out:
+        return
+    if not _carry(errors.are_off(used, noise[:, None] ** 2), used, noise, frame):
         return
     is_met = used.shares > 0
     J = (used.J[..., frame.free] / noise[:, None, None, None])[is_met]
