@@ -6,6 +6,7 @@ from mutation.mutant import Mutant
 
 _STARTS = "test_tracking_starts.py"
 _RANGES = "test_tracking_ranges.py"
+_TWIN = "test_tracking_twin.py"
 _DELAYS = "test_tracking_delays.py"
 _WINDOWS = "test_tracking_gating.py"
 _TRACK = "test_tracking_track.py"
@@ -104,6 +105,23 @@ _PREDICTION = (
         "0 * np.diag(expected.gain[free])",
         "late sensors are seen at the velocity of another pose",
         (_DELAYS,),
+    ),
+    Mutant(
+        "tracking-one-of-late-cameras-chosen",
+        "tracking/in_motion.py",
+        "by_velocity if moved == np.inf else 1.0",
+        "1.0",
+        "a fast body before a late camera is where one of the cameras alone sees it",
+        (_TWIN,),
+    ),
+    Mutant(
+        "tracking-fast-bodies-expected-at-rest",
+        "tracking/frame.py",
+        "return branch.course.expected(moved if is_there else None, elapsed)",
+        "expected = branch.course.expected(moved if is_there else None, elapsed)\n"
+        "        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected",
+        "late cameras contradict each other where a body moves faster than most",
+        (_TWIN,),
     ),
     Mutant(
         "tracking-sudden-motion-goes-unnoticed",

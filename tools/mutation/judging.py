@@ -366,8 +366,8 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-worse-twin-kept",
         "judgement/acceptance.py",
-        "is_better = new.log_density > old.log_density + more - 0.01",
-        "is_better = new.log_density < old.log_density",
+        "is_better = _worth(new, rules, 0.01) > _worth(old, rules)",
+        "is_better = _worth(new, rules) < _worth(old, rules)",
         "of two fits that are one pose the worse is told",
     ),
     Mutant(
@@ -398,9 +398,16 @@ _JUDGE = (
     Mutant(
         "judgement-any-noise-as-likely",
         "judgement/acceptance.py",
-        "more = rules.log_doubt *",
-        "more = 0.0 *",
+        "doubt = rules.log_doubt *",
+        "doubt = 0.0 *",
         "a bent pose is likelier than one that leaves out the spots that are off",
+    ),
+    Mutant(
+        "judgement-clutter-stands-for-a-pose",
+        "judgement/acceptance.py",
+        "return pose.log_evidence > 0, pose.log_density",
+        "return True, pose.log_density",
+        "four spots that are met exactly by chance stand for seven that show a body of another size",
     ),
     Mutant(
         "judgement-most-turned-twin",

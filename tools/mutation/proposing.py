@@ -28,7 +28,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-rivals-followed-however-far-behind",
         "tracking/frame.py",
-        "least=own - self.rules.look_alikes.behind, ",
+        "least=float(own) - self.rules.look_alikes.behind, ",
         "",
         "the other tilt of a flat body costs more than the body itself",
         (_PROPOSERS,),
@@ -164,9 +164,17 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers.py",
-        "if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():",
-        "if (off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():",
+        "likely[(2 * off > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf",
+        "pass",
         "of sensors that are out of step the one that is right by itself is believed",
+        (_PROPOSERS,),
+    ),
+    Mutant(
+        "tracking-one-mode-of-a-likelihood",
+        "tracking/proposers.py",
+        "errors.outlying**2:\n            modes.append(k)",
+        "1e9 * errors.outlying**2:\n            modes.append(k)",
+        "three spots that are met exactly by chance outweigh five that agree",
         (_PROPOSERS,),
     ),
     Mutant(
