@@ -59,7 +59,7 @@ SHOWN_BY = {
     "no searched": "2 parallel 6/0/0",
     "static clutter searched alike": "enters among 10 lamps",
     "no merged_pair": "fast",
-    "no agreed": "spots that touch",
+    "no agreed": "few among others",
     "sizes tell nothing": "two_cameras",
     "no without_sensor": "a knocked camera",
     "nothing merged": "fast",

@@ -105,6 +105,8 @@ SIMULATED = (
               knocked_deg=0.1),
     Simulated("spots that touch", MARKERS, 2, 9000.0,
               SimulationOptions(15, seed=5, noise=1.0, spot_sigma=2.0), (3.0, 10.0)),
+    Simulated("few among others", MARKERS[:5], 2, 2000.0,
+              SimulationOptions(30, seed=10, noise=1.0, spot_sigma=2.0, clutter=25, others=2)),
 )  # fmt: skip
 
 
@@ -162,7 +164,7 @@ def _session_text(one: Simulated, knocked_deg: float = 0.0) -> str:
         T = looking_at(one.distance * np.array(eye), np.zeros(3))
         if k == one.cameras - 1:
             T[:3] = Rotation.from_euler("y", knocked_deg, degrees=True).as_matrix() @ T[:3]
-        source = f"c{k}_*.png" if one.name == "spots that touch" else f"c{k}.csv"
+        source = f"c{k}_*.png" if one.options.spot_sigma else f"c{k}.csv"
         lines += [
             "[[sensor]]", f'name = "c{k}"', 'model = "pinhole"', f'source = "{source}"',
             "fps = 25.0", "resolution = [640, 512]",

@@ -164,7 +164,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers.py",
-        "likely[(2 * off > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf",
+        "likely[(2 * off.sum(axis=2) > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf",
         "pass",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),

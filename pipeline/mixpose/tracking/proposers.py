@@ -346,9 +346,10 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     noise = np.sqrt(frame.variances)
     if judged.proposer != predicted.__name__ or judged.left_out:
         return
-    if not _carry(errors.are_off(used, noise[:, None] ** 2), used, noise, frame):
+    off = errors.are_off(used, noise[:, None] ** 2) & (used.detections >= 0)
+    if not _carry(off, used, noise, frame):
         return
-    is_met = used.shares > 0
+    is_met = (used.shares > 0) & (used.detections >= 0)
     J = (used.J[..., frame.free] / noise[:, None, None, None])[is_met]
     r = (used.offsets / noise[:, None, None])[is_met]
     few = -(-J.shape[2] // int(used.dimensions.min()))
@@ -365,8 +366,9 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     others = replace(used, offsets=offsets)
     likely = log_likelihood(errors.blur * noise, others, J.shape[2], errors)
     # where most of a sensor are off it is out of step, and the others no better for it
-    off = errors.are_off(others, noise[:, None] ** 2 + used.extra).sum(axis=2)
-    likely[(2 * off > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf
+    off = errors.are_off(others, noise[:, None] ** 2 + used.extra)
+    likely[(2 * off.sum(axis=2) > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf
+    poses = perturb(judged.T_world_object, twists @ np.eye(6)[frame.free])
     least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
     for k in np.argsort(-likely, kind="stable").tolist():
         if not likely[k] > least or len(modes) > rules.proposals.kept:
@@ -374,10 +376,7 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
         apart = moved[modes] - moved[k]
         if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
             modes.append(k)
-            twist = np.zeros(6)
-            twist[frame.free] = twists[k]
-            T, blur = perturb(judged.T_world_object, twist), errors.blur * float(noise.max())
-            yield Start(T, frame.close, blur=blur)
+            yield Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
 
 
 def _some_sets(count: int, few: int, most: int, seed: int) -> Indices | None:
