@@ -109,8 +109,8 @@ _PREDICTION = (
     Mutant(
         "tracking-one-of-late-cameras-chosen",
         "tracking/in_motion.py",
-        "by_velocity if moved == np.inf else 1.0",
-        "1.0",
+        "wide = max(by_velocity, 1.0)",
+        "pass",
         "a fast body before a late camera is where one of the cameras alone sees it",
         (_TWIN,),
     ),

@@ -78,15 +78,16 @@ def fit_in_motion(
     errors = frame.rules.judgement.noise.errors
     for _ in range(6):
         seen = frame.in_motion(motion)
-        expected, matches = frame.expected(T), None
+        expected, matches, wide = frame.expected(T), None, 1.0
         if moved > timing.linear:
             beside, by_velocity = _beside(seen, T, expected)
-            # after the first climb the velocity is known
-            fit = climb(seen, T, beside, by_velocity if moved == np.inf else 1.0)
+            if moved == np.inf:  # after the first climb the velocity is known
+                wide = max(by_velocity, 1.0)
+            fit = climb(seen, T, beside, wide)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
             matches = fit.matches if T is fit.T_world_object else None
             expected = frame.expected(T)
-        met = offsets_of(seen, matches or matches_at(seen, T), expected)
+        met = offsets_of(seen, matches or matches_at(seen, T), expected, wide)
         design, known = met.unknowns(motion.velocity, expected, frame.free)
         variance = errors.typical**2
         for _ in range(2):  # the second time with the variance that the first leaves
@@ -137,8 +138,13 @@ def matches_at(frame: Frame, T_world_object: Floats) -> Matches:
     return associate(frame.finest, T_world_object, rules.association, narrowest)
 
 
-def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:
-    """Met features, as they pull: little, where farther off than noise and velocity explain."""
+def offsets_of(
+    frame: Frame, matches: Matches, expected: Expected | None = None, wide: float = 1.0
+) -> Offsets:
+    """Met features, as they pull: little, where farther off than noise and velocity explain.
+
+    Nor do they pull more than at a blur as `wide`, in σ_ε.
+    """
     views = [view for view in frame.still or frame.views if view.name in matches.names]
     seen = matches.weights > 0
     late, blurs = _seconds(views, matches.places, seen), np.ones(len(views))
@@ -147,7 +153,7 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         known = model.memory * frame.track.residuals.of(matches.names)
         _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
-        blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), max(beside, 1.0))
+        blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), wide)
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
     kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
     pull = pull[kept[:2]]
