@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking.changes import Change, of_units
+from mixpose.checking.changes import Change, called, of_units
 from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
 from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
@@ -22,7 +22,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
 from mixpose.judgement import APART
-from mixpose.records import FrameSet, PointPattern
+from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin, observe
 from mixpose.sensors import FisheyeCamera, PinholeCamera
@@ -34,6 +34,7 @@ CAUSES = (
 )
 """Why sensors may contradict each other."""
 
+_SEEN = 0.1  # of a sensor's density, from which it shows the body, even beside 60 false features
 _FIRST = 40  # frames of videos among which they are: to get far into one takes as long as all of it
 
 
@@ -179,7 +180,7 @@ def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doub
         tracker, track = begin(session)
         _, estimate = tracker.advance(track, number, None, views)
         if estimate.status == "ok":
-            return doubts
+            return replace(doubts, unexplained=_by_some(estimate))
         doubt = estimate.doubt or doubt
     numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
@@ -192,6 +193,20 @@ def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doub
         "once?"
     )
     return replace(doubts, unexplained=text)
+
+
+def _by_some(estimate: Estimate) -> str:
+    """What of a pose that is sure does not explain its frame: sensors that see none of it."""
+    others = [name for name, one in estimate.sensors.items() if (one.explained or 0.0) < _SEEN]
+    alone = [name for name in estimate.sensors if name not in others]
+    if not others or not alone:
+        return ""
+    return (
+        f"frame {estimate.frame}: {called(alone)} alone {'shows' if len(alone) == 1 else 'show'} "
+        f"the body where {called(others)} {'does' if len(others) == 1 else 'do'} not see it, by "
+        "the session as it is or with any one change of it: is it in view of all, or are several "
+        "calibrations, T_sensor_world or sources those of others?"
+    )
 
 
 def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:
