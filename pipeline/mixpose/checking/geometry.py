@@ -35,6 +35,7 @@ CAUSES = (
 """Why sensors may contradict each other."""
 
 _SEEN = 0.1  # of a sensor's density, from which it shows the body, even beside 60 false features
+_LIKELY = 0.5  # confidence from which a pose that is not sure is more than clutter
 _FIRST = 40  # frames of videos among which they are: to get far into one takes as long as all of it
 
 
@@ -174,25 +175,39 @@ def _at_the_start(recording: _Recording) -> Doubts:
 
 
 def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doubts:
-    """Why no frame is explained: sensors that contradict each other, or nobody knows."""
-    doubt, frames = "", frames[:2]
+    """Why no frame is explained: sensors that contradict each other, few markers, or unknown."""
+    doubt, shown, frames = "", list[Estimate](), frames[:2]
     for number, views in frames:
         tracker, track = begin(session)
         _, estimate = tracker.advance(track, number, None, views)
-        if estimate.status == "ok":
-            return replace(doubts, unexplained=_by_some(estimate))
         doubt = estimate.doubt or doubt
+        weights = sum(rival.weight for rival in estimate.hypotheses) or estimate.confidence or 0.0
+        if estimate.status == "ok" or (estimate.status == "ambiguous" and weights > _LIKELY):
+            shown.append(estimate)
     numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
-    if doubt:
+    is_ok = any(estimate.status == "ok" for estimate in shown)
+    if doubt and not is_ok:
         causes = f": {CAUSES}" if doubt == APART else ""
         return replace(doubts, warnings=(f"{where}: {doubt}{causes}",))
+    if is_ok or len(shown) == len(frames):
+        found = "" if is_ok else _not_sure(where, shown)
+        return replace(doubts, unexplained=_by_some(shown[-1]) or found)
     text = (
         f"{where}: the body is not found, by the session as it is or with any one change of it: is "
         "it in view, and are its markers found (mixpose inspect), or are several things wrong at "
         "once?"
     )
     return replace(doubts, unexplained=text)
+
+
+def _not_sure(where: str, shown: Sequence[Estimate]) -> str:
+    """Of poses that are ambiguous, in words."""
+    least = min(estimate.confidence or 0.0 for estimate in shown)
+    return (
+        f"{where}: the body is found, but not surely (confidence {least:.3g}): so few features may "
+        "as well be met by chance, or at another pose; more markers or another sensor would tell"
+    )
 
 
 def _by_some(estimate: Estimate) -> str:
