@@ -137,7 +137,7 @@ def test_a_sensor_without_features_or_beside_a_flood_is_no_mistake(session: Sess
 def test_that_no_frame_is_ok_is_said_long_before_the_end(
     session: Session, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = "none of the first 10 frames is ok, 10 lost; the run goes on, mixpose check"
+    said = "no pose in the first 10 frames is ok, 10 of 10 are lost; the run goes on, mixpose check"
     summary(session, *[[UNUSED, UNUSED]] * 9, status="lost")
     assert said not in capsys.readouterr().err
     summary(session, *[[UNUSED, UNUSED]] * 12, status="lost")

@@ -103,10 +103,11 @@ class Summary:
         self.findings.add(estimate)
         self.statuses[estimate.status] += 1
         self.delays = estimate.delays or self.delays
-        if sum(self.statuses.values()) == _EARLY * self.bodies and not self.statuses["ok"]:
+        count = sum(self.statuses.values())
+        if count == _EARLY * self.bodies and not self.statuses["ok"]:
             warn(
-                f"none of the first {_EARLY} frames is ok, {self.statuses['lost']} lost; the run "
-                f"goes on, mixpose check {self.path} says what is odd"
+                f"no pose in the first {_EARLY} frames is ok, {self.statuses['lost']} of {count} "
+                f"are lost; the run goes on, mixpose check {self.path} says what is odd"
             )
         if estimate.status == "lost":
             return
