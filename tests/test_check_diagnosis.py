@@ -22,15 +22,19 @@ from diagnosed import (
     with_points,
 )
 
+import mixpose
 from mixpose.body import Body
 from mixpose.checking import geometry_doubts, survey
 from mixpose.checking.changes import Change, of_units
 from mixpose.checking.evidence import Seen, best_pose
+from mixpose.checking.geometry import _by_some
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
 from mixpose.checking.values import Adjustment, adjusted, promise, unknowns
+from mixpose.records import Estimate, SensorReport
 from mixpose.rigid import perturb, transform
 from mixpose.runner import open_sources
+from mixpose.selection import Selection
 from mixpose.session import Session, load_session
 from mixpose.session.setup import Start
 
@@ -404,3 +408,26 @@ def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:
     # far more is worth more values
     tried[0] = tried[0]._replace(gain=130.0)
     assert simplest(tried, before, rules).change.startswith("a camera is elsewhere")
+
+
+def test_a_pose_that_one_of_several_cameras_shows_is_no_session_without_a_warning() -> None:
+    def said(**shares: float) -> str:
+        sensors = {name: SensorReport(share > 0, share, None) for name, share in shares.items()}
+        return _by_some(Estimate(91, None, "board", "ok", np.eye(4), None, 0.5, sensors))
+
+    assert said(a=0.9, b=0.8) == ""
+    assert said(a=0.9, b=0.0, c=0.0).startswith(
+        "frame 91: 'a' alone shows the body where 'b' and 'c' do not see it"
+    )
+    assert said(a=0.9, b=0.9, c=0.0).startswith(
+        "frame 91: 'a' and 'b' alone show the body where 'c' does not see it"
+    )
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_body_far_larger_than_what_is_seen_is_searched_for_without_a_remark(
+    right: Session,
+) -> None:
+    larger = with_points(right, right.body.means * 1000)
+    (estimate,) = mixpose.run(larger, selection=Selection(0, 1))
+    assert estimate.status != "ok"

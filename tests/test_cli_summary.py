@@ -134,6 +134,18 @@ def test_a_sensor_without_features_or_beside_a_flood_is_no_mistake(session: Sess
     assert summary(session, *[[met(0.08), met(0.05)]] * 4).warnings() == []
 
 
+def test_that_no_frame_is_ok_is_said_long_before_the_end(
+    session: Session, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = "no pose in the first 10 frames is ok, 10 of 10 are lost; the run goes on, mixpose check"
+    summary(session, *[[UNUSED, UNUSED]] * 9, status="lost")
+    assert said not in capsys.readouterr().err
+    summary(session, *[[UNUSED, UNUSED]] * 12, status="lost")
+    assert capsys.readouterr().err.count(said) == 1
+    summary(session, *[[met(0.9), met(0.9)]] * 12)
+    assert said not in capsys.readouterr().err
+
+
 def test_a_run_names_all_that_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, pictures = tmp_path / "poses.jsonl", tmp_path / "seen"
     request = RunRequest(poses, "jsonl", (), Selection(0, 1), False, pictures)

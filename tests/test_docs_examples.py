@@ -13,9 +13,12 @@ from typing import Any
 
 import pytest
 
+import mixpose
 from mixpose.cli import main
 from mixpose.cli.app import app
+from mixpose.cli.check import check_session
 from mixpose.session.schema import SessionTable
+from mixpose.simulation import SimulationOptions, simulate
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"`([\w./]+)`:\s*$")
@@ -197,6 +200,37 @@ def test_a_number_that_a_page_shows_is_told_from_another_one(
 def test_what_was_not_printed_is_not_shown(printed: str) -> None:
     with pytest.raises(AssertionError, match="not in what was printed"):
         differing("20 frames: 20 ok", printed)
+
+
+CAMERA_YML = """%YAML:1.0
+camera_matrix: !!opencv-matrix
+   {rows: 3, cols: 3, dt: d, data: [800., 0., 320., 0., 800., 240., 0., 0., 1.]}
+distortion_coefficients: !!opencv-matrix
+   {rows: 1, cols: 5, dt: d, data: [0., 0., 0., 0., 0.]}
+image_width: 640
+image_height: 480
+"""
+
+
+def test_the_session_of_the_readme_gives_poses_that_are_ok(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (text,) = (text for _, kind, text in blocks("README.md") if kind == "toml")
+    (tmp_path / "camera.yml").write_text(CAMERA_YML, encoding="utf-8")
+
+    def simulated(name: str, text: str) -> Path:
+        (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
+        session = mixpose.load_session(tmp_path / f"{name}.toml")
+        simulate(session, tmp_path / name, SimulationOptions(frames=4, seed=1))
+        return next((tmp_path / name).glob("*.toml"))
+
+    found = mixpose.run(mixpose.load_session(simulated("six", text)))
+    assert [estimate.status for estimate in found] == ["ok"] * 4
+    # by four markers one camera finds the pose, too, and chance explains each frame nearly as well
+    four = text.replace("[100, 111.6, -6.7], [-48, 20, 12], [35, -60, 30],", "[100, 111.6, -6.7],")
+    assert four != text
+    check_session(simulated("four", four), quick=True)
+    assert "the body is found, but not surely (confidence 0.99" in capsys.readouterr().out
 
 
 def test_the_session_in_the_readme_is_one() -> None:

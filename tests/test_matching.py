@@ -105,7 +105,7 @@ def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
 
     def seen(centres: Floats) -> tuple[Floats, Floats]:
         values = 0.2 * mixture(centres, y)
-        return _residuals(y, np.ones(3), VARIANCE, values, np.ones((3, 2, 6)), 0.2, RULES, True)[:2]
+        return _residuals(y, np.ones(3), VARIANCE, values, np.ones((3, 2, 6)), 0.2, RULES)[:2]
 
     shares, offsets = seen(y)
     np.testing.assert_allclose(shares, 1.0, atol=1e-9)
@@ -132,7 +132,7 @@ def test_features_of_a_noisy_profile_that_overlap_are_off_independently_of_each_
     both = np.stack([h, slopes], axis=2) * peak(VARIANCE, 1) / np.vecdot(h, h)[:, None, None]
     J, noise = rng.standard_normal((4, 1, 6)), 1e-4
     g = h.sum(axis=0) + noise * rng.standard_normal((4000, len(x)))
-    each = [_residuals(y, np.ones(4), VARIANCE, v @ both, J, 1.0, RULES, True) for v in g]
+    each = [_residuals(y, np.ones(4), VARIANCE, v @ both, J, 1.0, RULES) for v in g]
     offsets, rows = np.array([one[1][:, 0] for one in each]), each[0][2][:, 0, :2]
     variance = noise**2 / (slopes[2] @ slopes[2])
     # 4000 draws tell variances to 2.2 %

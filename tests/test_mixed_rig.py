@@ -53,9 +53,10 @@ def test_ranges_give_the_camera_its_depth(copied: Path) -> None:
     session.write_text(alone, encoding="utf-8")
     mixpose("run", session, "-o", copied / "alone.jsonl")
     mixed, one = (rms_z(copied / f"{name}.jsonl", truth) for name in ("mixed", "alone"))
-    # seen: 0.036 and 0.176 mm; a deviation of 0.03 mm in 30 frames does not come to 0.06
-    assert mixed < 0.06
-    assert mixed < one / 3
+    # seen: 0.013 and 0.176 mm, and 0.035 where peaks that overlap were taken for equally high; a
+    # deviation of 0.013 mm in 30 frames does not come to 0.02
+    assert mixed < 0.02
+    assert mixed < one / 5
 
 
 def test_the_first_frame_of_a_mixed_rig_is_found_without_a_start(copied: Path) -> None:

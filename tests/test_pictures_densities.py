@@ -88,13 +88,34 @@ def test_panels_of_one_kind_have_one_scale(parallel_cameras: list[ParallelBeam])
     y, _ = camera.project(body.means)
     view = View("one", camera, Observation(PointPattern(y, np.ones(1)), 2.0))
     picture = densities_picture(view, body, np.eye(4), [6.0, 2.0], EstimatorOptions(), (200, 200))
-    brightness = picture[:200].astype(float).sum(axis=-1)
-    wide, narrow = brightness[40:, :200].max(), brightness[40:, 204:404].max()
+    title = 34  # px of a title above a panel
+    brightness = picture[title : title + 200].astype(float).sum(axis=-1)
+    wide, narrow = brightness[:, :200].max(), brightness[:, 204:404].max()
     # a ninth of the peak is darker; each panel scaled to itself would have both alike
     assert wide < 0.9 * narrow
     # below each row its scale
     assert picture.shape[0] > 2 * 200 + 2 * 15
     assert picture.shape[1] == 404
+
+
+def test_peaks_are_shown_whole_and_titles_hide_nothing_of_them(
+    parallel_cameras: list[ParallelBeam],
+) -> None:
+    camera = parallel_cameras[0]
+    body = Body("four", tuple(PointFeature(np.array(at)) for at in np.eye(4, 3) * 5.0))
+    y, _ = camera.project(body.means)
+    view = View("one", camera, Observation(PointPattern(y, np.ones(4)), 2.0))
+    picture = densities_picture(view, body, np.eye(4), [6.0], EstimatorOptions(), (200, 200))
+    title, gap = 34, 4
+    bar = (picture.shape[0] - 2 * (title + 200) - 3 * gap) // 2
+    for first in (0, title + 200 + bar + 2 * gap):
+        assert (picture[first : first + title] == 255).all(axis=-1).any()
+        panel = picture[first + title : first + title + 200, :200]
+        # no letters in it, and at its edges the lowest colour: no peak is cut off there
+        assert not (panel == 255).all(axis=-1).any()
+        edge = np.concatenate([panel[0], panel[-1], panel[:, 0], panel[:, -1]])
+        assert edge.max() < 10
+        assert panel.max() > 100
 
 
 def test_a_panel_shows_a_detection_where_it_is(parallel_cameras: list[ParallelBeam]) -> None:
@@ -129,7 +150,7 @@ def test_what_was_found_far_from_the_pose_leaves_its_density_black(
     far = PointPattern(parallel_cameras[0].project(body.means)[0] + 150.0, np.ones(1))
     view = View("one", parallel_cameras[0], Observation(far, 2.0))
     picture = densities_picture(view, body, np.eye(4), [2.0], EstimatorOptions(), (200, 200))
-    assert picture[40:200].max() < 10  # the lowest colour is nearly black
+    assert picture[40:230].max() < 10  # the lowest colour is nearly black
 
 
 def test_a_pose_that_was_not_fitted_is_shown_at_the_blur_that_judges(

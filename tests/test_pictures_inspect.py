@@ -347,6 +347,15 @@ def test_without_a_pose_the_number_of_features_tells(recording: Path) -> None:
     assert "7 pieces above the threshold are too small" in text
 
 
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+def test_where_most_of_the_image_counts_as_feature_the_threshold_goes_the_other_way(
+    recording: Path, polarity: str
+) -> None:
+    # above 250 is nothing, and below it all of a dark frame: one piece, and no more farther up
+    lines = f'method = "blobs"\npolarity = "{polarity}"\nthreshold = 250'
+    assert "too few: lower threshold = 250" in advice_for(with_options(recording, lines), 6, None)
+
+
 def test_a_sensor_without_a_frame_is_said_to_have_none() -> None:
     session = mixpose.load_session(TWO_CAMERAS)
     finding = Finding(session.sensors[0], None, None, None, 0.0, None)

@@ -22,6 +22,7 @@ from mixpose.objective import View
 from mixpose.pictures import Part, displayable, draw_pose
 from mixpose.pictures.movie import Overlay
 from mixpose.pictures.overlay import (
+    AXES,
     CHI2_95,
     FOUND,
     STATUS_COLOURS,
@@ -32,7 +33,7 @@ from mixpose.pictures.overlay import (
 from mixpose.pictures.scene import draw_ranges, draw_scene
 from mixpose.pictures.signature import is_ours
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
-from mixpose.rigid import from_parts, perturb, transform
+from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.sensors import PinholeCamera, RangeSensor
@@ -75,6 +76,29 @@ def test_rings_lie_around_the_projected_features_and_stand_out(
         assert (np.abs(patch - colour).max(axis=-1) < 60).sum() > 20
         assert (patch.max(axis=-1) < 60).any()
     assert not np.array_equal(picture, ground)
+
+
+def test_no_axis_is_drawn_over_a_name_nor_over_its_own_letter() -> None:
+    K = np.array([[800.0, 0, 640], [0, 800, 512], [0, 0, 1]])
+    camera = PinholeCamera(K, np.zeros(5), (1280, 1024), np.eye(4))
+    body = Body("axes", tuple(PointFeature(at) for at in np.eye(4, 3, -1) * 200))
+    # its z axis, and less of its x axis, goes all around in the image
+    tilted = from_rotation_vector([np.pi / 2, 0.0, 0.0], np.zeros(3))
+    names = []
+    for turn in np.arange(8) * np.pi / 4:
+        T = from_rotation_vector([0.0, 0.0, turn], [0.0, 0.0, 600.0]) @ tilted
+        picture = draw_pose(BLACK, camera, body, T, colour=(255, 255, 255))
+        # the name of the feature at the origin, to the upper right of its ring
+        names.append((picture[480:508, 650:675] == 255).all(axis=-1).sum())
+        for k in (0, 2):
+            ends = np.stack([np.zeros(3), 0.5 * body.radius * np.eye(3)[k]])
+            start, end = camera.project(transform(T, ends))[0]
+            length, along = float(np.linalg.norm(end - start)), end - start
+            # its letter stands beyond the end
+            v, u = np.nonzero((picture == AXES[k][1]).all(axis=-1))
+            beyond = (np.stack([u, v], axis=1) - start) @ along / length - length
+            assert (beyond > 6).sum() > 20
+    assert min(names) > 0.9 * max(names) > 20
 
 
 def test_the_frame_that_is_drawn_on_stays_as_it_is(

@@ -54,7 +54,7 @@ def test_the_smallest_session_on_the_page_can_be_read(tmp_path: Path) -> None:
     text = page.partition("```toml\n")[2].partition("```")[0]
     (tmp_path / "session.toml").write_text(text, encoding="utf-8")
     session = load_session(tmp_path / "session.toml")
-    assert (len(session.body), len(session.sensors)) == (4, 1)
+    assert (len(session.body), len(session.sensors)) == (6, 1)
 
 
 def test_every_rule_of_a_tracker_is_on_the_page_of_constants_with_a_reason() -> None:

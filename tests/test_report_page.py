@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from command_line import LONGEST_S, command
-from report_runs import RECORDING, SYNTHETIC, estimate, write, write_run
+from report_runs import COVARIANCE, RECORDING, SYNTHETIC, estimate, write, write_run
 
 from mixpose.cli.report import write_report
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import read_poses
+from mixpose.report.series import series_of
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -93,6 +95,23 @@ def test_a_run_of_one_frame_is_told_as_one(tmp_path: Path) -> None:
     page = report(tmp_path, tmp_path / "poses.jsonl", true)
     assert "1 frame of the truth: 1 ok" in page.text
     assert "Covariance, 1 frame that is ok" in page.text
+
+
+def test_an_open_turn_has_no_band_and_is_said_to_be_open(tmp_path: Path) -> None:
+    # a deviation of 4 rad about x in two of three frames: twice as wide as half a turn
+    wide = COVARIANCE + np.diag([0, 0, 0, 16.0, 0, 0])
+    lines = [
+        replace(estimate(k, np.eye(4)), covariance=wide if k else COVARIANCE) for k in range(3)
+    ]
+    series = series_of(read_poses(write(tmp_path / "poses.jsonl", lines, None)))
+    assert np.isinf(series.half_width[:, 3]).tolist() == [False, True, True]
+    assert np.isfinite(series.half_width[:, [0, 1, 2, 4, 5]]).all()
+    page = report(tmp_path, tmp_path / "poses.jsonl")
+    spoken = [str(each.get("aria-label") or each.get("alt")) for _, each in page.elements]
+    said = [text for text in spoken if "open in 2 of 3 frames" in text]
+    assert len(said) == 1
+    assert said[0].startswith("Turn about x, deg")
+    assert "open in 2 frames" in page.text
 
 
 def test_page_has_the_figures_of_evaluate(full: Path) -> None:

@@ -105,16 +105,21 @@ def test_a_body_without_noise_goes_on_as_its_rates_say(order: int) -> None:
 
 
 def test_errors_shrink_and_covariances_hold_where_errors_are_independent() -> None:
-    truth, covariance = swinging(240, interval_s=0.02), covariance_of(0.1, 0.001)
-    poses = measured(truth, covariance, seed=1)
-    smooth = smooth_body(lines_of(poses, covariance), rules=QUICK)
-    before, after = rms_errors(truth, poses), rms_errors(truth, poses_of(smooth.estimates))
-    assert after[0] < 0.5 * before[0]
-    assert after[1] < 0.5 * before[1]
-    # 240 frames of about 8 that count together: 180 numbers, whose mean square is 1 ± 0.11
-    assert 0.8 < squared_errors(truth, smooth.estimates).mean() < 1.25
-    assert smooth.model is not None
-    assert smooth.model.white == 1.0
+    truth, covariance = swinging(60), covariance_of(0.1, 0.001)
+    squared = []
+    for seed in range(10):
+        poses = measured(truth, covariance, seed)
+        smooth = smooth_body(lines_of(poses, covariance), rules=QUICK)
+        before, after = rms_errors(truth, poses), rms_errors(truth, poses_of(smooth.estimates))
+        assert after[0] < 0.6 * before[0]
+        assert after[1] < 0.6 * before[1]
+        squared.append(squared_errors(truth, smooth.estimates).mean())
+        assert smooth.model is not None
+        assert smooth.model.white == 1.0
+    # 60 frames of about 5 that count together: 70 numbers, whose mean square is 1 ± 0.17, of ten
+    # recordings 1 ± 0.05
+    assert 0.6 < min(squared) <= max(squared) < 1.5
+    assert 0.8 < np.mean(squared) < 1.25
 
 
 @pytest.mark.parametrize(("scale", "held"), [(0.5, True), (1.7, False)])
@@ -319,32 +324,31 @@ def test_what_cannot_be_smoothed_is_told() -> None:
     np.testing.assert_array_equal(poses_of(few.estimates), truth[:5])
 
 
-@pytest.fixture(scope="module")
-def two_cameras(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    session = package.load_session(ROOT / "data/synthetic/two_cameras/session.toml")
-    path = tmp_path_factory.mktemp("two_cameras") / "poses.jsonl"
-    write_poses(path, list(package.run(session)))
-    return path
-
-
-def test_poses_of_two_cameras_err_by_at_most_0_7_of_what_they_did(
-    two_cameras: Path, tmp_path: Path
+@pytest.mark.parametrize("recording", ["two_cameras", "camera_and_ranges"])
+def test_poses_of_recordings_err_by_at_most_0_7_of_what_they_did(
+    recording: str, tmp_path: Path
 ) -> None:
-    output, truth = tmp_path / "smooth.jsonl", ROOT / "data/synthetic/two_cameras/truth.jsonl"
-    done = mixpose("smooth", two_cameras, "-o", output)
+    folder = ROOT / "data/synthetic" / recording
+    poses, output, truth = (
+        tmp_path / "poses.jsonl",
+        tmp_path / "smooth.jsonl",
+        folder / "truth.jsonl",
+    )
+    write_poses(poses, list(package.run(package.load_session(folder / "session.toml"))))
+    done = mixpose("smooth", poses, "-o", output)
     assert done.returncode == 0, done.stderr
-    assert "40 poses smoothed" in done.stderr
-    before, after = evaluate_files(two_cameras, truth), evaluate_files(output, truth)
+    before, after = evaluate_files(poses, truth), evaluate_files(output, truth)
     assert before.rotation_deg is not None
     assert after.rotation_deg is not None
     assert before.translation is not None
     assert after.translation is not None
     assert after.rotation_deg.rms < 0.7 * before.rotation_deg.rms
+    # 0.92 where ranges were off by the same from frame to frame, with a squared error of 1.7
     assert after.translation.rms < 0.7 * before.translation.rms
     assert after.nees is not None
     assert after.nees.nees_per_dimension < 1.25
-    header = read_poses(output).header
-    assert header["smoothed"]["tracker"]["motion"] == "crackle"
+    (header,) = read_poses(output).header["smoothed"].values()
+    assert header["motion"] == "crackle"
     again = mixpose("smooth", output, "-o", tmp_path / "twice.jsonl")
     assert again.returncode == 3
     assert "was smoothed before" in again.stderr

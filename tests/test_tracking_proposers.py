@@ -244,6 +244,36 @@ def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body()
     assert len(tilts([few])) == 1
 
 
+def test_of_what_is_likelier_clutter_no_look_alikes_are_asked_for() -> None:
+    K = np.array([[900.0, 0, 640], [0, 900.0, 512], [0, 0, 1]])
+    aside = from_rotation_vector([0.0, 0.5, 0.0], [-300.0, 0.0, 80.0])
+    one = PinholeCamera(K, resolution=(1280, 1024))
+    other = PinholeCamera(K, resolution=(1280, 1024), T_sensor_world=aside)
+    places = 30 * np.array([[x, y, 0.0] for x, y in np.ndindex(6, 6)])
+    grid = Body("grid", tuple(PointFeature(place) for place in places))
+    T = from_rotation_vector([0.2, 0.1, 0.3], [-70.0, -70.0, 600.0])
+    dots = one.project(transform(T, grid.means[7:16]))[0]
+    tracker = Tracker.create(grid, EstimatorOptions(), T)
+
+    def asked(scatter: float) -> tuple[float, int]:
+        """Evidence of the pose, where one camera sees nine dots so far off, and look-alikes."""
+        rng = np.random.default_rng(0)
+        near = dots + rng.normal(0, scatter, dots.shape)
+        seen = [np.vstack([near, rng.uniform(0, 900, (20, 2))]), rng.uniform(0, 900, (20, 2))]
+        views = [view_of("one", one, seen[0]), view_of("other", other, seen[1])]
+        data = tracker.data(tracker.begin(), 0, None, views)
+        start, likelihood = Start(T), likelihood_of(data)
+        best = likelihood.judge(likelihood.fit(start), start)
+        return best.log_evidence, len(list(look_alikes(data, [best])))
+
+    evidence, count = asked(0.0)  # nine dots of the grid lie like nine others, a step off
+    assert evidence > 0
+    assert count > 0
+    evidence, count = asked(3.0)  # as chance has them; of wrong sessions each costs a search
+    assert evidence < 0
+    assert count == 0
+
+
 SIX = np.array(
     [[0, 0, 0], [80, 6, 10], [-55, 48, -12], [-30, -66, 25], [36, 40, 62], [22, -35, -48]], float
 )

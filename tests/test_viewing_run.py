@@ -106,6 +106,17 @@ def test_the_page_stays_after_the_last_frame_but_not_longer_than_the_run() -> No
         wait_until(lambda: not page.exists())
 
 
+def test_a_run_that_is_done_ends_as_soon_as_nobody_looks() -> None:
+    with viewed(RANGES) as (process, address):
+        with open_page(address) as connection:
+            until(PageClient(connection), "done")
+            assert process.poll() is None
+        # at once, where the page would stay for 30 s
+        assert process.wait(10) == 0
+        assert process.stderr is not None
+        assert "the page stays while somebody looks, for 30 s at the most" in process.stderr.read()
+
+
 def test_an_interrupt_ends_a_run_that_waits_for_its_page() -> None:
     with viewed(RANGES, "--pause") as (process, _):
         process.send_signal(signal.SIGINT)

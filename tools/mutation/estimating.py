@@ -78,10 +78,18 @@ _NARROW = (
     Mutant(
         "fit-sensors-weigh-the-same",
         "fit/near.py",
-        "objective.weighed_by(blurs * blurs / weighed)",
-        "objective",
+        "objective.in_nats(blurs * blurs / weighed)",
+        "objective.in_nats(blurs * blurs / weighed.mean())",
         "a camera that finds spots to 0.02 px counts no more than one that errs by 0.4 px",
         ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-heights-of-ranges-beside-a-camera-are-alike",
+        "fit/near.py",
+        "likeliest = -np.inf if is_rough else likeliest",
+        "is_rough = not is_rough",
+        "a range is off wherever peaks of features overlap, by the same for as long as they do",
+        ("test_mixed_rig.py",),
     ),
     Mutant(
         "matching-errors-of-calibration-are-noise",

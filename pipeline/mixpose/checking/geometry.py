@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking.changes import Change, of_units
+from mixpose.checking.changes import Change, called, of_units
 from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
 from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
@@ -22,7 +22,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
 from mixpose.judgement import APART
-from mixpose.records import FrameSet, PointPattern
+from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin, observe
 from mixpose.sensors import FisheyeCamera, PinholeCamera
@@ -34,6 +34,8 @@ CAUSES = (
 )
 """Why sensors may contradict each other."""
 
+_SEEN = 0.1  # of a sensor's density, from which it shows the body, even beside 60 false features
+_LIKELY = 0.5  # confidence from which a pose that is not sure is more than clutter
 _FIRST = 40  # frames of videos among which they are: to get far into one takes as long as all of it
 
 
@@ -173,25 +175,53 @@ def _at_the_start(recording: _Recording) -> Doubts:
 
 
 def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doubts:
-    """Why no frame is explained: sensors that contradict each other, or nobody knows."""
-    doubt, frames = "", frames[:2]
+    """Why no frame is explained: sensors that contradict each other, few markers, or unknown."""
+    doubt, shown, frames = "", list[Estimate](), frames[:2]
     for number, views in frames:
         tracker, track = begin(session)
         _, estimate = tracker.advance(track, number, None, views)
-        if estimate.status == "ok":
-            return doubts
         doubt = estimate.doubt or doubt
+        weights = sum(rival.weight for rival in estimate.hypotheses) or estimate.confidence or 0.0
+        if estimate.status == "ok" or (estimate.status == "ambiguous" and weights > _LIKELY):
+            shown.append(estimate)
     numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
-    if doubt:
+    is_ok = any(estimate.status == "ok" for estimate in shown)
+    if doubt and not is_ok:
         causes = f": {CAUSES}" if doubt == APART else ""
         return replace(doubts, warnings=(f"{where}: {doubt}{causes}",))
+    if is_ok or len(shown) == len(frames):
+        found = "" if is_ok else _not_sure(where, shown)
+        return replace(doubts, unexplained=_by_some(shown[-1]) or found)
     text = (
         f"{where}: the body is not found, by the session as it is or with any one change of it: is "
         "it in view, and are its markers found (mixpose inspect), or are several things wrong at "
         "once?"
     )
     return replace(doubts, unexplained=text)
+
+
+def _not_sure(where: str, shown: Sequence[Estimate]) -> str:
+    """Of poses that are ambiguous, in words."""
+    least = min(estimate.confidence or 0.0 for estimate in shown)
+    return (
+        f"{where}: the body is found, but not surely (confidence {least:.3g}): so few features may "
+        "as well be met by chance, or at another pose; more markers or another sensor would tell"
+    )
+
+
+def _by_some(estimate: Estimate) -> str:
+    """What of a pose that is sure does not explain its frame: sensors that see none of it."""
+    others = [name for name, one in estimate.sensors.items() if (one.explained or 0.0) < _SEEN]
+    alone = [name for name in estimate.sensors if name not in others]
+    if not others or not alone:
+        return ""
+    return (
+        f"frame {estimate.frame}: {called(alone)} alone {'shows' if len(alone) == 1 else 'show'} "
+        f"the body where {called(others)} {'does' if len(others) == 1 else 'do'} not see it, by "
+        "the session as it is or with any one change of it: is it in view of all, or are several "
+        "calibrations, T_sensor_world or sources those of others?"
+    )
 
 
 def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:

@@ -55,15 +55,18 @@ def advice(
         return "the table of detections does not fit the body: look at its rows"
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
-    frame = RawFrame(number, None, image)
+    frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
     before = len(_points(_found(session, setup, frame, {})))
     trials = []
     for key, value in _trials(options, image):
         views = _found(session, setup, frame, {key: value})
         count = len(_points(views))
-        if 0.9 * expected <= count <= 2 * expected:
+        if count >= 0.9 * expected and judge(count, expected) is None:
             trials.append(_Trial(key, value, count, views))
-    trials.sort(key=lambda trial: abs(trial.found - expected))
+    # the rule that goes by each image comes first, as a number may suit this image alone
+    trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.found - expected)))
+    if before > expected:
+        trials = [trial for trial in trials if trial.found <= 2 * expected]
     chosen = _with_the_body(session, number, trials)
     if chosen is None and before < expected and trials:
         chosen = trials[0]  # what finds more loses nothing, even where the body cannot be told
@@ -72,8 +75,10 @@ def advice(
         written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
         return f"with {chosen.key} = {written} {_SHARED} it would be {chosen.found}"
     if before > expected:
+        left = [trial.found for trial in trials if trial.value == "auto"]
+        rule = f', nor with threshold = "auto", which leaves {left[0]}' if left else ""
         return (
-            "none of the values tried leaves what can be the body; clutter is allowed for, and "
+            f"with no value tried the body is found for sure{rule}; clutter is allowed for, and "
             "mixpose inspect shows what is found"
         )
     keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
@@ -81,16 +86,17 @@ def advice(
     return f"change {keys.get(options.method, usual)} in [extract]"
 
 
-def told_apart(warnings: Sequence[str]) -> list[str]:
-    """Warnings about sensors, where two that want unlike values of a key each get their own."""
-    values: dict[str, set[str]] = {}
+def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
+    """Warnings about some of so many sensors: a key is shared where all of them want one value."""
+    values: dict[str, list[str]] = {}
     for warning in warnings:
         if advised := _ADVISED.search(warning):
-            values.setdefault(advised[1], set()).add(advised[2])
+            values.setdefault(advised[1], []).append(advised[2])
     return [
-        warning.replace(_SHARED, _OWN)
-        if (advised := _ADVISED.search(warning)) and len(values[advised[1]]) > 1
-        else warning
+        warning
+        if (advised := _ADVISED.search(warning)) is None
+        or values[advised[1]] == sensors * [advised[2]]
+        else warning.replace(_SHARED, _OWN)
         for warning in warnings
     ]
 
@@ -140,7 +146,7 @@ def _found(
         return []
     alone = replace(session, sensors=(replace(setup, extract=options),))
     try:
-        return observe(alone, FrameSet(frame.number, None, {setup.name: frame}))
+        return observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
     except MixposeError:
         return []
 

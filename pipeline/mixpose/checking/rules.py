@@ -58,10 +58,10 @@ class DiagnosisRules:
     leaders: int = constant(
         3, "changes that explain most, though no frame, that are tried with each other one as well"
     )
-    patience_s: float = constant(20.0, "of processor time, for all trials together")
+    patience_s: float = constant(7.0, "of processor time, for all trials together")
     as_it_is: float = constant(
-        0.15,
+        0.3,
         "of that, after which no more frames are estimated by the session as it is: 0.6 s a frame "
-        "in most, 3 to 9 s where a body a thousandth as large meets any detection",
+        "in most, 1 to 3 s of 400 dots",
     )
     whole: float = constant(0.75, "of that, for changes without values: the rest is for values")

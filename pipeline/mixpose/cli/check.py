@@ -113,7 +113,9 @@ def check_session(
     doubts = geometry_doubts(session, opened, surveys)
     if doubts.mended is None:
         report.lines += given.lines
-        report.warnings = told_apart(report.of_counts) + report.warnings + given.warnings
+        report.warnings = (
+            told_apart(report.of_counts, len(session.sensors)) + report.warnings + given.warnings
+        )
         report.warnings += doubts.warnings
         if doubts.unexplained and not (report.of_counts or doubts.warnings):
             report.warnings.append(doubts.unexplained)

@@ -25,6 +25,7 @@ _OFTEN = 0.2  # of the frames: sensors that take turns do so by no accident
 # of sigma: 0.2 is the most in recordings whose geometry is right, 0.8 with a chessboard whose
 # squares are given as 25 in place of 24 mm
 _FAR_OFF = 0.5
+_EARLY = 10  # frames without one that is ok, after which that is said: they may take seconds each
 _SURELY_LATE = 6.0  # standard deviations
 _LATE_S = 5e-4  # less is rarely worth a key
 _REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
@@ -102,6 +103,12 @@ class Summary:
         self.findings.add(estimate)
         self.statuses[estimate.status] += 1
         self.delays = estimate.delays or self.delays
+        count = sum(self.statuses.values())
+        if count == _EARLY * self.bodies and not self.statuses["ok"]:
+            warn(
+                f"no pose in the first {_EARLY} frames is ok, {self.statuses['lost']} of {count} "
+                f"are lost; the run goes on, mixpose check {self.path} says what is odd"
+            )
         if estimate.status == "lost":
             return
         reasons = {n: one.why for n, one in estimate.sensors.items() if one.why}

@@ -38,6 +38,7 @@ from mixpose.objective import (
     matched_objective,
     project_body,
     together,
+    with_heights,
 )
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import Floats, Mask
@@ -253,7 +254,9 @@ def _to_the_noise(
         end = np.minimum(np.minimum(narrow, before), blurs)
         is_noise, others = _are_noise(matches, variances, blurs, errors, rules)
         unlike, counted = weighed / counted, weighed
-        are_right = bool(unlike.min() > rules.narrower**2 * unlike.max())  # weights by noise
+        # weights by noise; and at first all features of a grid are taken for equally high
+        is_rough = best is None and bool(finest.are_grids.any())
+        are_right = not is_rough and bool(unlike.min() > rules.narrower**2 * unlike.max())
         is_end = is_noise or bool((end > rules.narrower * blurs).all())
         is_end = is_end and (are_right or best is not None)
         straight, is_clear = np.inf, are_right and not others
@@ -269,11 +272,12 @@ def _to_the_noise(
             likeliest, best = likelihood, fit
         if is_end or likeliest < least:
             return best
+        likeliest = -np.inf if is_rough else likeliest
         if not is_noise:
             blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]
             views = _around(finest.views, matches, errors.reach)
             objective = matched_objective(views, finest.projection.body, levels[-1])
-        by_noise = objective.weighed_by(blurs * blurs / weighed)
+        by_noise = with_heights(objective.in_nats(blurs * blurs / weighed), rules.unlike)
         ascent = ascend(by_noise, ascent.states, perturb, free, rules.sharp)
 
 

@@ -72,13 +72,13 @@ def associate(
     others = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
-    is_grid = [view.observation.cell is not None for view in views]
-    J = J.copy() if any(is_grid) else J  # what was projected is used again
-    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
+    is_grid = objective.are_grids
+    J = J.copy() if is_grid.any() else J  # what was projected is used again
+    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if is_grid.any() else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m], J[k, of, :m] = _residuals(
-            *mixture, match.sampled[k, 0, of, : 1 + m], J[k, of, :m], amplitude, rules, all(is_grid)
+            *mixture, match.sampled[k, 0, of, : 1 + m], J[k, of, :m], amplitude, rules
         )
     J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
     if np.count_nonzero(merged):
@@ -272,30 +272,27 @@ def _residuals(
     J: Floats,
     amplitude: float,
     rules: AssociationRules,
-    unlike: bool,
 ) -> tuple[Floats, Floats, Floats]:
     """Shares, offsets and Jacobians (n, m, 6) of features (n, m) that a grid of values is seen at.
 
-    C is the predicted mixture blurred alike, each feature with an amplitude of its own where they
-    are `unlike`.  What is left of the gradient without all others is the pull on a feature.  Pulls
-    of features that overlap answer to the places of all (F, 1 for a feature by itself) and err
+    C is the predicted mixture blurred alike, each feature with an amplitude of its own.  What is
+    left of the gradient without all others is the pull on a feature.  Pulls of features that
+    overlap answer to the places of all (F, 1 for a feature by itself) and err
     together (S), once heights are fitted.  So offsets and Jacobians are S^(−½) δ and S^(−½) F J,
     whose errors are independent and alike.
     """
     (n, m), top, away = y.shape, peak(variance, y.shape[1]), y[:, None] - y[None]
     overlaps = np.exp(-0.5 * (away * away).sum(axis=-1) / variance)
     bells = weights * overlaps * top
-    rest, amplitudes = sampled[:, 0] - amplitude * bells.sum(axis=1), np.full(n, amplitude)
-    height = rest + amplitude * weights * top
+    rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
+    amplitudes = amplitude + np.linalg.solve(bells + rules.alike * top * np.diag(weights), rest)
+    height = amplitudes * weights * top
     steep = (overlaps[..., None] * away).swapaxes(1, 2).reshape(n * m, n) / np.sqrt(variance)
     outer = np.eye(m) - away[..., :, None] * away[..., None, :] / variance
-    F = S = (overlaps[..., None, None] * outer).swapaxes(1, 2).reshape(n * m, n * m)
-    if unlike:
-        amplitudes += np.linalg.solve(bells + rules.alike * top * np.diag(weights), rest)
-        height = amplitudes * weights * top
-        by_height = np.linalg.solve(overlaps + rules.alike * np.eye(n), steep.T)
-        F = F - steep @ by_height
-        S = F - rules.alike * by_height.T @ by_height
+    alone = (overlaps[..., None, None] * outer).swapaxes(1, 2).reshape(n * m, n * m)
+    by_height = np.linalg.solve(overlaps + rules.alike * np.eye(n), steep.T)
+    F = alone - steep @ by_height
+    S = F - rules.alike * by_height.T @ by_height
     # what the better half of the features looks like by itself
     full = float(np.median(np.sort(height)[n // 2 :]))
     if full <= 0:

@@ -27,4 +27,5 @@ from mixpose.objective.projection import (
 from mixpose.objective.terms import (
     AmplitudesObjective as AmplitudesObjective,
     NormalPrior as NormalPrior,
+    with_heights as with_heights,
 )

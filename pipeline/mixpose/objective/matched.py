@@ -36,7 +36,7 @@ from mixpose.density import (
 )
 from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
@@ -175,9 +175,18 @@ class MatchedObjective:
             parts.append(own)
         return np.concatenate(parts, axis=1)
 
-    def weighed_by(self, factors: Floats) -> MatchedObjective:
-        """The same with weights ω_l times factors (L,), of which only the ratios count."""
-        return replace(self, weights=self.weights * (factors / factors.mean())[:, None])
+    @property
+    def are_grids(self) -> Mask:
+        """Of which sensors (L,) the density is a grid of values, no detections."""
+        return np.array([view.observation.cell is not None for view in self.views])
+
+    def in_nats(self, precisions: Floats) -> MatchedObjective:
+        """The same in nats, with offsets of features of σ²/s² (L,), over their variances.
+
+        Of n features that are met, one that is off by r takes r²/(2 n σ²) from a share S_l.
+        """
+        weights = self.weights * len(self.projection.body.features)
+        return replace(self, weights=weights * precisions[:, None])
 
     def match(self, poses: Floats) -> Match:
         """What is predicted at poses (H, 4, 4), and what is there."""

@@ -1,8 +1,8 @@
 """Terms beside the matched objective: what is known of a pose before, and unlike brightness.
 
 With one amplitude for all features, two that overlap pull each other aside where the one is
-brighter.  Here each feature i of a sensor has its amplitude α_i.  With b_i = ⟨g, h_i⟩ = w_i C(p_i)
-and B_ij = ⟨h_i, h_j⟩,
+brighter.  Here each feature i of a sensor whose density is a grid has its amplitude α_i.  With
+b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
 
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 
@@ -14,12 +14,12 @@ Gauss-Newton's of the residual g − Σ_i α_i h_i with α solved for (variable 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.objective.matched import MatchedObjective
-from mixpose.optimise import Quadratic
+from mixpose.optimise import Quadratic, Sum, Term
 from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, twist_between
 
@@ -49,9 +49,9 @@ class NormalPrior:
 
 @dataclass(frozen=True, eq=False)
 class AmplitudesObjective:
-    """Σ_l Q_l / (2 N_l) over the pose, in nats."""
+    """Σ_l Q_l / (2 N_l) over the pose, in nats, of the sensors with noise in their cells."""
 
-    matched: MatchedObjective  # at σ_ε of sensors with noise in their cells
+    matched: MatchedObjective  # at σ_ε
     noise: Floats  # (L,) variance of a cell's noise times the size of a cell
     spread: float  # s, relative
 
@@ -62,7 +62,7 @@ class AmplitudesObjective:
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and curvature at one pose (4, 4)."""
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
-        for k, (a, B, inner, C, away, J) in enumerate(self._mixtures(T_world_object)):
+        for k, (a, B, inner, C, away, J) in self._mixtures(T_world_object):
             v, scale = float(self.matched.variances[k, 0]), 0.5 / float(self.noise[k])
             alpha, (n, _, m) = a[:, None], away.shape
             bells = alpha * B * a
@@ -80,14 +80,17 @@ class AmplitudesObjective:
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
-        parts = self._mixtures(T_world_object)
-        explained = [a @ (2 * C[:, 0] - B @ a) for a, B, _, C, _, _ in parts]
-        return np.asarray(self.matched.energies[:, 0] - explained)
+        left = self.matched.energies[:, 0].copy()
+        for k, (a, B, _, C, _, _) in self._mixtures(T_world_object):
+            left[k] -= a @ (2 * C[:, 0] - B @ a)
+        return left
 
-    def _mixtures(self, T_world_object: Floats) -> Iterator[tuple[Floats, ...]]:
+    def _mixtures(self, T_world_object: Floats) -> Iterator[tuple[int, tuple[Floats, ...]]]:
         """By sensor α (n,), B, B + λP (n, n), b, ∇b (n, 1 + m), p_i − p_j (n, n, m), J (n m, 6)."""
         match = self.matched.match(T_world_object[None])
-        for k, m in enumerate(self.matched.projection.dimensions.tolist()):
+        dimensions = self.matched.projection.dimensions.tolist()
+        for k in np.flatnonzero(self.matched.are_grids).tolist():
+            m = dimensions[k]
             seen = np.flatnonzero(match.weights[k, 0] > 0)
             w, y = match.weights[k, 0, seen], match.y[k, 0, seen, :m]
             C = w[:, None] * match.sampled[k, 0, seen, : 1 + m]
@@ -101,4 +104,15 @@ class AmplitudesObjective:
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
             alpha, J = np.linalg.solve(inner, C[:, 0]), match.J[k, 0, seen, :m].reshape(-1, 6)
-            yield alpha, B, inner, C, away, J
+            yield k, (alpha, B, inner, C, away, J)
+
+
+def with_heights(likelihood: MatchedObjective, spread: float) -> Term:
+    """An objective in nats, in which features of grids have amplitudes of a relative spread."""
+    if not likelihood.are_grids.any():
+        return likelihood
+    points = replace(
+        likelihood, weights=np.where(likelihood.are_grids[:, None], 0.0, likelihood.weights)
+    )
+    noise = 0.5 * likelihood.energies[:, 0] / likelihood.weights[:, 0]
+    return Sum((points, AmplitudesObjective(likelihood, noise, spread)))

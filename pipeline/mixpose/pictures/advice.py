@@ -17,6 +17,7 @@ from mixpose.records import Floats, GridPattern, PointPattern
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
 _NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
 _FLOODED = 0.02  # share of an image above a threshold that would find everything
+_REVERSED = 0.5  # share from which it is the background that counts as feature
 _LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
 _SPECK_PX = 2  # pieces up to this area are noise
 _MOST = 0.8  # of the features in view that must be met to tell what markers look like
@@ -276,7 +277,7 @@ def _more(light: Light, expected: int) -> str:
     """A threshold at which pieces are as many as expected, or nearly so, where there is one."""
     options, base = light.options, float(np.median(light.raw))
     if not isinstance(options.threshold, str):
-        return _direction(options, lower=True)
+        return _direction(options, lower=light.share < _REVERSED)
     over = float(light.scene.level)
     counts = {}
     for level in (base + share * over for share in _LOWER):

@@ -75,16 +75,26 @@ def words(
     picture: Picture, text: str, place: tuple[float, float], colour: Colour, *, size: float = 1.0
 ) -> float:
     """Write text from a place on its baseline on; returns where it ends, u in px."""
-    pixels = max(round(_TEXT_PX * stroke(picture) * size), 9)
+    pixels = _letters(picture, size)
     rim = max(round(pixels / 14), 1)
     u, v = round(place[0]), round(place[1])
     offsets = [(a, b) for a in (-rim, 0, rim) for b in (-rim, 0, rim) if a or b]
     for du, dv in offsets:
         cv2.putText(picture, text, (u + du, v + dv), BLACK, _face(), pixels, _WEIGHT)
     cv2.putText(picture, text, (u, v), colour, _face(), pixels, _WEIGHT)
-    size_of_picture = picture.shape[1], picture.shape[0]
-    left, _, width, _ = cv2.getTextSize(size_of_picture, text, (u, v), _face(), pixels, _WEIGHT)
+    return u + width_of(picture, text, size=size)
+
+
+def width_of(picture: Picture, text: str, *, size: float = 1.0) -> float:
+    """How far text reaches on a picture, in px."""
+    shape, pixels = (picture.shape[1], picture.shape[0]), _letters(picture, size)
+    left, _, width, _ = cv2.getTextSize(shape, text, (0, 0), _face(), pixels, _WEIGHT)
     return float(left + width)
+
+
+def _letters(picture: Picture, size: float) -> int:
+    """Height of letters in px."""
+    return max(round(_TEXT_PX * stroke(picture) * size), 9)
 
 
 def caption_place(picture: Picture, line: int = 0) -> tuple[float, float]:

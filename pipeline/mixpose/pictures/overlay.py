@@ -94,8 +94,8 @@ def draw_pose(
         canvas.cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
     if pose is not None:
         pose.draw_ellipses(covariance, magnified)
+        pose.draw_axes()  # below the features and their names
         pose.draw_features(colour or STATUS_COLOURS[status or "ok"], named=named)
-        pose.draw_axes()
     caption(picture, status, frame)
     return picture
 
@@ -211,10 +211,13 @@ class _DrawnPose:
             if len(line) < 2:
                 continue
             canvas.polyline(self.picture, line, colour, width=2)
-            if np.linalg.norm(line[-1] - start) < 1.5 * height:
+            length = float(np.linalg.norm(line[-1] - start))
+            if length < 1.5 * height:
                 continue  # letters would hide what they are beside
-            place = line[-1, 0] + 0.3 * height, line[-1, 1] + 0.3 * height
-            canvas.words(self.picture, name, place, colour, size=0.9)
+            # a letter's middle, beyond the end of its axis
+            u, v = line[-1] + 0.55 * height * (line[-1] - start) / length
+            left = u - canvas.width_of(self.picture, name, size=0.9) / 2
+            canvas.words(self.picture, name, (left, v + 0.2 * height), colour, size=0.9)
 
 
 def caption(picture: Picture, status: Status | None, frame: int | None) -> None:

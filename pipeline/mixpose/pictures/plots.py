@@ -39,6 +39,7 @@ _POINTS = 241  # of a slice
 _SIDE = 41  # points along a side of a map
 _MAPS = 3
 _BATCH = 512  # poses that are projected at once
+_APART = 0.01  # of a plot's width, from name to name of features in ranges
 _SAMPLES = 200  # per feature: enough to look at
 
 
@@ -196,7 +197,14 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
         axes.errorbar(
             r, 1.08, xerr=spread[i], fmt="v", ms=5, color=_EXPECTED, capsize=2, label=label
         )
-        axes.text(r, 1.2, body.labels[i], color=_EXPECTED, ha="center", fontsize=8)
+    order = np.flatnonzero(expected.seen)[np.argsort(expected.y[expected.seen, 0])]
+    ranges = expected.y[order, 0]
+    # features whose names would stand on each other share one line of names
+    near = np.diff(ranges) < _APART * np.ptp(axes.get_xlim())
+    for group in np.split(np.arange(len(order)), np.flatnonzero(~near) + 1):
+        names = ", ".join(body.labels[i] for i in order[group])
+        middle = float(ranges[group].mean()) if len(group) else 0.0
+        axes.text(middle, 1.2, names, color=_EXPECTED, ha="center", fontsize=8)
 
 
 def _span(finding: Finding) -> tuple[float, float]:

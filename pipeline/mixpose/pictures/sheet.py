@@ -32,7 +32,7 @@ _LARGE = (1400, 1050)  # room of a picture of its own
 _SMALL = (460, 345)  # and on the sheet
 _WIDTH = 4 * _SMALL[0] + 12
 _BLURS_ON_SHEET = 2
-_BAR_PX = 38  # of a scale on the sheet, with the gaps
+_BAR_PX = 72  # of a title and a scale on the sheet, with the gaps
 _MOST_BLURS = 8  # in a picture of their own
 _GAP_PX = 4
 _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
@@ -121,7 +121,7 @@ def _camera_pictures(
     if finding.view is not None and sigmas:
         few = _some(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
-        panel = (_SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
+        panel = (_SMALL[0] // len(few) - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
         about = finding.view, body, estimate.T_world_object, few, session.estimator
         pictures["density"] = densities_picture(*about, panel)
     return pictures

@@ -49,7 +49,8 @@ _FINEST = 4  # of these each way in a pixel
 _AT_ONCE = 2**20  # of these: 16 MB of coordinates
 _SHOWN = 1e-3  # of the lowest peak: what is less is black
 _BAR_LINES = 1.6  # height of a bar, lines of captions
-_MARGIN = 4  # widest blurs around the body
+# widest blurs around the body: C is √2 wider, and a peak of it is shown as far as √(2 ln 1/_SHOWN)
+_MARGIN = 5.3
 
 
 def features_picture(finding: Finding, room: Size) -> Picture:
@@ -225,10 +226,17 @@ def densities_picture(
         peaks = [float(one.values.max()) for one in panels]
         top = max(peaks) or 1.0  # where nothing was found about the body, all is black
         bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
-        drawn = [titled(_coloured(one.values, bottom, top), one.title) for one in panels]
+        drawn = [_headed(_coloured(one.values, bottom, top), one.title) for one in panels]
         row = canvas.in_grid(drawn, len(drawn))
         rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
     return canvas.stacked(rows)
+
+
+def _headed(picture: Picture, title: str) -> Picture:
+    """The picture below a title, which hides nothing of it."""
+    height = round(1.5 * canvas.line_height(picture))
+    strip = np.zeros((height, picture.shape[1], 3), np.uint8)
+    return np.concatenate([titled(strip, title), picture])
 
 
 def panels_of(
@@ -319,12 +327,16 @@ def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
     bar = np.tile(bottom * (top / bottom) ** shares, (max(round(0.4 * line), 4), 1))
     picture = np.zeros((round(_BAR_LINES * line), width, 3), np.uint8)
     picture[: len(bar)] = _coloured(bar, bottom, top)
-    first, last = np.ceil(np.log10(bottom)), np.floor(np.log10(top))
-    baseline = picture.shape[0] - 0.3 * line
-    for power in np.arange(first, last + 1):
-        u = width * (power - np.log10(bottom)) / np.log10(top / bottom)
-        if u < width - 8 * line:
+    baseline, size = picture.shape[0] - 0.3 * line, 0.8
+    largest = f"{top:.1e} / px²"
+    end = width - canvas.width_of(picture, largest, size=size) - 0.3 * line
+    canvas.words(picture, largest, (end, baseline), WHITE, size=size)
+    free = 0.0  # from here on there is room for words
+    for power in np.arange(np.ceil(np.log10(bottom)), np.floor(np.log10(top)) + 1):
+        u, word = width * (power - np.log10(bottom)) / np.log10(top / bottom), f"1e{power:.0f}"
+        reach = canvas.width_of(picture, word, size=size) + 0.5 * line
+        if free <= u < end - reach:
             picture[: len(bar), max(round(u) - 1, 0) : round(u) + 1] = 255
-            canvas.words(picture, f"1e{power:.0f}", (u, baseline), WHITE, size=0.8)
-    canvas.words(picture, f"{top:.1e} / px²", (width - 5 * line, baseline), WHITE, size=0.8)
+            canvas.words(picture, word, (u, baseline), WHITE, size=size)
+            free = u + reach
     return picture

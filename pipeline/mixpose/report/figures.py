@@ -220,7 +220,10 @@ def motion(series: Series, errors: Errors | None) -> list[Chart]:
             half_width = series.half_width[:, 3 * kind + k]
             title = f"{word.capitalize()} {axis}, {unit}"
             svg = _values(series, values[:, k], half_width, truth, jumps)
-            charts.append(Chart(title, _spoken(title, values[:, k]), svg))
+            spoken = _spoken(title, values[:, k])
+            is_open = np.isinf(half_width)
+            spoken += f"; {_open(is_open, half_width)}" if is_open.any() else ""
+            charts.append(Chart(title, spoken, svg))
     return charts
 
 
@@ -343,8 +346,10 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
 def _values(
     series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
 ) -> str:
-    """Values with their band above, the band's half-width alone below."""
+    """Values with their band above, the band's half-width alone below; none where it is open."""
     figure, (upper, lower) = stacked((3.0, 1.2))
+    is_open = np.isinf(half_width)
+    half_width = np.where(is_open, np.nan, half_width)
     panel = TimeAxes(upper, series, jumps)
     panel.mark_lost()
     panel.band(values, half_width)
@@ -365,8 +370,18 @@ def _values(
         lower.set_yscale("log")
     else:
         lower.set_ylim(0.0, 1.15 * float(positive.max()) if positive.size else 1.0)
+    if is_open.any() and not positive.size:
+        lower.set_yticks([])
+    if is_open.any():
+        lower.set_title(_open(is_open, half_width), fontsize="small", loc="left")
     lower.set(xlabel=series.x_label, ylabel="± 95 %")
     return drawn(figure)
+
+
+def _open(is_open: Flags, half_width: Floats) -> str:
+    """What a figure says of frames whose covariance leaves a direction open."""
+    count, known = int(is_open.sum()), int(is_open.sum() + np.isfinite(half_width).sum())
+    return f"open in {count} of {known} frames, where any value fits: no band"
 
 
 def _limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:

@@ -211,9 +211,11 @@ def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
         ("turn, 95 %", series.half_width[:, 3:], "°"),
     ):
         widest = widths.max(axis=1) if len(widths) else np.empty(0)
-        if np.isfinite(widest).any():
-            value = f"± {_short(float(np.nanmedian(widest)))}{unit}"
-            found.append(Figure(name, value, "median of the least certain axis"))
+        if not np.isnan(widest).all():
+            middle, count = float(np.nanmedian(widest)), int(np.isinf(widest).sum())
+            value = "open" if np.isinf(middle) else f"± {_short(middle)}{unit}"
+            note = f"; open in {count} frames" if count else ""
+            found.append(Figure(name, value, f"median of the least certain axis{note}"))
     if np.isfinite(series.score).any():
         found.append(Figure("score", _median(series.score), "median; 1 is best"))
     if np.isfinite(series.latency_ms).any():

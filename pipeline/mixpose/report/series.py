@@ -44,7 +44,9 @@ class Series:
     position: Floats  # (n, 3)
     # (n, 3), rotation vector in world axes, degrees, of the turn from `T_reference`
     turn_deg: Floats
-    half_width: Floats  # (n, 6), of the 95 % bands of position and turn, length units and degrees
+    # (n, 6), of the 95 % bands of position and turn, length units and degrees; infinite where a
+    # direction is open: a turn beyond half a turn may be any
+    half_width: Floats
     T_reference: Floats  # (4, 4), the first pose that is "ok", or else the first pose
     score: Floats  # (n,)
     latency_ms: Floats  # (n,)
@@ -203,6 +205,7 @@ def _half_widths(lines: list[PoseLine], T: Floats, T_reference: Floats) -> Float
         variances = np.diag(J @ line.covariance @ J.T)
         widths[i] = SIGMAS_95 * np.sqrt(np.maximum(variances, 0.0))
     widths[:, 3:] = np.round(np.degrees(widths[:, 3:]), _DECIMALS_DEG)
+    widths[:, 3:][widths[:, 3:] > 180.0] = np.inf
     return widths
 
 

@@ -94,8 +94,9 @@ def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tu
             u, v, depth = image.projection[:, :3] @ world + image.projection[:, 3:]
             scale = 1.0 / np.maximum(depth, 1e-300)
             rows, columns = image.cells.shape
-            column = np.clip(u * scale, 0.0, columns - 1.0).astype(np.int32)
-            row = np.clip(v * scale, 0.0, rows - 1.0).astype(np.int32)
+            with np.errstate(over="ignore"):  # behind the camera, as far out as can be
+                column = np.clip(u * scale, 0.0, columns - 1.0).astype(np.int32)
+                row = np.clip(v * scale, 0.0, rows - 1.0).astype(np.int32)
             met = np.take(image.cells, row * columns + column)
             if body.normals is not None and image.eye.any():
                 outward = (axes[..., :3] @ body.normals.T).reshape(3, -1)

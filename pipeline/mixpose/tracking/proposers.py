@@ -139,7 +139,8 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    kinds, behind, most = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind, -np.inf
+    # of what is likelier clutter the look-alikes are, too
+    kinds, behind, most = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind, 0.0
     # once more, where what is moved is better: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
