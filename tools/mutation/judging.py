@@ -407,7 +407,7 @@ _JUDGE = (
         "judgement/acceptance.py",
         "return pose.log_evidence > 0, pose.log_density",
         "return True, pose.log_density",
-        "four spots that are met exactly by chance stand for seven that show a body of another size",
+        "four spots that are met exactly by chance stand for seven of a body of another size",
     ),
     Mutant(
         "judgement-most-turned-twin",

@@ -164,8 +164,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers.py",
-        "likely[(2 * off.sum(axis=2) > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf",
-        "pass",
+        ".any(axis=1)] = -np.inf",
+        ".all(axis=1)] = likely.min()",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),
     ),

@@ -340,15 +340,16 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matc
 def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """Where some of the detections that are met fix the pose, and others agree with them.
 
-    Several that are cut, or another's, may pull a fit together; the rest agrees elsewhere.  Modes
-    of the likelihood are sought by one step of least squares from each of many sets.
+    Several that are cut, or another's, may pull a fit together, all a little off then; the rest
+    agrees elsewhere.  Modes of the likelihood are sought by one step of least squares from each of
+    many sets.
     """
     errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
-    noise = np.sqrt(frame.variances)
     if judged.proposer != predicted.__name__ or judged.left_out:
         return
+    noise = np.sqrt(np.minimum(frame.variances, judged.variances))  # this frame's has what is off
     off = errors.are_off(used, noise[:, None] ** 2) & (used.detections >= 0)
-    if not _carry(off, used, noise, frame):
+    if judged.residual_ratio <= 1 and not _carry(off, used, noise, frame):
         return
     is_met = (used.shares > 0) & (used.detections >= 0)
     J = (used.J[..., frame.free] / noise[:, None, None, None])[is_met]
@@ -370,12 +371,12 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     off = errors.are_off(others, noise[:, None] ** 2 + used.extra)
     likely[(2 * off.sum(axis=2) > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf
     poses = perturb(judged.T_world_object, twists @ np.eye(6)[frame.free])
-    least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
+    least, modes = float(likely.max()) + rules.acceptance.log_doubt, list[int]()
     for k in np.argsort(-likely, kind="stable").tolist():
-        if not likely[k] > least or len(modes) > rules.proposals.kept:
+        if not likely[k] > least or len(modes) == rules.proposals.kept:
             break
         apart = moved[modes] - moved[k]
-        if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
+        if np.vecdot(apart, apart).max(axis=1).min(initial=np.inf) > errors.outlying**2:
             modes.append(k)
             yield Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
 
