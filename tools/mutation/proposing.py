@@ -164,8 +164,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers.py",
-        ".any(axis=1)] = -np.inf",
-        ".all(axis=1)] = likely.min()",
+        "return np.asarray(2 * off > ",
+        "return np.asarray(off > ",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),
     ),

@@ -23,7 +23,7 @@ from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolera
 from mixpose.density import DRAWING
 from mixpose.fit import Fit, blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
-from mixpose.matching import LEAST_VARIANCE, Matches, log_likelihood, welsch
+from mixpose.matching import LEAST_VARIANCE, ErrorRules, Matches, log_likelihood, welsch
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, transform
@@ -139,8 +139,8 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    # of what is likelier clutter the look-alikes are, too
-    kinds, behind, most = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind, 0.0
+    kinds, behind = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind
+    most = -behind / 2  # what is so much likelier clutter has no look-alike that is not
     # once more, where what is moved is better: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
@@ -367,18 +367,25 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     offsets[:, is_met] = (r - moved) * noise[is_met.nonzero()[0], None]
     others = replace(used, offsets=offsets)
     likely = log_likelihood(errors.blur * noise, others, J.shape[2], errors)
-    # where most of a sensor are off it is out of step, and the others no better for it
-    off = errors.are_off(others, noise[:, None] ** 2 + used.extra)
-    likely[(2 * off.sum(axis=2) > np.count_nonzero(used.shares, axis=1)).any(axis=1)] = -np.inf
+    likely[_is_out_of_step(others, noise**2, errors).any(axis=1)] = -np.inf
     poses = perturb(judged.T_world_object, twists @ np.eye(6)[frame.free])
-    least, modes = float(likely.max()) + rules.acceptance.log_doubt, list[int]()
+    least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
     for k in np.argsort(-likely, kind="stable").tolist():
-        if not likely[k] > least or len(modes) == rules.proposals.kept:
+        if not likely[k] > least or len(modes) > rules.proposals.kept:
             break
         apart = moved[modes] - moved[k]
-        if np.vecdot(apart, apart).max(axis=1).min(initial=np.inf) > errors.outlying**2:
+        if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
             modes.append(k)
-            yield Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
+            start = Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
+            T, seen = met_at(frame, fit := likelihood.fit(start))
+            if not _is_out_of_step(seen, frame.variances, errors).any():
+                yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
+
+
+def _is_out_of_step(seen: Matches, variances: Floats, errors: ErrorRules) -> Mask:
+    """Of which sensors (..., L) most are off by more than noise: others are no better for it."""
+    off = errors.are_off(seen, variances[:, None] + seen.extra).sum(axis=-1)
+    return np.asarray(2 * off > np.count_nonzero(seen.shares, axis=-1))
 
 
 def _some_sets(count: int, few: int, most: int, seed: int) -> Indices | None:
