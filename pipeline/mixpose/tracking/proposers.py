@@ -345,7 +345,8 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     many sets.
     """
     errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
-    if judged.proposer != predicted.__name__ or judged.left_out:
+    # what is off is told by the noise of frames before
+    if judged.proposer != predicted.__name__ or judged.left_out or not frame.track.believed:
         return
     noise = np.sqrt(np.minimum(frame.variances, judged.variances))  # this frame's has what is off
     off = errors.are_off(used, noise[:, None] ** 2) & (used.detections >= 0)
