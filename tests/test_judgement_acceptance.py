@@ -260,3 +260,13 @@ def test_of_one_pose_residuals_as_before_are_likelier_than_larger_ones(
     ranked = [replace(fine, T_world_object=ELSEWHERE)]
     insert(ranked, bent, SQUARE, ALL_FREE, RULES)
     assert [one.proposer for one in ranked] == ["bent", "fine"]
+
+
+def test_what_is_likelier_clutter_stands_for_no_evident_pose() -> None:
+    # by residuals as before it would, as those of the evident one are seven nats unlikely
+    evident = replace(SURE, residual_ratio=12.0, log_evidence=1.8)
+    few = replace(SURE, residual_ratio=0.0, log_evidence=-5.0)
+    for first, second in ((evident, few), (few, evident)):
+        ranked = [first]
+        insert(ranked, second, EIGHT, ALL_FREE, RULES)
+        assert [one.log_evidence for one in ranked] == [1.8]
