@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,10 @@ from mixpose.density import Observation
 from mixpose.objective import View, project_body
 from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.objective.paper import SampledTerm
-from mixpose.records import PointPattern
+from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import Sensor
+from mixpose.tracking import Tracker
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -101,3 +103,19 @@ def _moved_by_look_up(
     error = np.sqrt(3) / 72 / STEPS_PER_SIGMA**3 * np.sqrt(2)  # in σ_ε
     inverse = np.linalg.pinv(np.concatenate(rows)[:, free])
     return np.asarray(np.abs(of_pose[:, free] @ inverse).sum(axis=1) * error)
+
+
+def first_frame(tracker: Tracker, views: list[View]) -> Estimate:
+    """Of a track that knows nothing yet."""
+    return tracker.advance(tracker.begin(), 0, None, views)[1]
+
+
+def without(tracker: Tracker, name: str) -> Tracker:
+    """A tracker that does not have one of the proposers or refinements."""
+    names = [one.__name__ for one in tracker.proposers]
+    assert name in [*names, *(one.__name__ for one in tracker.refinements)]
+    return replace(
+        tracker,
+        proposers=tuple(one for one in tracker.proposers if one.__name__ != name),
+        refinements=tuple(one for one in tracker.refinements if one.__name__ != name),
+    )

@@ -35,13 +35,13 @@ from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
-    disagreeing,
     is_doubtful,
     look_alikes,
     multistart,
     predicted,
     searched,
 )
+from mixpose.tracking.refinements import disagreeing
 from mixpose.tracking.rules import ProposalRules
 from mixpose.tracking.track import Branch
 

@@ -294,8 +294,8 @@ class Estimate:
     # Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
     # lost, None where a file does not say.
     confidence: float | None = None
-    # Which of `mixpose.tracking.proposers` the pose came from; empty without a pose. No part of the
-    # pose line.
+    # Which of `mixpose.tracking.proposers` or `refinements` the pose came from; empty without one.
+    # No part of the pose line.
     proposer: str = field(default="", compare=False)
     # Standard deviations of a feature, by sensor, of the objectives that the pose was fitted by, in
     # their order; empty where it was not fitted to this frame. No part of the pose line.

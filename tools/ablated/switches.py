@@ -10,15 +10,8 @@ from mixpose.judgement import DetectionModel
 from mixpose.objective import View
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.proposers import (
-    Proposer,
-    Refinement,
-    agreed,
-    merged_pair,
-    multistart,
-    searched,
-    without_sensor,
-)
+from mixpose.tracking.proposers import Proposer, multistart, searched
+from mixpose.tracking.refinements import Refinement, agreed, merged_pair, without_sensor
 
 FREE = 0.0
 NEVER = float("inf")

@@ -351,11 +351,11 @@ _NOISE = (
     ),
     Mutant(
         "tracking-merged-spots-pull-by-all-that-they-are-off",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "seen.shares * weights",
         "seen.shares",
         "a spot of two features that is cut bends the pose",
-        ("test_tracking_proposers.py",),
+        ("test_tracking_refinements.py",),
     ),
 )
 

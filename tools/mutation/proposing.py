@@ -5,6 +5,7 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _PROPOSERS = "test_tracking_proposers.py"
+_REFINEMENTS = "test_tracking_refinements.py"
 _BESIDE = "test_several_bodies_companions.py"
 _STARTS = "test_tracking_starts.py"
 
@@ -51,7 +52,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-no-sensor-left-out",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "return names if np.count_nonzero(agreeing & ~apart) >= 2 else []",
         "return []",
         "a camera that was bumped bends the pose",
@@ -59,7 +60,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-another-sensor-left-out",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "names = [seen.names[k] for k in np.flatnonzero(apart)]",
         "names = [seen.names[k - 1] for k in np.flatnonzero(apart)]",
         "of three cameras a sound one is left out",
@@ -67,7 +68,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "len(frame.views) < 3 or judged.left_out:",
         "len(frame.views) < 99 or judged.left_out:",
         "a camera that was bumped bends the pose",
@@ -139,19 +140,19 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-one-merged-pair-a-sensor",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "for most in (1, len(frame.body)):",
         "for most in (1,):",
         "two spots of two features each bend the pose",
-        (_PROPOSERS,),
+        (_REFINEMENTS,),
     ),
     Mutant(
         "tracking-merged-pairs-never-mended",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "return None if T is T_world_object else T",
         "return None",
         "two features seen as one bend the pose",
-        (_PROPOSERS,),
+        (_REFINEMENTS,),
     ),
     Mutant(
         "tracking-narrow-fits-begin-wide",
@@ -163,19 +164,19 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "return np.asarray(2 * off > ",
         "return np.asarray(off > ",
         "of sensors that are out of step the one that is right by itself is believed",
-        (_PROPOSERS,),
+        (_REFINEMENTS,),
     ),
     Mutant(
         "tracking-one-mode-of-a-likelihood",
-        "tracking/proposers.py",
+        "tracking/refinements.py",
         "errors.outlying**2:\n            modes.append(k)",
         "1e9 * errors.outlying**2:\n            modes.append(k)",
         "three spots that are met exactly by chance outweigh five that agree",
-        (_PROPOSERS,),
+        (_REFINEMENTS,),
     ),
     Mutant(
         "tracking-slips-never-looked-for",

@@ -170,7 +170,7 @@ def fit_near(
     if options.objective != "matched":
         return Fit.of(descended(None, rules.fine), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
-    if all(view.observation.cell is not None for view in views):  # whose noise is that of cells
+    if finest.are_grids.all():  # whose noise is that of cells
         fit = Fit.of(descended(finest, rules.fine), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)

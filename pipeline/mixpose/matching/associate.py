@@ -72,9 +72,9 @@ def associate(
     others = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
-    is_grid = objective.are_grids
-    J = J.copy() if is_grid.any() else J  # what was projected is used again
-    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if is_grid.any() else ():
+    grids = np.flatnonzero(objective.are_grids & is_open.any(axis=1)).tolist()
+    J = J.copy() if grids else J  # what was projected is used again
+    for k in grids:
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m], J[k, of, :m] = _residuals(

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -175,7 +176,7 @@ class MatchedObjective:
             parts.append(own)
         return np.concatenate(parts, axis=1)
 
-    @property
+    @cached_property
     def are_grids(self) -> Mask:
         """Of which sensors (L,) the density is a grid of values, no detections."""
         return np.array([view.observation.cell is not None for view in self.views])

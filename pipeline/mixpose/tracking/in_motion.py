@@ -173,8 +173,12 @@ def _beside(frame: Frame, T_world_object: Floats, expected: Expected) -> tuple[f
     """
     at, views = frame.finest.projection.project(T_world_object[None]), frame.still or frame.views
     seen, J = at.weights[:, 0] > 0, at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
-    late, told = _seconds(views, at.y[:, 0], seen), [replace(view, unsure=None) for view in views]
-    return _off(views, late, J, seen, expected), _off(told, late, J, seen, expected)
+    late = _seconds(views, at.y[:, 0], seen)
+    both = _off(views, late, J, seen, expected)
+    if all(view.unsure is None for view in views):
+        return both, both
+    told = [replace(view, unsure=None) for view in views]
+    return both, _off(told, late, J, seen, expected)
 
 
 def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:

@@ -1,41 +1,31 @@
 """Where the body of a frame may be: starts for fits, in the order in which they are tried.
 
-A proposer yields starts for a frame, given the poses found so far.  A refinement yields starts that
-may do better than a judged pose: without a sensor, with merged features, at narrow blurs.  Each
-says itself when it applies.
+A proposer yields starts for a frame, given the poses found so far, and says itself when it applies.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, product
+from itertools import product
 from operator import add
 from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.density import DRAWING
-from mixpose.fit import Fit, blur_schedule
-from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, inverted, is_sure
-from mixpose.matching import LEAST_VARIANCE, ErrorRules, Matches, log_likelihood, welsch
-from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats, Indices, Mask
+from mixpose.fit import blur_schedule
+from mixpose.judgement import ScoredPose, is_sure
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
-from mixpose.tracking.likelihood import Likelihood, met_at
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
-Refinement: TypeAlias = Callable[[Frame, Likelihood, ScoredPose], Iterable[Start]]
-
-OUT_OF_STEP = "out of step or bumped"
 
 
 def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
@@ -242,175 +232,4 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 
-def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """The pose fitted without the sensors that disagree with two others or more."""
-    if len(frame.views) < 3 or judged.left_out:
-        return
-    if apart := disagreeing(judged.matches, frame.rules.acceptance, frame.rules.judgement.noise):
-        yield Start(judged.T_world_object, frame.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
-
-
-def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
-    """Sensors that see the body elsewhere than two others or more do.
-
-    They meet little of it, with as many detections beside it that belong to nothing, or with
-    residuals that are far larger than the others', more than chance would make them.
-    """
-    agreeing = seen.coverage >= rules.agreeing
-    apart = ~agreeing & (seen.expected > 0)
-    apart &= seen.unmatched_nearby >= rules.agreeing * seen.missed
-    squares, degrees = seen.squares * agreeing, seen.measurements * agreeing
-    if np.count_nonzero(agreeing) > 2:
-        rest = degrees.sum() - degrees
-        variances = (squares.sum() - squares) / np.maximum(rest, 1e-12)
-        # NaN without degrees of freedom, which nothing is larger than
-        limits = np.maximum(rules.disagreeing, fdtri(degrees, rest, model.by_chance))
-        apart |= squares > degrees * limits * np.maximum(variances, LEAST_VARIANCE)
-    names = [seen.names[k] for k in np.flatnonzero(apart)]
-    return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
-
-
-def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """Least squares with the middles of features that run into each other in one detection.
-
-    Of the nearest pair in each sensor, and of all that may be.
-    """
-    rules, before = frame.rules.judgement.association, 0
-    for most in (1, len(frame.body)):
-        paired, is_far = _paired(judged.matches, rules.reach_squared, rules.middle, most)
-        if (pairs := int(paired.merged.sum())) == before:
-            return
-        before = pairs
-        # pairs that are as far off as their spot is wide pull from there, or not at all
-        for widest in (0.0, 1.0) if is_far else (0.0,):
-            if (T := _with_pairs(frame, judged.T_world_object, paired, widest)) is not None:
-                yield Start(T)
-
-
-def _with_pairs(
-    frame: Frame, T_world_object: Floats, paired: Matches, widest: float
-) -> Floats | None:
-    """The pose (4, 4) by two steps of least squares, the first at that blur or the noise's."""
-    T, seen = T_world_object, paired
-    narrow = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
-    for least in (widest, 0.0):  # the second starts within 0.01 σ_ε of the first's end
-        if T is not T_world_object:
-            T, seen = met_at(frame, Fit(T))
-        if not np.count_nonzero(seen.merged):
-            break
-        weights = welsch(seen.squared, np.maximum(narrow, least))
-        J, offsets = replace(seen, shares=seen.shares * weights).rows()
-        rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-        T = perturb(T, least_squares(rest, free=frame.free)[0])
-    return None if T is T_world_object else T
-
-
-def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matches, bool]:
-    """In each sensor features missed near detections of single ones, as one with these.
-
-    The nearest first, so many at most; `reach` is how far that may be, squared, in variances of C,
-    of detections without a size.  And whether any are farther off.
-    """
-    if not np.count_nonzero(seen.missed):
-        return seen, False
-    shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
-    merged, extra, is_far = seen.merged.copy(), seen.extra.copy(), False
-    for k in np.flatnonzero((seen.missed > 0) & (seen.met > 0)):
-        by = seen.detections[k]
-        met = np.flatnonzero((by >= 0) & ((by[:, None] == by).sum(axis=1) == 1))
-        lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
-        away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
-        squared = (away * away).sum(axis=2) / 2
-        # of two disks that touch the centres are √2 times as far apart as their joint area is wide
-        squared[squared > np.maximum(reach, (seen.radii[k, met] / seen.sigmas[k]) ** 2)] = np.inf
-        for _ in range(most):
-            if squared.min(initial=np.inf) == np.inf:
-                break
-            i, j = np.unravel_index(int(squared.argmin()), squared.shape)
-            is_far |= bool(squared[i, j] > reach)
-            pair = [lost[i], met[j]]
-            shares[k, pair] = shares[k, met[j]] / 2
-            offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
-            J[k, pair] = J[k, pair].mean(axis=0)
-            merged[k], extra[k, pair] = merged[k] + 1, middle**2
-            squared[i], squared[:, j] = np.inf, np.inf
-    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra), is_far
-
-
-def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """Where some of the detections that are met fix the pose, and others agree with them.
-
-    Several that are cut, or another's, may pull a fit together, all a little off then; the rest
-    agrees elsewhere.  Modes of the likelihood are sought by one step of least squares from each of
-    many sets.
-    """
-    errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
-    # what is off is told by the noise of frames before
-    if judged.proposer != predicted.__name__ or judged.left_out or not frame.track.believed:
-        return
-    noise = np.sqrt(np.minimum(frame.variances, judged.variances))  # this frame's has what is off
-    off = errors.are_off(used, noise[:, None] ** 2) & (used.detections >= 0)
-    if judged.residual_ratio <= 1 and not _carry(off, used, noise, frame):
-        return
-    is_met = (used.shares > 0) & (used.detections >= 0)
-    J = (used.J[..., frame.free] / noise[:, None, None, None])[is_met]
-    r = (used.offsets / noise[:, None, None])[is_met]
-    few = -(-J.shape[2] // int(used.dimensions.min()))
-    if (sets := _some_sets(len(r), few, rules.proposals.sets, frame.options.seed)) is None:
-        return
-    known = frame.predictions[0].uncertainty if frame.predictions else frame.start_uncertainty
-    rows = J[sets].reshape(len(sets), -1, J.shape[2])
-    information = rows.swapaxes(1, 2) @ rows + np.diag(known[frame.free] ** -2.0)
-    twists = np.linalg.solve(information, rows.swapaxes(1, 2) @ r[sets].reshape(*rows.shape[:2], 1))
-    twists = np.concatenate([np.zeros((1, J.shape[2])), twists[..., 0]])
-    moved = np.einsum("nmk,sk->snm", J, twists)  # in deviations of the noise
-    offsets = np.zeros((len(twists), *used.offsets.shape))
-    offsets[:, is_met] = (r - moved) * noise[is_met.nonzero()[0], None]
-    others = replace(used, offsets=offsets)
-    likely = log_likelihood(errors.blur * noise, others, J.shape[2], errors)
-    likely[_is_out_of_step(others, noise**2, errors).any(axis=1)] = -np.inf
-    poses = perturb(judged.T_world_object, twists @ np.eye(6)[frame.free])
-    least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
-    for k in np.argsort(-likely, kind="stable").tolist():
-        if not likely[k] > least or len(modes) > rules.proposals.kept:
-            break
-        apart = moved[modes] - moved[k]
-        if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
-            modes.append(k)
-            start = Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
-            T, seen = met_at(frame, fit := likelihood.fit(start))
-            if not _is_out_of_step(seen, frame.variances, errors).any():
-                yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
-
-
-def _is_out_of_step(seen: Matches, variances: Floats, errors: ErrorRules) -> Mask:
-    """Of which sensors (..., L) most are off by more than noise: others are no better for it."""
-    off = errors.are_off(seen, variances[:, None] + seen.extra).sum(axis=-1)
-    return np.asarray(2 * off > np.count_nonzero(seen.shares, axis=-1))
-
-
-def _some_sets(count: int, few: int, most: int, seed: int) -> Indices | None:
-    """All sets (S, few) of so many numbers below a count, or some at random; None for too few."""
-    if count <= few:
-        return None
-    if math.comb(count, few) <= most:
-        return np.array([*combinations(range(count), few)])
-    return np.random.default_rng(seed).random((most, count)).argsort(axis=1)[:, :few]
-
-
-def _carry(off: Mask, used: Matches, noise: Floats, frame: Frame) -> bool:
-    """Whether features (L, N) that are off carry any away, by a part of the noise that matters.
-
-    They do so by least squares at the most.  Where they do not, all modes are one.
-    """
-    if not np.count_nonzero(off):
-        return False
-    J = used.J[..., frame.free] / noise[:, None, None, None]
-    met = J[used.shares > 0].reshape(-1, J.shape[-1])
-    pull = np.einsum("nmk,nm->k", J[off], (used.offsets / noise[:, None, None])[off])
-    moved = (met @ (inverted(met.T @ met) @ pull)).reshape(-1, J.shape[-2])
-    return bool(np.vecdot(moved, moved).max() > frame.rules.fit.moved**2)
-
-
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
-REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, agreed)

@@ -23,7 +23,8 @@ from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.proposers import PROPOSERS, Proposer
+from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
