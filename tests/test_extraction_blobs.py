@@ -156,6 +156,17 @@ def test_disk_behind_a_cable_and_with_a_nick_keeps_its_centre() -> None:
     assert distances(found, np.array([(60.4, 59.7)]))[0] < 0.15
 
 
+def test_noise_on_oblique_disks_makes_no_two_spots_of_them() -> None:
+    # flat on top, so that between their halves and their middle there is nothing but noise
+    x, y = np.meshgrid(np.arange(-15.0, 16.0), np.arange(-15.0, 16.0))
+    covered = gaussian_filter(((x / 10) ** 2 + (y / 6) ** 2 < 1).astype(float), 1.0)
+    for seed in range(40):
+        found = blobs(photograph(150 * np.pad(covered, 20), seed))
+        assert len(found) == 1
+        # what has no rim is put at the middle of its hull, 0.1 px off and more
+        assert np.abs(found[0] - 35).max() < 0.05
+
+
 def test_disk_half_in_shadow_keeps_its_centre() -> None:
     light = 180 * disk(120, 60.4, 59.7, 40)
     light[:, 55:] *= 0.3

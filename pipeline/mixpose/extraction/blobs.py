@@ -273,7 +273,8 @@ def _disks(
     levels, greys = np.array([scene.level for scene in scenes]), [scene.grey for scene in scenes]
     rims = find_rims(greys, which, contours, levels[which], are_oval, rules.rims)
     some = np.flatnonzero(rims.are_good(rules.rims))
-    some = some[~are_waisted(greys, which[some], rims.ellipses.select(some), rules.rims)]
+    own = rims.ellipses.select(some), rims.contrast[some]
+    some = some[~are_waisted(greys, which[some], *own, rules.rims)]
     contrasts = rims.contrast[some]
     # mostly the brightest row of all tells, or pixel, which is quicker than the median
     doubted = contrasts < np.array([_usual_step(scene, rules) for scene in scenes])[which[some]]

@@ -38,9 +38,6 @@ from mixpose.records import Floats, Indices, Mask, Singles
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
 
-# One in so many of these is looked at first: an ellipse through half of the edges is near enough.
-FIRST = 2
-
 # Times that an ellipse is fitted again to the points near it.
 REFITS = 3
 
@@ -102,6 +99,15 @@ class Rims:
     coverage: Floats  # (B,) as of a `Rim`
     residual: Floats  # (B,) likewise
     contrast: Floats  # (B,) median step of the signal across the edges
+    moved: Floats  # (B,) px, the largest distance of an edge from where it was looked for
+
+    def replaced(self, rows: Indices, others: Rims) -> Rims:
+        """With others in some rows."""
+        numbers = [one.copy() for one in (self.coverage, self.residual, self.contrast, self.moved)]
+        new = others.coverage, others.residual, others.contrast, others.moved
+        for own, values in zip(numbers, new, strict=True):
+            own[rows] = values
+        return Rims(self.ellipses.replaced(rows, others.ellipses), *numbers)
 
     def are_good(self, rules: EllipseRules = EllipseRules()) -> Mask:
         """Which (B,) are ellipses."""
@@ -132,16 +138,18 @@ def find_rims(
     outlines are sound `ovals` (B), rims are looked for at these.
     """
     ellipses = _begun(outlines, ovals, rules)
-    edges, found = np.zeros((3, len(outlines))), np.arange(len(outlines))
+    rims, again = Rims(ellipses, *np.zeros((4, len(outlines)))), ellipses.sound
     # Roughly first, then from the better ellipse, which has all of a soft or broken rim in reach.
-    for least, circle in ((rules.coverage / 2, _CIRCLE[:, ::FIRST]), (rules.coverage, _CIRCLE)):
-        found = found[ellipses.sound[found]]
+    for least in (rules.coverage / 2, rules.coverage):
+        found = np.flatnonzero(again)
         if not found.size:
             break
-        at = signals, which[found], ellipses.select(found), contrasts[found]
-        better, edges[:, found] = _rims_near(*at, circle, least, rules)
-        ellipses = ellipses.replaced(found, better)
-    return Rims(ellipses, *edges)
+        at = signals, which[found], rims.ellipses.select(found), contrasts[found]
+        rims = rims.replaced(found, _rims_near(*at, least, rules))
+        # most are near enough at once
+        is_near = rims.are_good(rules) & (rims.moved <= rules.min_reach / 2)
+        again = rims.ellipses.sound & ~is_near
+    return rims
 
 
 def _begun(outlines: Sequence[Contour], ovals: Ellipses, rules: EllipseRules) -> Ellipses:
@@ -170,16 +178,15 @@ def _rims_near(
     which: Indices,
     others: Ellipses,
     contrasts: Floats,
-    circle: Floats,
     least: float,
     rules: EllipseRules,
-) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
-    """Ellipses through the edges near others, with coverage, residual and contrast of each.
+) -> Rims:
+    """Rims through the edges near other ellipses.
 
-    Those that have edges in less than a share `least` of the directions (2, n) are not fitted.
+    Those that have edges in less than a share `least` of the directions are not fitted.
     """
-    edges, found, steps, lows = _edges(signals, which, others, contrasts, circle, rules)
-    found &= (found.sum(axis=1) >= least * circle.shape[1])[:, None]
+    edges, found, steps, lows, off = _edges(signals, which, others, contrasts, rules)
+    found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
@@ -190,16 +197,21 @@ def _rims_near(
     squares = np.where(on_rim, distance, 0.0) ** 2
     residual = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
     better = replace(better, sound=better.sound & (count > 0))
-    return better, (count / circle.shape[1], residual, _medians(steps, on_rim))
+    moved = np.where(on_rim, np.abs(off), 0.0).max(axis=1)
+    return Rims(better, count / DIRECTIONS, residual, _medians(steps, on_rim), moved)
 
 
 def are_waisted(
     signals: Sequence[Grey],
     which: Indices,
     ellipses: Ellipses,
+    contrasts: Floats,
     rules: EllipseRules = EllipseRules(),
 ) -> Mask:
-    """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow."""
+    """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow.
+
+    They are as high as the signal steps at the rim by `contrasts` (B,), or higher inside.
+    """
     axes, waisted = ellipses.half_axes, np.zeros(len(which), dtype=np.bool_)
     own = np.flatnonzero(axes.max(axis=1) >= rules.long * axes.min(axis=1))
     if not own.size:
@@ -211,7 +223,7 @@ def are_waisted(
     lines = places.transpose(2, 0, 1), np.zeros((2, *places.shape[:2])), np.zeros(1)
     middle, *ends = sample_each(signals, which[own], *lines)[0].T
     (low, high), (left, right) = np.sort(ends[:2], axis=0), np.sort(ends[2:], axis=0)
-    height = high - left
+    height = np.maximum(high - left, contrasts[own])
     waisted[own] = (low - middle > rules.dip * height) & (middle - right > rules.ridge * height)
     return waisted
 
@@ -300,16 +312,15 @@ def _edges(
     which: Indices,
     ellipses: Ellipses,
     contrasts: Floats,
-    circle: Floats,
     rules: EllipseRules,
-) -> tuple[Floats, Mask, Floats, Floats]:
-    """Edges (B, n, 2) along the normals of ellipses, to parts of a pixel, in directions (2, n).
+) -> tuple[Floats, Mask, Floats, Floats, Floats]:
+    """Edges (B, n, 2) along the normals of ellipses, to parts of a pixel, in n directions.
 
     There the signal falls through half the height of the edge; whether by one of `contrasts`, well
-    within reach, by how much, and down to what (B, n).
+    within reach, by how much, down to what, and how far off the ellipse in px (B, n).
     """
     (a, b), angle = ellipses.half_axes.T[..., None], ellipses.angle[:, None]
-    (x, y), c, s = circle, np.cos(angle), np.sin(angle)
+    (x, y), c, s = _CIRCLE, np.cos(angle), np.sin(angle)
     on_rim = np.array([c * a * x - s * b * y, s * a * x + c * b * y])
     on_rim += ellipses.centre.T[..., None]
     # as long as one, across the rim
@@ -318,7 +329,7 @@ def _edges(
     normals = np.array([c * x - s * y, s * x + c * y])
     reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
     reach = reach.astype(np.intp)
-    where, found, steps, lows = np.zeros((4, len(reach), circle.shape[1]))
+    where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
     for whole in sorted(set(reach.tolist())):
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
@@ -326,13 +337,13 @@ def _edges(
         lines = on_rim[:, some], normals[:, some], offsets
         profiles = sample_each(signals, which[some], *lines)
         step, place, below, low = _fall(profiles.reshape(len(offsets), -1), offsets)
-        shape = (len(some), circle.shape[1])
+        shape = (len(some), DIRECTIONS)
         sure = step >= np.repeat(contrasts[some], shape[1]).astype(np.float32)
         sure &= below & (np.abs(place) <= whole)
         for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
             whole_array[some] = part.reshape(shape)
     edges = np.stack(tuple(on_rim + normals * where), axis=2)
-    return edges, found > 0, steps, lows
+    return edges, found > 0, steps, lows, where
 
 
 def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Singles, Floats, Mask, Singles]:

@@ -160,8 +160,7 @@ def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
 
 
 def _starts(data: Frame, best: ScoredPose, rest: Frame) -> Iterator[Start]:
-    """Where a second pose may be: where one was, then what a search finds."""
-    yield from _elsewhere(data, best)
+    """Where a second pose may be, as a search finds."""
     views, rules = rest.views, data.rules
     found: Sequence[Copy | Candidate]
     if len(views) > 1:  # quickly, by points that cameras see together
