@@ -165,14 +165,19 @@ class MatchedObjective:
         With `whole`, features out of view count as predicted and not met.  Else a pose gains by
         moving features that meet nothing out of the picture.
         """
-        parts = [np.zeros((len(self.views), 0))]
-        for at in map(self.projection.project, self._blocks(poses)):
-            product = np.vecdot(self.atlas.look_up(at.y)[..., 0], at.weights)
-            norm = norms(at.y, at.weights, self.variances, self.tops)
-            own = self.weights / self.energies * product**2 / norm
+        parts, rest = [np.zeros((len(self.views), 0))], (self.variances, self.tops)
+        for some in self._blocks(poses):
+            if len(some) == 1:  # what may be climbed from next
+                at = self.match(some)
+            else:
+                at = self.projection.project(some)
+                norm = norms(at.y, at.weights, *rest)
+                at = at._replace(sampled=self.atlas.look_up(at.y), norm=norm)
+            product = np.vecdot(at.sampled[..., 0], at.weights)
+            own = self.weights / self.energies * product**2 / at.norm
             if whole:
                 hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
-                own = own * (norm / (norm + self.tops * np.vecdot(hidden, hidden)))
+                own = own * (at.norm / (at.norm + self.tops * np.vecdot(hidden, hidden)))
             parts.append(own)
         return np.concatenate(parts, axis=1)
 
