@@ -206,6 +206,20 @@ def test_a_pose_covers_those_that_it_stands_for(odds: float, widened: float) -> 
     np.testing.assert_allclose(told.covariance, expected, rtol=1e-3)
 
 
+def test_a_pose_that_stands_for_one_known_less_well_is_known_no_better() -> None:
+    # the mean of both covariances about the one that is told, by what each is believed
+    covariance, lasting = np.diag(np.full(6, 1e-4)), np.diag(np.full(6, 2e-5))
+    best = replace(SURE, covariance=covariance, persistent=lasting)
+    moved = perturb(TRUTH, np.array([0.04, 0, 0, 0, 0, 0]))
+    wide = replace(best, covariance=9 * covariance, persistent=9 * lasting)
+    ranked = [best]
+    insert(ranked, replace(wide, T_world_object=moved), EIGHT, ALL_FREE, RULES)
+    expected = 5 * covariance
+    expected[0, 0] += 0.5 * 0.04**2
+    np.testing.assert_allclose(ranked[0].covariance, expected, rtol=1e-3)
+    np.testing.assert_allclose(ranked[0].persistent, 5 * lasting, rtol=1e-3)
+
+
 def test_what_is_not_believed_to_one_in_a_thousand_widens_nothing() -> None:
     best = replace(SURE, covariance=np.diag(np.full(6, 1e-4)))
     moved = perturb(TRUTH, np.array([0.04, 0, 0, 0, 0, 0]))

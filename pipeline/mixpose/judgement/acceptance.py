@@ -193,13 +193,30 @@ def insert(
             told, other = (new, old) if is_better else (old, new)
             belief = beliefs([told, other])[1]
             if told.spread is None and belief > 1 - rules.confidence:
-                wider = max(belief, 1 / limit) * away[:, None] * away
-                told = replace(told, covariance=told.covariance + wider)
+                told = _with_moments_of(told, other, belief, max(belief, 1 / limit), away)
             ranked[k] = told
             break
     else:
         ranked.append(new)
     ranked.sort(key=lambda one: -one.log_density)
+
+
+def _with_moments_of(
+    told: ScoredPose, other: ScoredPose, belief: float, apart: float, away: Floats
+) -> ScoredPose:
+    """A pose with the covariance about it of both, where the other, a twist (6,) away, may be it.
+
+    The other may be it by a `belief`, and its distance counts by `apart`.
+    """
+    covariance, persistent = (
+        (1 - belief) * own + belief * beside
+        for own, beside in (
+            (told.covariance, other.covariance),
+            (told.persistent, other.persistent),
+        )
+    )
+    covariance += apart * away[:, None] * away
+    return replace(told, covariance=covariance, persistent=persistent)
 
 
 def _worth(pose: ScoredPose, rules: AcceptanceRules, more: float = 0.0) -> tuple[bool, float]:
