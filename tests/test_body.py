@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from rounding import rounding
 
-from mixpose.body import Body, Gravity, PointFeature, Sampler, SegmentFeature, symmetries, uniforms
+from mixpose.body import (
+    Body,
+    Gravity,
+    PointFeature,
+    Sampler,
+    SegmentFeature,
+    mirror_image,
+    symmetries,
+    uniforms,
+)
 from mixpose.rigid import from_rotation_vector, transform
 
 COVARIANCE = np.array([[9.0, 2.0, 0.0], [2.0, 4.0, 1.0], [0.0, 1.0, 1.0]])
@@ -194,6 +203,22 @@ def test_a_body_looks_alike_where_its_own_spread_hides_the_difference() -> None:
     for sigma, order in ((0.0, 1), (0.3, 24)):
         features = tuple(PointFeature(point, sigma**2 * np.eye(3)) for point in bent)
         assert len(Body("bent", features).symmetries) == order
+
+
+def test_the_mirror_image_of_spheres_is_of_spheres_with_the_same_labels() -> None:
+    points = np.array([[0.0, 0, 0], [60, 0, 5], [0, 70, -10], [40, 30, 50]])
+    features, radii = tuple(map(PointFeature, points)), np.full(4, 7.5)
+    labels = ("a", "b", "c", "d")
+    body = Body("ball", features, names=labels, radii=radii, shape="sphere")
+    mirrored = mirror_image(body, frozenset(range(4)))
+    assert (mirrored.shape, mirrored.labels) == ("sphere", labels)
+    np.testing.assert_array_equal(mirrored.radii, radii)
+    # all distances are kept, and the volume changes its sign
+    at, own = mirrored.means, body.means
+    sides = [np.linalg.norm(one - one[:, None], axis=2) for one in (at, own)]
+    np.testing.assert_allclose(sides[0], sides[1], atol=1e-9)
+    volumes = [np.linalg.det(one[1:] - one[0]) for one in (at, own)]
+    assert volumes[0] == pytest.approx(-volumes[1])
 
 
 def test_the_radius_does_not_depend_on_where_the_body_is_measured_from() -> None:

@@ -93,6 +93,15 @@ def test_time_is_that_of_the_first_sensor_that_has_one() -> None:
     assert [time_s for _, time_s, _ in joined(sources)] == [0.0, 0.1]
 
 
+def test_times_of_a_sensor_that_go_back_are_refused_and_those_of_two_may_differ() -> None:
+    # where `a` has no frame the time is that of the other clock
+    both: dict[str, Source] = {"a": Recorded(10, 30, rate=5.0), "b": Recorded(10, 20, rate=10.0)}
+    assert [time_s for _, time_s, _ in joined(both)] == [2.0, 2.0, 6.0]
+    back = Recorded(10, 20, rate=-10.0)
+    with pytest.raises(RecordingError, match=r"'b': frame 20 is at -2 s and .* before it at -1 s"):
+        joined({"a": Recorded(10, 20), "b": back})
+
+
 def test_step_counts_from_the_first_number_of_all_sensors() -> None:
     sources: dict[str, Source] = {"a": Recorded(4, 5, 6, 7, 8), "b": Recorded(*range(3, 9))}
     assert joined(sources, None, None, 2) == [

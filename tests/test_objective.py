@@ -171,6 +171,32 @@ def test_the_papers_objectives_are_formula_4_and_its_separate_sums_written_down(
     assert expected[0, 0] == pytest.approx(0.5 * expected[0, 1], rel=0.1)
 
 
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_a_body_out_of_view_of_all_sensors_has_no_slope(
+    name: ObjectiveName, paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    away = perturb(TRUTH, np.array([1e5, 1e5, 0, 0, 0, 0]))
+    views, samples = views_of(pinhole_cameras, paper_body, TRUTH, 2.0), paper_body.sample(10)
+    objective = build_objective(name, views, paper_body, samples, [2.0, 2.0], away)
+    assert objective.value(away) == 0.0
+    assert not objective.value(np.array([away, away])).any()
+    found = objective.linearise(away[None])
+    for part in (found.value, found.gradient, found.curvature):
+        assert not part.any()
+
+
+def test_what_gravity_displaces_belongs_to_the_samples_of_the_same_seed(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    body = replace(paper_body, gravity=Gravity(np.array([0.0, 0.0, -1.0]), 3.0))
+    views = views_of(pinhole_cameras, body, TRUTH, 2.0)
+    samples, level = body.sample(50, seed=3), [2.0, 2.0]
+    objective = build_objective("paper", views, body, samples, level, TRUTH, 3)
+    assert isinstance(objective, PaperObjective)
+    by_hand = PaperObjective(objective.terms, samples, body.world_offsets(50, seed=3))
+    assert objective.value(TRUTH) == by_hand.value(TRUTH)
+
+
 @pytest.mark.parametrize("name", ["matched", "paper"])
 @pytest.mark.parametrize("rig", ["parallel_cameras", "pinhole_cameras"])
 def test_the_papers_validation_example_has_its_maximum_at_the_truth(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.special import chdtri
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
-from mixpose.judgement import JudgementRules, NoiseModel
+from mixpose.judgement import JudgementRules, NoiseModel, RememberedNoise
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
@@ -130,6 +131,19 @@ def test_ranges_err_by_more_than_said_where_residuals_say_so() -> None:
     # twenty degrees of freedom at 1 and twenty at 4
     assert noise_ratio(np.array([80.0, 20.0]), RangeRules()) == pytest.approx(np.sqrt(2.5))
     assert noise_ratio(np.array([1.0, 20.0]), RangeRules()) == 1.0
+
+
+def test_a_frame_of_ranges_alone_forgets_nothing_of_cameras() -> None:
+    before = RememberedNoise(("cam",), np.array([[3.0], [100.0]]), np.ones((4, 5)), fields=0.4)
+    tracker = Tracker.create(TROLLEY, EstimatorOptions(free=("x", "y", "rz")), np.eye(4))
+    track = replace(tracker.begin(), residuals=before)
+    data = tracker.data(track, 0, None, views_at(np.eye(4), np.random.default_rng(3)))
+    after = likelihood_of(data).judge(Fit(np.eye(4)), Start(np.eye(4))).noise
+    np.testing.assert_array_equal(after.of(("cam",)), before.sums)
+    np.testing.assert_array_equal(after.moments, before.moments)
+    assert after.fields == before.fields
+    # theirs are not taken for those of ranges, of which one frame has no more than it detects
+    assert 0 < after.of(("",))[1, 0] <= 8 * len(TROLLEY) - 3
 
 
 def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:

@@ -149,6 +149,26 @@ def test_a_velocity_is_per_second() -> None:
     assert steady.branches[0].uncertainty[:3] == pytest.approx([least] * 3)
 
 
+@pytest.mark.parametrize(("before", "after"), [(2.0, None), (None, 2.1)])
+def test_no_velocity_holds_where_only_one_of_two_frames_has_a_time(
+    before: float | None, after: float | None
+) -> None:
+    # it may be per second or per frame
+    track = Track((branch(velocity=VELOCITY),), frame=7, time_s=before)
+    (prediction,) = predict(track, EIGHT, 8, after)
+    np.testing.assert_array_equal(prediction.T_world_object, TRUTH)
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(track, 8, after, [])
+    assert follow(data, [Branch(moved(1))]).branches[0].velocity is None
+
+
+def test_a_clock_that_goes_back_tells_no_time() -> None:
+    track = Track((branch(velocity=VELOCITY),), frame=7, time_s=2.0)
+    assert track.elapsed(8, 1.3) == 0.0
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(track, 8, 1.3, [])
+    after = follow(data, [Branch(moved(1), spread=NARROW)])
+    assert np.isfinite(after.branches[0].uncertainty).all()
+
+
 def test_of_two_places_where_a_body_may_be_each_goes_on_by_itself() -> None:
     there = perturb(np.eye(4), np.array([0.0, 300.0, 0.0, 0.0, 0.0, 0.0]))
     track = followed(Track(), [moved(0), there], 0, 0.0)
@@ -190,7 +210,7 @@ def test_a_sure_frame_has_no_rivals_and_its_noise_is_remembered(
     assert estimate.status == "ok"
     assert estimate.hypotheses == ()
     # 2 · 8 · 2 coordinates, six of which the pose has used up, counted by how near they are met
-    assert track.residuals.total[1] == pytest.approx(26, rel=0.01)
+    assert track.residuals.sums[1].sum() == pytest.approx(26, rel=0.01)
 
 
 def test_a_start_may_be_as_far_off_as_is_said() -> None:

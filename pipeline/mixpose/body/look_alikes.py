@@ -11,7 +11,7 @@ same sides are tried, and those kept under which the other features have partner
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import TypeAlias
@@ -175,7 +175,7 @@ def mirror_image(body: Body, near: frozenset[int]) -> Body:
     outward = body.normals
     if outward is not None:
         outward = outward - 2 * (outward @ normal)[:, None] * normal
-    return Body(body.name, tuple(PointFeature(one) for one in mirrored), outward)
+    return replace(body, features=tuple(PointFeature(one) for one in mirrored), normals=outward)
 
 
 @lru_cache(maxsize=256)

@@ -188,12 +188,12 @@ class Body:
             samples.append(feature.sample(own))
         return np.array(samples)
 
-    def world_offsets(self, count: int, *, antithetic: bool = True, seed: int = 0) -> Floats:
+    def world_offsets(self, count: int, *, seed: int = 0) -> Floats:
         """Displacements along gravity (R, 3) in the world, one for each sample of a feature.
 
         Zero for a body that states none.  They belong to the samples of the same count and seed.
         """
         if self.gravity is None:
             return np.zeros((1 if self.is_exact else 2 * (count // 2), 3))
-        drawn = uniforms(count, antithetic=antithetic, seed=seed)[:, 4]
+        drawn = uniforms(count, seed=seed)[:, 4]
         return np.asarray(self.gravity.sigma * ndtri(drawn)[:, None] * self.gravity.unit)

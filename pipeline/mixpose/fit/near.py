@@ -33,6 +33,7 @@ from mixpose.objective import (
     MatchedObjective,
     NormalPrior,
     ObjectiveName,
+    PaperObjective,
     View,
     build_objective,
     matched_objective,
@@ -156,15 +157,19 @@ def fit_near(
     blur = blur if wide <= 1 else wide
     levels, begins = list[list[float]](), [blur * sigma for sigma in sigmas]
 
+    def sampled(level: Sequence[float], T: Floats) -> MatchedObjective | PaperObjective:
+        seed = options.seed
+        return build_objective(options.objective, views, body, samples, level, T, seed)
+
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
         states, spread = T_start[None], np.where(free, uncertainty, 0.0)
         for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
             if level[0] <= begins[0]:
                 break
             levels.append(level)
-            at = build_objective(options.objective, views, body, samples, level, states[0])
+            at = sampled(level, states[0])
             states = ascend(at, states, perturb, free, rules.coarse).states
-        end = last or build_objective(options.objective, views, body, samples, sigmas, states[0])
+        end = last or sampled(sigmas, states[0])
         return ascend(end, states, perturb, free, newton)
 
     if options.objective != "matched":

@@ -7,6 +7,7 @@ nearest stamp instead of by equal numbers.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
@@ -16,7 +17,7 @@ from statistics import median
 
 import numpy as np
 
-from mixpose.errors import SessionError
+from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.live import LiveSource, join_live
 from mixpose.frames.prefetch import prefetch
@@ -75,6 +76,7 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
         for stream in streams.values():
             stack.callback(stream.close)
         heads = {sensor: next(stream, None) for sensor, stream in streams.items()}
+        last = dict.fromkeys(sources, -math.inf)
         while waiting := [head.number for head in heads.values() if head is not None]:
             number = min(waiting)
             frames = {
@@ -82,10 +84,23 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
                 for sensor, head in heads.items()
                 if head is not None and head.number == number
             }
+            for sensor, head in frames.items():
+                if head.time_s is not None:
+                    _require_later(sensor, head, last[sensor])
+                    last[sensor] = head.time_s
             times = (frame.time_s for frame in frames.values() if frame.time_s is not None)
             yield FrameSet(number, next(times, None), frames)
             for sensor in frames:
                 heads[sensor] = next(streams[sensor], None)
+
+
+def _require_later(sensor: str, frame: RawFrame, last_s: float) -> None:
+    """Refuse a frame that was taken before the one before it: velocities would be anything."""
+    if frame.time_s is not None and frame.time_s < last_s:
+        raise RecordingError(
+            f"sensor {sensor!r}: frame {frame.number} is at {frame.time_s:g} s and the frame "
+            f"before it at {last_s:g} s; allowed are times that do not go back"
+        )
 
 
 def _more_ahead(frame: RawFrame) -> int:

@@ -88,11 +88,6 @@ class RememberedNoise:
     biases: Biases = field(default_factory=dict)
     fields: float = 1.0  # share of the variance that is fields of sensors; not known before
 
-    @property
-    def total(self) -> Floats:
-        """Squares and degrees of freedom (2,) of all sensors together."""
-        return np.asarray(self.sums.sum(axis=1))
-
     def followed(self, names: Sequence[str], sums: Floats, *rest: Any) -> RememberedNoise:
         """With sums (2, L) of some sensors and those of others as they were, and all else anew."""
         others = [k for k, name in enumerate(self.names) if name not in names]

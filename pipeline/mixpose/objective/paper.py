@@ -65,6 +65,8 @@ class PaperObjective:
 
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
+        if not self.terms:  # no sensor has the body in view
+            return 0.0, np.zeros(6), np.zeros((6, 6))
         points = transform(T_world_object, self.points) + self.offsets
         arms, count = self.points @ T_world_object[:3, :3].T, len(points)
         at = [(term.density, *term.sensor.linearise(points)) for term in self.terms]
@@ -86,6 +88,8 @@ class PaperObjective:
 
     def _values(self, poses: Floats) -> Floats:
         """Values (k,) at poses (k, 4, 4)."""
+        if not self.terms:
+            return np.zeros(len(poses))
         product, *others = self._parts(self._densities(poses))
         for part in others:
             product *= part
@@ -218,10 +222,11 @@ def build_objective(
     samples: Floats,  # (N, R, 3) of the body; the matched objective does not use them
     sigmas: Sequence[float],  # of a feature at this level, per view, in sensor units
     near: Floats,  # (4, 4) pose around whose projection sampled densities are made
+    seed: int = 0,  # that samples are drawn by
 ) -> MatchedObjective | PaperObjective:
     """Build an objective of the pose at one level of blur."""
     if name == "matched":
         return matched_objective(views, body, sigmas)
     kind = PaperObjective if name == "paper" else IndependentObjective
     terms = sampled_terms(views, samples, sigmas, near)
-    return kind(terms, samples, body.world_offsets(samples.shape[1]))
+    return kind(terms, samples, body.world_offsets(samples.shape[1], seed=seed))

@@ -282,7 +282,8 @@ def objective_around(
     samples = body.sample(min(options.samples, _SAMPLES), seed=options.seed)
 
     def values(sigmas: Sequence[float], twists: Floats) -> Floats:
-        objective = build_objective(options.objective, views, body, samples, sigmas, T_world_object)
+        given = options.objective, views, body, samples, sigmas, T_world_object, options.seed
+        objective = build_objective(*given)
         poses = perturb(T_world_object, twists)
         parts = [objective.value(poses[k : k + _BATCH]) for k in range(0, len(poses), _BATCH)]
         found = np.nan_to_num(np.concatenate(parts))

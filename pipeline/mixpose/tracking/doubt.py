@@ -87,7 +87,7 @@ def _alternatives(
         # of a scene with mirrors nobody knows which side a frame shows
         likely = 0.5 if one.name == MIRRORED and data.options.mirrors else rules.mistaken
         yield Alternative(one.what, math.log(likely) + one.log_odds + one.log_harm)
-    if one_misses(best, track.residuals.total, track.agreed, rules, noise):
+    if one_misses(best, _noise_before(data, best), track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
@@ -218,7 +218,12 @@ def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     if not are_few or track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
     is_missed, noise = (seen.missed > 0.5).any(), rules.judgement.noise
-    return bool(is_missed) or is_far_off(seen, track.residuals.total, rules.acceptance, noise)
+    return bool(is_missed) or is_far_off(seen, _noise_before(data, judged), rules.acceptance, noise)
+
+
+def _noise_before(data: Frame, judged: ScoredPose) -> Floats:
+    """Squares and degrees of freedom (2,) that sensors of a pose have left so far."""
+    return np.asarray(data.track.residuals.of(judged.matches.names).sum(axis=1))
 
 
 def _evidence(data: Frame, start: Start) -> float:

@@ -271,6 +271,7 @@ def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
     steady, branches = per_kind(body, rules.steady), list[Branch]()
+    is_timed = track.is_timed_as(frame.time_s)
     for one in found:
         T, deviation = one.T_world_object, one.deviation
         velocity, course, uncertainty = None, None, rules.unsteady * steady
@@ -280,7 +281,7 @@ def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
             if one.spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)
                 walk = walk.joined(moved, body.radius, elapsed)
-            elif one.spread is None and track.misses <= rules.coasting:
+            elif one.spread is None and track.misses <= rules.coasting and is_timed:
                 velocity = moved / elapsed
                 last = parent.velocity
                 change = moved / 2 if last is None else moved - last * elapsed

@@ -23,7 +23,6 @@ from mixpose.fit import Fit, blur_schedule, fit_near
 from mixpose.judgement import (
     Case,
     DetectionModel,
-    RememberedNoise,
     ScoredPose,
     judge,
     judge_together,
@@ -38,6 +37,9 @@ from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, given
 from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown
 from mixpose.tracking.rules import RangeRules
+
+# under this name the noise of single ranges is remembered, of all of them together
+RANGES = ("",)
 
 
 class MatchedLikelihood:
@@ -248,7 +250,8 @@ class AssociationLikelihood:
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
-        self._noise = noise_ratio(frame.track.residuals.total, frame.rules.ranges)  # in σ_ε
+        known = frame.track.residuals.of(RANGES)[:, 0]
+        self._noise = noise_ratio(known, frame.rules.ranges)  # in σ_ε
 
     def fit(self, start: Start) -> Fit:
         """Climb the posterior, at first with ranges that err as far as the prior may."""
@@ -275,20 +278,21 @@ class AssociationLikelihood:
         count, inner = int(free.sum()), np.ix_(free, free)
         degrees = max(float(found.met[0]) - count, 0.0)
         squares = float(found.squares[0]) if degrees else 0.0
-        noise = model.noise.memory * before.of(("",)) + [[squares], [degrees]]
+        known = before.of(RANGES)
+        noise = model.noise.memory * known + [[squares], [degrees]]
         # a direction that all of it leaves open is as uncertain as anywhere
         information = self._definite(self._posterior(start, self._noise).linearise(T[None]))
         information += np.diag(1 / frame.anywhere[1][free] ** 2)
         covariance = np.zeros((6, 6))
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-        degrees = rules.ranges.stated_degrees + float(before.total[1])
+        degrees = rules.ranges.stated_degrees + float(known[1, 0])
         covariance *= model.noise.enlargement(degrees)
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,
             log_evidence=float(found.log_odds[0]) + frame.prior(T)[0] + float(volume),
-            noise=RememberedNoise(("",), noise),
+            noise=before.followed(RANGES, noise, before.moments, before.biases, before.fields),
             spread=np.sqrt(np.diag(covariance)),
         )
 

@@ -67,10 +67,8 @@ class DelayEvidence:
         late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
         return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
 
-    def applied(
-        self, views: Sequence[View], time_s: float | None, elapsed: float | None
-    ) -> list[View]:
-        """Views as late as they are known to be, so long after a pose; none is without times."""
+    def applied(self, views: Sequence[View], time_s: float | None) -> list[View]:
+        """Views as late as they are known to be; none is without times."""
         if time_s is None:
             return [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
         applied = list(views)
@@ -84,8 +82,7 @@ class DelayEvidence:
                     estimated=late.seconds,
                 )
         # a clock that differs by ten standard deviations is not the same: none is late then
-        longest = min(10 * self.unknown_s, math.inf if elapsed is None else max(elapsed, 0.0))
-        are_believed = all(abs(view.delay) <= longest for view in applied)
+        are_believed = all(abs(view.delay) <= 10 * self.unknown_s for view in applied)
         return applied if are_believed else [replace(view, delay=0.0) for view in applied]
 
 
@@ -155,8 +152,12 @@ class Track:
         return {}
 
     def seconds_until(self, time_s: float | None) -> float | None:
-        """Seconds since the last pose; None where either has no time."""
-        return None if time_s is None or self.time_s is None else time_s - self.time_s
+        """Seconds since the last pose; None where either has no time, 0 if the clock went back."""
+        return None if time_s is None or self.time_s is None else max(time_s - self.time_s, 0.0)
+
+    def is_timed_as(self, time_s: float | None) -> bool:
+        """Whether a frame has a time as the last pose, or none as that: else no velocity holds."""
+        return (time_s is None) == (self.time_s is None)
 
     def is_in_turn(self, frame: int, every: int) -> bool:
         """Whether a frame is the first of so many numbers, whatever frames there are."""
@@ -184,7 +185,7 @@ def predict(
     track: Track, body: Body, frame: int, time_s: float | None, rules: MotionRules = MotionRules()
 ) -> list[Branch]:
     """Where the branches of a track expect the body; wider, the longer nothing was seen."""
-    elapsed = track.elapsed(frame, time_s)
+    elapsed, is_timed = track.elapsed(frame, time_s), track.is_timed_as(time_s)
     widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
     for branch in track.branches:
@@ -192,7 +193,7 @@ def predict(
         if branch.spread is not None:
             walk = track.walk or RandomWalk.unknown(body, elapsed, rules)
             uncertainty = np.sqrt(branch.spread**2 + walk.variance(elapsed))
-        elif branch.velocity is not None and track.misses <= rules.coasting:
+        elif branch.velocity is not None and track.misses <= rules.coasting and is_timed:
             T = perturb(T, branch.velocity * elapsed)
         predictions.append(replace(branch, T_world_object=T, uncertainty=uncertainty))
     return predictions

@@ -108,7 +108,7 @@ class Tracker(Setup):
         """A frame, and what is known before it; sensors that saw nothing are left out."""
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
-        seen = track.delays.applied(seen, time_s, track.seconds_until(time_s))
+        seen = track.delays.applied(seen, time_s)
         if predictions:
             T = predictions[0].T_world_object
             seen = weighed_by_size(seen, self.body, T, track.sizes, self.rules.sizes)
