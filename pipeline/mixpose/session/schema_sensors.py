@@ -101,7 +101,7 @@ class SensorTable(Table):
     Example: `source = "left*.png"`"""
     times: str | None = Field(None, min_length=1, description="a CSV file: frame,time_s")
     """When frames were taken, in seconds: a table with a row for each frame, beside the session
-    file or relative to it.
+    file or relative to it.  Times must not go back from frame to frame.
     Example: `times = "times.csv"`"""
     fps: Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
