@@ -73,7 +73,9 @@ class ConvertRequest:
         None, "bop, ros, tum: relative to a camera, not the world.", metavar="SENSOR"
     )
     session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
-    source: list[str] | None = option(None, "rerun: as for run.", metavar="NAME=PATH")
+    source: list[str] | None = option(
+        None, "rerun: as for run, else that of the run.", metavar="NAME=PATH"
+    )
     measured: bool = option(
         False, "c3d, trc: leave gaps where a marker was not measured by itself."
     )
