@@ -121,7 +121,10 @@ class DesignRequest:
     monte_carlo: int = option(0, "Simulate and estimate so many frames of each system.", min=0)
     seed: int = option(0, "Same seed, same study.", min=0)
     tolerance: float | None = option(
-        None, "Markers of two bodies lie alike within this; else 10 % of the radius."
+        None,
+        "Markers of two bodies lie alike within this; else 10 % of the radius.",
+        min=0,
+        max=1e9,
     )
     json: Path | None = option(None, "Write all numbers here.")
     plot: Path | None = option(None, "Draw it: .png, .svg or .pdf.")
