@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mixpose.body import Body
 from mixpose.cli.app import InspectRequest
+from mixpose.cli.output import refuse_stdout
 from mixpose.cli.run import named_sources
 from mixpose.cli.session_formats import recording_of
 from mixpose.errors import RecordingError, SessionError, reporting
@@ -36,6 +37,7 @@ def inspect_frame(request: InspectRequest) -> None:
     if the recording or the poses cannot be read.
     """
     folder, poses = request.output, request.poses
+    refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
     require_matplotlib()
     _check_folder(folder, session)

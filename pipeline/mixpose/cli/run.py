@@ -13,7 +13,14 @@ from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_stdout,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -136,6 +143,8 @@ def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch |
     """What draws each frame, finished with the stack; None where nothing is to be drawn."""
     if request.overlay is None:
         return None
+    instead = "a folder or a video, as --overlay run.mp4"
+    refuse_stdout(request.overlay, "--overlay", "pictures", instead)
     from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
 
     return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
