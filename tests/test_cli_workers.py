@@ -32,6 +32,7 @@ from kills import without_latency
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 RANGES = SYNTHETIC / "range_profiles" / "session.toml"
 BEAMS = SYNTHETIC / "parallel_beams" / "session.toml"
+BODIES = SYNTHETIC / "several_bodies" / "session.toml"
 
 
 def poses_of(path: Path) -> list[dict[str, Any]]:
@@ -85,6 +86,22 @@ def test_several_sessions_give_the_poses_that_each_gives_alone(tmp_path: Path) -
     again = command("run", RANGES, BEAMS, "-o", folder, "--stop", "3")
     assert "2 of 2 recordings are done already" in again.stderr
     assert (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns == before
+
+
+def test_poses_of_several_bodies_are_counted_beside_those_of_one(tmp_path: Path) -> None:
+    folder = tmp_path / "poses"
+    result = command("run", BODIES, BEAMS, "-o", folder, "--stop", "2")
+    assert result.returncode == 0, result.stderr
+    alone = command("run", BODIES, "-o", tmp_path / "alone.jsonl", "--stop", "2")
+    told = "mixpose: 2 frames of 4 bodies: 8 ok"
+    assert alone.stderr.splitlines()[-1].startswith(told)
+    assert told.replace("mixpose:", f"mixpose: {BODIES}:") in result.stderr.splitlines()
+    rows = (folder / "summary.csv").read_text(encoding="utf-8").splitlines()[1:]
+    assert [row.split(",")[:5] for row in rows] == [
+        ["several_bodies", "done", "8", "0", "0"], ["parallel_beams", "done", "2", "0", "0"],
+    ]  # fmt: skip
+    status = status_of(folder / "several_bodies")
+    assert (status["frames"], status["bodies"]) == ({"ok": 8}, 4)
 
 
 def test_a_session_that_fails_is_named_and_the_same_command_does_what_is_left(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -135,6 +136,20 @@ def test_ranges_have_plots_and_the_pose_may_come_from_a_run(
     assert names == {"sheet.png", "objective.png", "ranges.png"}
     assert command(*arguments, 9) == 2
     assert "has no pose of it, found frames 0 to 1" in capsys.readouterr().err
+
+
+def test_the_frame_is_of_the_recording_that_the_poses_are_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses, gone = tmp_path / "poses.jsonl", tmp_path / "tuesday"
+    header, *lines = TWO_CAMERAS.with_name("truth.jsonl").read_text().splitlines()
+    told = json.dumps({**json.loads(header), "sources": {"left": str(gone)}})
+    poses.write_text("\n".join([told, *lines, ""]))
+    words = ("inspect", TWO_CAMERAS, "-o", tmp_path / "seen", "--poses", poses, "--frame", 1)
+    assert command(*words) == 3
+    assert f"{gone}: no such file" in capsys.readouterr().err
+    left = TWO_CAMERAS.with_name("left*.png")
+    assert command(*words, "--source", f"left={left}") == 0
 
 
 def test_poses_of_another_object_are_refused(

@@ -45,8 +45,9 @@ def estimate(frame: int, *, status: Any = "ok", time_s: float | None = 0.1) -> E
 ESTIMATES = (estimate(3), estimate(4, status="lost"), estimate(5, status="ambiguous"), estimate(9))
 
 
-def written(path: Path, *estimates: Estimate, unit: str = "mm") -> Path:
-    header = Header(unit=unit, session="s.toml", session_sha256="0" * 64, mixpose="0.1.0", seed=3)
+def written(path: Path, *estimates: Estimate, unit: str = "mm", **more: Any) -> Path:
+    run: dict[str, Any] = {"session": "s.toml", "session_sha256": "0" * 64, "seed": 3, **more}
+    header = Header(unit=unit, mixpose="0.1.0", **run)
     with path.open("w", encoding="utf-8") as stream:
         writer = JsonlWriter(stream, header)
         for each in estimates:
@@ -77,6 +78,23 @@ def refused(capfd: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 def test_json_lines_stay_as_they_are(poses: Path, tmp_path: Path) -> None:
     assert convert(poses, "-o", tmp_path / "again.jsonl") == 0
     assert (tmp_path / "again.jsonl").read_text() == poses.read_text()
+
+
+def test_the_recording_that_was_read_stays_in_json_lines(tmp_path: Path) -> None:
+    sources = {"left": "tuesday/left*.png"}
+    poses = written(tmp_path / "poses.jsonl", *ESTIMATES, sources=sources)
+    assert read_poses(poses).sources == sources
+    assert convert(poses, "-o", tmp_path / "again.jsonl") == 0
+    assert (tmp_path / "again.jsonl").read_text() == poses.read_text()
+
+
+def test_a_header_whose_recordings_are_no_names_is_refused(
+    poses: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = poses.read_text().replace('"seed": 3', '"seed": 3, "sources": {"left": 0}')
+    poses.write_text(text)
+    assert convert(poses, "-o", tmp_path / "poses.csv") == 3
+    assert "poses.jsonl:1: sources.left is 0" in capfd.readouterr().err
 
 
 def test_table_has_a_row_per_frame(poses: Path, tmp_path: Path) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import os
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from report_runs import RECORDING, estimate, write
@@ -35,6 +39,42 @@ def shot_of_left(folder: Path, away: float) -> tuple[Shot, float]:
     y, seen = sensor.project(transform(T, session.body.means))
     assert seen.all()
     return frame.shots[0], float((np.ptp(y, axis=0) / [WIDTH, HEIGHT]).max())
+
+
+def test_poses_are_drawn_on_the_recording_that_the_run_read(tmp_path: Path) -> None:
+    session, truth = load_session(RECORDING / "session.toml"), read_poses(RECORDING / "truth.jsonl")
+    T = truth.poses[0].T_world_object
+    assert T is not None
+    (tmp_path / "tuesday").mkdir()
+    noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    cv2.imwrite(str(tmp_path / "tuesday" / "left0000.png"), noise)
+    named = write(tmp_path / "p.jsonl", [estimate(0, T)], RECORDING / "session.toml")
+
+    def shown(**sources: str) -> tuple[dict[str, float], list[str]]:
+        poses = read_poses(named)
+        poses = replace(poses, header={**poses.header, "sources": sources})
+        frames, notices = overlay_frames(session, poses, series_of(poses), None)
+        return {shot.sensor: brightness(shot) for frame in frames for shot in frame.shots}, notices
+
+    found, notices = shown(left=str(tmp_path / "tuesday"))
+    assert not notices
+    assert found["left"] > 100
+    assert found["right"] < 50
+    # a recording that is gone is no reason to show another one, nor is a stream
+    found, (notice,) = shown(left=str(tmp_path / "wednesday"))
+    assert found.keys() == {"right"}
+    assert "recording of left cannot be read again" in notice
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
+        assert shown(left=str(tmp_path / "pipe")) == (found, [])
+    assert shown(left="udp://there:1234") == (found, [])
+
+
+def brightness(shot: Shot) -> float:
+    jpeg = np.frombuffer(base64.b64decode(shot.uri.partition(",")[2]), np.uint8)
+    image = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    return float(image.mean())
 
 
 @pytest.mark.parametrize(("away", "least"), [(1.0, None), (2.0, None), (20.0, 120 / WIDTH)])

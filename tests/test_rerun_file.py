@@ -12,6 +12,7 @@ import pytest
 
 from mixpose import rigid
 from mixpose.cli import main
+from mixpose.cli.session_formats import recording_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.session import load_session
 
@@ -154,6 +155,20 @@ def test_what_a_recording_needs_is_told(
     errors = capfd.readouterr().err
     assert message in errors
     assert len(errors.splitlines()) == 1
+
+
+def test_the_recording_is_the_one_that_the_run_read(poses: Path, tmp_path: Path) -> None:
+    (tmp_path / "tuesday").mkdir()
+    cv2.imwrite(str(tmp_path / "tuesday" / "left0003.png"), np.zeros((512, 640), np.uint8))
+    header, *lines = poses.read_text().splitlines()
+    told = json.dumps({**json.loads(header), "sources": {"left": str(tmp_path / "tuesday")}})
+    poses.write_text("\n".join([told, *lines, ""]))
+    session, left = load_session(SESSION), SESSION.with_name("left*.png")
+    opened = recording_of(read_poses(poses), session, [])
+    assert "1 image" in opened["left"].describe()
+    assert "40 images" in opened["right"].describe()
+    named = recording_of(read_poses(poses), session, [f"left={left}"])
+    assert "40 images" in named["left"].describe()
 
 
 def test_missing_package_is_told_with_what_to_install(

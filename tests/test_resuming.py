@@ -9,8 +9,10 @@ import random
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,6 +89,28 @@ def test_without_what_the_run_knew_its_frames_are_estimated_again(
     assert "frames up to 2 are estimated again and left as they are" in capsys.readouterr().err
     assert without_latency(parts) == without_latency(whole)
     assert parts.read_text(encoding="utf-8").splitlines(keepends=True)[:4] == text[:4]
+
+
+def test_frames_that_are_estimated_again_are_not_published_and_drawn_again(tmp_path: Path) -> None:
+    session = SYNTHETIC / "several_bodies" / "session.toml"
+    poses, drawn = tmp_path / "poses.jsonl", tmp_path / "drawn"
+    assert command("run", session, "-o", poses, "--stop", "2") == 0
+    note_path(poses).unlink()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:
+        receiving.bind(("127.0.0.1", 0))
+        url = f"udp://127.0.0.1:{receiving.getsockname()[1]}"
+        words = ("--resume", "--publish", url, "--overlay", drawn)
+        assert command("run", session, "-o", poses, "--stop", "3", *words) == 0
+        receiving.setblocking(False)
+        received = []
+        with suppress(BlockingIOError):
+            while True:
+                received.append(json.loads(receiving.recv(65536)))
+    frames = [line["frame"] for line in received if line["type"] == "pose"]
+    assert frames == [2, 2, 2, 2]
+    assert [path.name for path in drawn.iterdir()] == ["overlay_000002.png"]
+    written = poses.read_text(encoding="utf-8").splitlines()[1:]
+    assert [json.loads(line)["frame"] for line in written] == [0] * 4 + [1] * 4 + [2] * 4
 
 
 def test_what_another_run_knew_is_not_believed(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from mixpose.errors import SessionError
 from mixpose.frames.images import frame_numbers
 from mixpose.rigid import rotation_matrix, transform
 from mixpose.session import Session, load_session
+from mixpose.simulation import SimulationOptions, simulate
 from mixpose.simulation.central_pose import central_pose, count_seen, pivot_of
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.session_copy import copy_session
@@ -69,6 +70,37 @@ def test_a_start_pose_that_no_sensor_sees_is_refused(tmp_path: Path) -> None:
     start = "[start]\nrotation_vector = [0, 0, 0]\ntranslation = [5, 6, -700]\n"
     with pytest.raises(SessionError, match="start: no sensor sees"):
         central_pose(session_of(tmp_path, camera(), before=start), 0)
+
+
+CLOUD = """
+[[sensor]]
+name = "depth"
+model = "cloud"
+source = "points.csv"
+"""
+
+
+@pytest.mark.parametrize(
+    ("sensor", "words"),
+    [
+        (CLOUD, "object: found 2 bodies before range sensors or clouds; simulate draws"),
+        (camera(), "object 'wall': found no place apart from the other bodies in view"),
+    ],
+)
+def test_bodies_that_cannot_be_drawn_together_are_refused_with_the_file_named_once(
+    sensor: str, words: str, tmp_path: Path
+) -> None:
+    wall = f"""
+[[object]]
+name = "wall"
+points = {[[9e4 * k, 9e4 * (k % 2), 0] for k in range(-3, 4)]}
+"""
+    text = OBJECT.replace("[object]", "[[object]]") + wall + sensor
+    path = tmp_path / "session.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SessionError) as caught:
+        simulate(load_session(path), tmp_path / "out", SimulationOptions(frames=1))
+    assert str(caught.value).startswith(f"{path}: {words}")
 
 
 def test_before_one_camera_the_body_fills_half_of_the_smaller_side(tmp_path: Path) -> None:

@@ -354,6 +354,18 @@ def test_poses_of_recordings_err_by_at_most_0_7_of_what_they_did(
     assert "was smoothed before" in again.stderr
 
 
+def test_the_recording_that_the_poses_are_of_stays_in_the_header(tmp_path: Path) -> None:
+    path, output = tmp_path / "poses.jsonl", tmp_path / "smooth.jsonl"
+    write_poses(path, lines_of(swinging(12), covariance_of(0.1, 0.001)))
+    header, *lines = path.read_text(encoding="utf-8").splitlines()
+    sources = {"left": "tuesday/left*.png"}
+    told = json.dumps({**json.loads(header), "sources": sources})
+    path.write_text("\n".join([told, *lines, ""]), encoding="utf-8")
+    done = mixpose("smooth", path, "--motion", "acceleration", "-o", output)
+    assert done.returncode == 0, done.stderr
+    assert read_poses(output).sources == sources
+
+
 def test_the_command_writes_all_bodies_in_the_order_of_frames(tmp_path: Path) -> None:
     covariance, poses = covariance_of(0.1, 0.001), swinging(12)
     lines = [

@@ -109,6 +109,9 @@ the proposer (`docs/method.md`) of each pose that was not predicted. The exit st
 (done; a lost frame is a result), 2 (the session file or the options are wrong), 3 (the recording
 cannot be read; poses already estimated stay written) or 130 (interrupted, everything so far
 written). An error is one line on standard error.
+
+A file that is text may be `-`, standard output; what is printed beside it then goes to standard
+error. Folders, pictures, `.c3d` and `.rrd` need a name.
 """
 
 CONSTANTS_HEAD = f"""\

@@ -230,7 +230,9 @@ class MeasuredPoint:
 class SensorReport:
     """How one sensor took part in an estimate."""
 
-    used: bool  # whether it had a frame with features in it
+    # Whether the pose rests on it.  Not without features, where it was left out, and where it meets
+    # none of the body; of a frame without a pose, by the likeliest one.
+    used: bool
     # share of the sensor's feature density that the pose accounts for, 0 to 1
     explained: float | None = None
     rms: float | None = None  # residual of the explained features, px or length units

@@ -299,15 +299,13 @@ def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:
     return max(round(2 * u) + 1, 1), max(round(2 * v) + 1, 1)
 
 
-def typical_poses(
-    session: Session, count: int, *, away: float = 1.0, seed: int = 0
-) -> list[Floats]:
+def typical_poses(session: Session, count: int, *, away: float = 1.0) -> list[Floats]:
     """Poses T_world_object in the sensors' common view, if any, those that show most features.
 
     Every camera has a resolution. One alone is `away` times as far away as where the body fills
     half of the image's smaller side.
     """
-    rotations = Rotation.random(_TRIED, rng=np.random.default_rng(seed)).as_matrix()
+    rotations = Rotation.random(_TRIED, rng=np.random.default_rng(0)).as_matrix()
     pivot = pivot_of(session.body)
     seen_at_best = 0
     chosen: list[Floats] = []

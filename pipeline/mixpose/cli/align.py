@@ -13,7 +13,7 @@ from mixpose import __version__, rigid
 from mixpose.calibration.rig import centre_of
 from mixpose.cli.app_after import AlignRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but, write_text
+from mixpose.cli.output import refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import read_poses
@@ -48,7 +48,7 @@ def align_session(request: AlignRequest) -> None:
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
     _tell(session, floor, request.up)
-    say(f"{session.path.name} in the frame of {floor.by} -> {request.output}")
+    say(f"{session.path.name} in the frame of {floor.by} -> {shown(request.output)}")
 
 
 def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate]:

@@ -39,7 +39,9 @@ def evaluate(
 
 def report(
     poses: PosesFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The page, as report.html; or stdout (-).")
+    ],
     truth: Annotated[Path | None, TRUTH] = None,
 ) -> None:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
@@ -73,7 +75,9 @@ class ConvertRequest:
         None, "bop, ros, tum: relative to a camera, not the world.", metavar="SENSOR"
     )
     session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
-    source: list[str] | None = option(None, "rerun: as for run.", metavar="NAME=PATH")
+    source: list[str] | None = option(
+        None, "rerun: as for run, else that of the run.", metavar="NAME=PATH"
+    )
     measured: bool = option(
         False, "c3d, trc: leave gaps where a marker was not measured by itself."
     )
@@ -89,7 +93,7 @@ class SmoothRequest:
 
     poses: PosesFile
     output: Path | None = option(
-        None, "Write here, not to stdout.", "-o", "--output", metavar="SMOOTH.jsonl"
+        None, "Write here, not to stdout (-).", "-o", "--output", metavar="SMOOTH.jsonl"
     )
     fill: float = option(
         0.0, "Fill gaps of at most so long, marked; else none.", min=0, metavar="SECONDS"
@@ -121,6 +125,8 @@ class AlignRequest:
         "What lies on the floor: poses, or a body in a frame. Repeatable.",
         metavar="POSES.jsonl|OBJECT@FRAME",
     )
-    output: Path = option(..., "The aligned session.", "-o", "--output", metavar="ALIGNED.toml")
+    output: Path = option(
+        ..., "The aligned session; or stdout (-).", "-o", "--output", metavar="ALIGNED.toml"
+    )
     up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
     source: Recordings = None

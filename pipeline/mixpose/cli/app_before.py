@@ -23,7 +23,9 @@ class ImportRequest:
             "and bodies: .csv, .rom, .vsk or .obj.",
         ),
     ]
-    output: Path = option(..., "The session file, which must be new.", "-o", "--output")
+    output: Path = option(
+        ..., "The session file, which must be new; or stdout (-).", "-o", "--output"
+    )
     unit: LengthUnit = option("mm", "Unit of lengths in the session.")
     lengths: LengthUnit | None = option(
         None, "Unit of translations in files whose format does not fix it."
@@ -36,7 +38,7 @@ class CalibrateRequest:
 
     session: SessionFile
     output: Path | None = option(
-        None, "The calibrated session.", "-o", "--output", metavar="CALIBRATED.toml"
+        None, "The calibrated session; or stdout (-).", "-o", "--output", metavar="CALIBRATED.toml"
     )
     poses: Path | None = option(
         None, "Known poses of the body; else none is known.", metavar="POSES.jsonl"
@@ -56,7 +58,7 @@ class CalibrateRequest:
         None, "Whose frame becomes the world; else it stays.", metavar="SENSOR|body@FRAME"
     )
     check: bool = option(False, "Only say whether the calibration still holds.")
-    report: Path | None = option(None, "A page with pictures.", metavar="FILE.html")
+    report: Path | None = option(None, "A page with pictures; or stdout (-).", metavar="FILE.html")
     source: Recordings = None
 
 
@@ -67,7 +69,8 @@ class LearnRequest:
     session: SessionFile
     output: Path = option(
         ...,
-        "Table of the markers; of several bodies the others go to BODY-2.csv and so on.",
+        "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
+        "one may go to stdout (-).",
         "-o",
         "--output",
         metavar="BODY.csv",
@@ -121,9 +124,12 @@ class DesignRequest:
     monte_carlo: int = option(0, "Simulate and estimate so many frames of each system.", min=0)
     seed: int = option(0, "Same seed, same study.", min=0)
     tolerance: float | None = option(
-        None, "Markers of two bodies lie alike within this; else 10 % of the radius."
+        None,
+        "Markers of two bodies lie alike within this; else 10 % of the radius.",
+        min=0,
+        max=1e9,
     )
-    json: Path | None = option(None, "Write all numbers here.")
+    json: Path | None = option(None, "Write all numbers here; or to stdout (-).")
     plot: Path | None = option(None, "Draw it: .png, .svg or .pdf.")
     workers: int = option(1, "How many poses are simulated at a time.", min=1)
     scheduler: str | None = option(

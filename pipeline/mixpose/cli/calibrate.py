@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -22,7 +21,13 @@ from mixpose.calibration.words import check_world, error_of_held, in_world, with
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import refuse_to_overwrite_but, write_text
+from mixpose.cli.output import (
+    is_stdout,
+    print_lines,
+    refuse_to_overwrite_but,
+    shown,
+    write_text,
+)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -45,6 +50,8 @@ def calibrate_session(request: CalibrateRequest) -> None:
     output = request.output
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
+    if is_stdout(output) and is_stdout(request.report):
+        raise SessionError("--report -: found -o - too; name a file for one of them")
     inputs = [path] if request.poses is None else [path, request.poses]
     for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
@@ -56,10 +63,10 @@ def calibrate_session(request: CalibrateRequest) -> None:
             page = render_calibration(found, path.name, session.unit, __version__)
             write_text(request.report, page, "--report")
     told = (check_lines if output is None else lines_of)(found, session.unit)
-    sys.stdout.write("\n".join(told) + "\n")
+    print_lines(told, output, request.report)
     _warn(found, session.unit)
     if output is not None:
-        say(f"calibrated from {len(found.used)} frames -> {output}")
+        say(f"calibrated from {len(found.used)} frames -> {shown(output)}")
 
 
 @contextmanager
@@ -73,7 +80,7 @@ def _calibrated(
             task = task_of(session, request, rules, progress)
             say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
             saved = None
-            if request.output is not None:
+            if request.output is not None and not is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")
                 refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
                 saved = kept.enter_context(_kept(partial, _key_of(session, task)))

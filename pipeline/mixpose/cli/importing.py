@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 from mixpose.checking import key_warnings, with_image_sizes
 from mixpose.cli.app_before import ImportRequest
 from mixpose.cli.notices import say, warn
+from mixpose.cli.output import is_stdout, shown, write_text
 from mixpose.errors import SessionError
-from mixpose.importing import gather, session_text
-from mixpose.session import load_session
+from mixpose.importing import Imported, gather, session_text
+from mixpose.session import Session, load_session
 
 
 def import_files(request: ImportRequest) -> None:
@@ -16,15 +20,12 @@ def import_files(request: ImportRequest) -> None:
     Raises SessionError if a file cannot be read, or the output is there already.
     """
     output, unit = request.output, request.unit
-    if output.exists():
+    if output.exists() and not is_stdout(output):
         raise SessionError(f"-o {output}: is there already; name a new file")
     if not output.parent.is_dir():
         raise SessionError(f"-o {output}: there is no folder {output.parent}")
     imported = gather(request.files, unit, request.lengths)
-    text = session_text(imported, output)
-    with output.open("x", encoding="utf-8", newline="\n") as stream:
-        stream.write(text)
-    session = load_session(output)  # what was written can be read, or this is a defect
+    session = _written(imported, output)
     for warning in (*imported.warnings, *key_warnings(with_image_sizes(session, {}))):
         warn(warning)
     if not imported.bodies:
@@ -32,6 +33,20 @@ def import_files(request: ImportRequest) -> None:
     count = len(imported.cameras)
     names = ", ".join(camera.name for camera in imported.cameras)
     say(
-        f"{count} camera{'s' * (count != 1)} ({names}), lengths in {unit} -> {output}; now add the "
-        "source of each sensor"
+        f"{count} camera{'s' * (count != 1)} ({names}), lengths in {unit} -> {shown(output)}; now "
+        "add the source of each sensor"
     )
+
+
+def _written(imported: Imported, output: Path) -> Session:
+    """Write the session and read it again: what was written can be read, or this is a defect."""
+    if is_stdout(output):
+        with TemporaryDirectory() as folder:
+            copy = Path(folder) / "session.toml"
+            copy.write_text(session_text(imported, copy), encoding="utf-8")
+            session = load_session(copy)
+        write_text(output, session_text(imported, output), "-o")
+        return session
+    with output.open("x", encoding="utf-8", newline="\n") as stream:
+        stream.write(session_text(imported, output))
+    return load_session(output)

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from mixpose.body import Body
 from mixpose.cli.app import InspectRequest
+from mixpose.cli.output import refuse_stdout
 from mixpose.cli.run import named_sources
+from mixpose.cli.session_formats import recording_of
 from mixpose.errors import RecordingError, SessionError, reporting
 from mixpose.frames import Source, pair
 from mixpose.pictures.advice import describe
@@ -20,7 +22,7 @@ from mixpose.pictures.plots import require_matplotlib
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, prefixes_of
 from mixpose.pictures.signature import refuse_foreign, write_png
-from mixpose.poses.jsonl import read_poses
+from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.runner import clouds_of, observe, open_sources, scene_of
 from mixpose.session import Session, load_session
@@ -35,18 +37,24 @@ def inspect_frame(request: InspectRequest) -> None:
     if the recording or the poses cannot be read.
     """
     folder, poses = request.output, request.poses
+    refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
     require_matplotlib()
     _check_folder(folder, session)
-    opened = open_sources(session, named_sources(request.source or ()))
+    file = None if poses is None else _of_session(read_poses(poses), session)
+    opened = (
+        open_sources(session, named_sources(request.source or ()))
+        if file is None
+        else recording_of(file, session, request.source or ())
+    )
     frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
     scene = scene_of(session)
-    if poses is None:
+    if file is None:
         _, estimates = scene.advance(scene.begin(), number, frame_set.time_s, views)
     else:
-        estimates = _from_file(poses, session, number)
+        estimates = _from_file(file, session, number)
     bodies = [tracked.body for tracked in scene.bodies]
     clouds = clouds_of(session)
     estimates = [with_clouds(one, clouds) for one in estimates]
@@ -93,14 +101,18 @@ def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
     raise SessionError(f"--frame {number}: the recording has no such frame; it has {recordings}")
 
 
-def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
-    """The poses of a frame as a run wrote them, one per body."""
-    file = read_poses(path)
+def _of_session(file: PoseFile, session: Session) -> PoseFile:
     if file.unit is not None and file.unit != session.unit:
         raise SessionError(
-            f"--poses {path}: lengths are in {file.unit}, those of the session in {session.unit}; "
-            "give poses of this session"
+            f"--poses {file.path}: lengths are in {file.unit}, those of the session in "
+            f"{session.unit}; give poses of this session"
         )
+    return file
+
+
+def _from_file(file: PoseFile, session: Session, number: int) -> list[Estimate]:
+    """The poses of a frame as a run wrote them, one per body."""
+    path = file.path
     found: list[Estimate] = []
     for label in session.labels:
         own = [pose for pose in file.poses if pose.label == label]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from mixpose.cli.app_before import LearnRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import refuse_to_overwrite_but, write_text
+from mixpose.cli.output import (
+    is_stdout,
+    print_lines,
+    refuse_to_overwrite_but,
+    shown,
+    write_text,
+)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
@@ -35,11 +40,21 @@ def learn_session(request: LearnRequest) -> None:
     with watched() as progress:
         lesson = learn(session, named_sources(request.source or ()), rules, progress)
     bodies = _in_frames(lesson, request, older)
+    if len(bodies) > 1 and is_stdout(request.output):
+        raise SessionError(
+            f"-o -: found {len(bodies)} bodies, each of which gets a table of its own; name a "
+            "file, as -o body.csv"
+        )
     files = [_file(request.output, k) for k in range(len(bodies))]
     for file, body in zip(files, bodies, strict=True):
         refuse_to_overwrite_but(file, inputs, MARK)
         write_text(file, table_text(body), "-o")
     _tell(lesson, bodies, files, session, rules)
+
+
+def _called(file: Path) -> Path:
+    """How a table is called, also one that goes to standard output."""
+    return Path("body.csv") if is_stdout(file) else file
 
 
 def _older(path: Path, session: Session) -> Markers:
@@ -86,22 +101,23 @@ def _tell(
     rules: LearningRules,
 ) -> None:
     lines = list[str]()
-    for file, body in zip(files, bodies, strict=True):
+    called = [_called(file) for file in files]
+    for file, body in zip(called, bodies, strict=True):
         lines += lines_of(body, file.name, session.unit)
     if len(bodies) > 1 or bodies[0].count > 1:
         lines.append("in the session:")
-        for file, body in zip(files, bodies, strict=True):
+        for file, body in zip(called, bodies, strict=True):
             lines += ["", "[[object]]", f'name = "{file.stem}"', f'file = "{file.name}"']
             lines += [f"count = {body.count}"] if body.count > 1 else []
-    sys.stdout.write("\n".join(lines) + "\n")
-    names = [file.name for file in files]
+    print_lines(lines, *files)
+    names = [file.name for file in called]
     for body, name in zip(bodies, names, strict=True):
         for doubt in doubts_of(body, name, session.unit, rules):
             warn(doubt)
     for doubt in look_alikes(bodies, names):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
-    say(f"learnt from {lesson.frames} frames -> {', '.join(map(str, files))}{others}")
+    say(f"learnt from {lesson.frames} frames -> {', '.join(map(shown, files))}{others}")
 
 
 def _warn_of_late(session: Session) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections import Counter, deque
@@ -15,7 +16,7 @@ if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.calibration.task import Progress
     from mixpose.frames import Source
     from mixpose.objective import View
-    from mixpose.records import DelaySeen, Estimate, FrameSet, Status
+    from mixpose.records import DelaySeen, Estimate, FrameSet
     from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
@@ -32,6 +33,11 @@ _REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
 
 _TIMED = 4  # frames by which it is told how long the search takes
 _FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
+
+# what `frames_text` says, and where poses were written
+_FRAMES = re.compile(
+    r"mixpose: \d+ frames?(?: of (\d+) bodies)?: (\d+ \w+(?:, \d+ \w+)*)(?: -> |$)"
+)
 
 
 def say(message: str) -> None:
@@ -59,6 +65,25 @@ def warn_of_sources(
             warn(f"sensor {name!r}: {caution}")
 
 
+def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
+    """How many frames there were, and how many poses of theirs came to which status."""
+    count = sum(statuses.values()) // bodies
+    of = f" of {bodies} bodies" if bodies > 1 else ""
+    words = ("ok", "ambiguous", "lost")
+    parts = [f"{statuses[word]} {word}" for word in words if statuses.get(word)]
+    return f"{count} frame{'s' * (count != 1)}{of}: {', '.join(parts) or 'none'}"
+
+
+def told_frames(line: str) -> tuple[dict[str, int], int] | None:
+    """The statuses and the number of bodies in a line that a run said in the end; else None."""
+    found = _FRAMES.match(line)
+    if found is None:
+        return None
+    bodies, told = found.groups()
+    pairs = (part.split(" ", 1) for part in told.split(", "))
+    return {status: int(count) for count, status in pairs}, int(bodies or 1)
+
+
 def origin_of(estimate: Estimate) -> str:
     """A frame's status, which proposer its pose came from, and what a search cost."""
     origin = f", the pose came from: {estimate.proposer}" if estimate.proposer else ""
@@ -84,7 +109,7 @@ class Summary:
         self.idle_for = MEETS_NOTHING
         self.findings, self.path = Findings(session), session.path
         self.bodies = len(session.labels)
-        self.statuses: Counter[Status] = Counter()
+        self.statuses: Counter[str] = Counter()
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
         self.shared = 0  # frames with a pose in which two sensors or more had features
@@ -137,12 +162,7 @@ class Summary:
 
     def text(self) -> str:
         """One line: how many frames came to which status."""
-        count = sum(self.statuses.values())
-        words: tuple[Status, ...] = ("ok", "ambiguous", "lost")
-        parts = [f"{self.statuses[word]} {word}" for word in words if self.statuses[word]]
-        count //= self.bodies
-        of = f" of {self.bodies} bodies" if self.bodies > 1 else ""
-        return f"{count} frame{'s' * (count != 1)}{of}: {', '.join(parts)}"
+        return frames_text(self.statuses, self.bodies)
 
     def say(self, where: str) -> None:
         """Print the line, and warn of sensors that took no part or fit badly."""

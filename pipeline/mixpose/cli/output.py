@@ -10,6 +10,7 @@ from typing import TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
+from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
@@ -152,10 +153,12 @@ def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
 ) -> None:
     """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
-    it.
+    it; standard output is.
 
     Raises SessionError if it is one of the inputs, or holds something else; `option` named it.
     """
+    if is_stdout(path):
+        return
     beginning = _beginning(path, inputs, option)
     if beginning and mark not in beginning:
         raise _foreign(path, option)
@@ -189,11 +192,38 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def is_stdout(named: Path | None) -> bool:
+    """Whether what an option names is standard output."""
+    return named is not None and output_of(named) is None
+
+
+def refuse_stdout(named: Path | None, option: str, what: str, instead: str) -> None:
+    """Raise a SessionError where an option names standard output, which cannot take `what`."""
+    if is_stdout(named):
+        raise SessionError(f"{option} -: {what} cannot go to standard output; name {instead}")
+
+
+def shown(named: Path) -> str:
+    """What messages call a place that is written to."""
+    return "standard output" if is_stdout(named) else str(named)
+
+
+def print_lines(lines: Iterable[str], *written: Path | None) -> None:
+    """Print what people read; to standard error where standard output has what is written."""
+    stream = sys.stderr if any(map(is_stdout, written)) else sys.stdout
+    stream.write("\n".join(lines) + "\n")
+
+
 def write_text(path: Path, text: str, option: str) -> None:
-    """Write a text to the file that an option names.
+    """Write a text to the file that an option names, or to standard output.
 
     Raises SessionError if it cannot be written.
     """
+    if is_stdout(path):
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode("utf-8"))  # the same bytes on every system
+        sys.stdout.buffer.flush()
+        return
     told = reporting(SessionError, f"{option} {path}: cannot be written")
     with told, appearing_whole(path) as part:
         part.write_text(text, encoding="utf-8", newline="\n")

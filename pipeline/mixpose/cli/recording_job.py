@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import socket
@@ -24,12 +23,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from mixpose.cli.lines import note_path
+from mixpose.cli.notices import told_frames
 
 STATUS = "status.json"
 LOG = "log.txt"
 DONE, FAILED, INTERRUPTED = "done", "failed", "interrupted"
 
-_COUNTS = re.compile(r"^mixpose: \d+ frames?: (.*?)(?: -> .*)?$")
 _INTERRUPTED_STATUS = 130
 
 
@@ -59,7 +58,8 @@ class Outcome:
     mixpose: str
     state: str
     exit_status: int  # of ``mixpose run``
-    frames: Mapping[str, int] = field(default_factory=dict)  # by status of their poses
+    frames: Mapping[str, int] = field(default_factory=dict)  # poses by their status
+    bodies: int = 1  # poses of a frame
     warnings: int = 0  # in the log
     reason: str | None = None  # why it failed: the last line of the log
     seconds: float = 0.0
@@ -158,9 +158,11 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
         lines.append(f"mixpose: ended by signal {-status}")
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
+    frames, bodies = _frames(lines)
     outcome = replace(
         outcome_of(job, state, 128 - status if status < 0 else status),
-        frames=_frames(lines),
+        frames=frames,
+        bodies=bodies,
         warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
         reason=None
         if status == 0
@@ -217,10 +219,7 @@ def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
     return Outcome(**told, state=state, exit_status=exit_status, host=socket.gethostname())
 
 
-def _frames(lines: list[str]) -> dict[str, int]:
-    """Frames by status, as the run said in the end."""
-    said = [found for line in lines if (found := _COUNTS.match(line))]
-    if not said:
-        return {}
-    pairs = (part.split(" ", 1) for part in said[-1].group(1).split(", "))
-    return {status: int(count) for count, status in pairs}
+def _frames(lines: list[str]) -> tuple[dict[str, int], int]:
+    """Poses by status and the number of bodies, as the run said in the end."""
+    said = [found for line in lines if (found := told_frames(line))]
+    return said[-1] if said else ({}, 1)

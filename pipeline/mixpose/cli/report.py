@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.notices import say
-from mixpose.cli.output import refuse_to_overwrite_but, write_text
+from mixpose.cli.output import refuse_to_overwrite_but, shown, write_text
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.report.page import MARK, find_session, render
@@ -15,7 +15,7 @@ _PAGES = (".html", ".htm")
 
 
 def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
-    """Write the report of a run to a page of its own.
+    """Write the report of a run to a page of its own, or to standard output.
 
     Raises SessionError if the output would overwrite something else, or a library is missing.
     Raises RecordingError if the poses or the truth cannot be read or compared.
@@ -31,4 +31,4 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
         )
     write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
     count = len(poses.poses)
-    say(f"{count} frame{'s' * (count != 1)} -> {output}")
+    say(f"{count} frame{'s' * (count != 1)} -> {shown(output)}")

@@ -67,7 +67,7 @@ class RunRequest:
 
 
 def output_of(named: Path | None) -> Path | None:
-    """Where ``-o`` says that poses go; None, standard output, also where it says ``-``."""
+    """Where an option says that something goes; None, standard output, also where it says ``-``."""
     return None if named == Path("-") else named
 
 

@@ -6,13 +6,21 @@ import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_stdout,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -63,7 +71,9 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     view = _view(pages, session, request, opened)
     output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
+        is_new = partial(_is_new, session.labels, go_on.there)
         watch = _each(
+            is_new,
             _publishing(stack, session, request, header),
             summary.watch,
             _overlay(stack, session, request),
@@ -82,7 +92,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
         stack.enter_context(closing(estimates))
         notes = stack.enter_context(_notes(request))
         shown = _with_progress(estimates, session, quiet=request.output is None)
-        for estimate in _not_there(shown, go_on.there):
+        for estimate in filter(is_new, shown):
             output.write(estimate)
             is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
             if notes is not None and output.file is not None and is_whole:
@@ -123,21 +133,18 @@ def _notes(request: RunRequest) -> Iterator[Notes | None]:
         notes.write()
 
 
-def _not_there(estimates: Iterable[Estimate], there: ResumePoint | None) -> Iterator[Estimate]:
-    """Estimates after the last line that is there already."""
-    seen = 0
-    for estimate in estimates:
-        if there is not None:
-            seen += estimate.frame == there.frame
-            if (estimate.frame, seen) <= (there.frame, there.lines):
-                continue
-        yield estimate
+def _is_new(labels: Sequence[str], there: ResumePoint | None, estimate: Estimate) -> bool:
+    """Whether an estimate comes after the last line that is there already."""
+    place = labels.index(estimate.label) + 1  # of its line among those of the frame
+    return there is None or (estimate.frame, place) > (there.frame, there.lines)
 
 
 def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
     """What draws each frame, finished with the stack; None where nothing is to be drawn."""
     if request.overlay is None:
         return None
+    instead = "a folder or a video, as --overlay run.mp4"
+    refuse_stdout(request.overlay, "--overlay", "pictures", instead)
     from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
 
     return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
@@ -185,12 +192,12 @@ def _view(
     return viewer.watch
 
 
-def _each(*watches: Watch | None) -> Watch:
-    """Several that look at each frame, one after the other."""
+def _each(is_new: Callable[[Estimate], bool], *watches: Watch | None) -> Watch:
+    """Several that look at each new frame, one after the other."""
     there = [one for one in watches if one is not None]
 
     def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        for one in there:
+        for one in there if is_new(estimate) else ():
             one(frame_set, views, estimate)
 
     return watch

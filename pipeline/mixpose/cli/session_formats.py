@@ -17,6 +17,7 @@ from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
+from mixpose.frames import Source
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
 from mixpose.poses.trajectories import Trajectories, rate_of, write_c3d, write_trc
@@ -187,20 +188,33 @@ def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequ
             "--format rerun: needs the package rerun-sdk; install it with: "
             "python -m pip install 'mixpose[rerun]'"
         )
-    from mixpose.cli.run import named_sources  # noqa: PLC0415 - only where it is written
-    from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415
-    from mixpose.runner import open_sources  # noqa: PLC0415
+    from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - only where it is written
 
     session = session_of(poses, request.session, allow_code=request.allow_code)
-    opened = open_sources(session, named_sources(request.source or ()))
+    opened = recording_of(poses, session, request.source or ())
+    with appearing_whole(output) as part:
+        write_rerun_file(part, session, opened, lines)
+
+
+def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dict[str, Source]:
+    """The recording that poses were estimated from: that of their header, else of the session.
+
+    Recordings that are `named` stand in place of it. Raises SessionError if there is no frame any
+    more, and RecordingError if it cannot be opened.
+    """
+    from mixpose.cli.run import named_sources  # noqa: PLC0415 - only where it is read again
+    from mixpose.runner import open_sources  # noqa: PLC0415
+
+    sensors = [setup.name for setup in session.sensors]
+    told = {name: source for name, source in poses.sources.items() if name in sensors}
+    opened = open_sources(session, {**told, **named_sources(named)})
     for name, source in opened.items():
         if source.kind == "live":
             raise SessionError(
                 f"sensor {name!r} is live, so its frames are gone; name a recording of them "
                 f"with --source {name}=PATH"
             )
-    with appearing_whole(output) as part:
-        write_rerun_file(part, session, opened, lines)
+    return opened
 
 
 def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False) -> Session:

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.notices import say
+from mixpose.cli.notices import frames_text, say
 from mixpose.cli.recording_job import (
     DONE,
     FAILED,
@@ -245,9 +245,7 @@ def _line(outcome: Outcome) -> str:
     """How a recording went."""
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
-    count = sum(outcome.frames.values())
-    parts = [f"{outcome.frames[word]} {word}" for word in _STATUSES if outcome.frames.get(word)]
-    text = f"{count} frame{'s' * (count != 1)}: {', '.join(parts) or 'none'}"
+    text = frames_text(outcome.frames, outcome.bodies)
     many = outcome.warnings
     return f"{text}; {many} warning{'s' * (many != 1)} in its log" if many else text
 

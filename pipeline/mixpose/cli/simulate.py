@@ -7,6 +7,7 @@ from dataclasses import fields
 
 from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.notices import bar
+from mixpose.cli.output import refuse_stdout
 from mixpose.errors import SessionError
 from mixpose.session import load_session
 from mixpose.session.values import LONGEST_DELAY_S, as_number
@@ -37,6 +38,7 @@ def simulate_session(request: SimulateRequest) -> None:
     given = {name: value for name, value in vars(request).items() if name in names}
     options = SimulationOptions(**given, delay=delays_of(request.delay or []))
     folder, overwrite = request.output, request.overwrite
+    refuse_stdout(folder, "-o", "a recording", "a folder, as -o recording")
     session = load_session(request.session)
     with bar("simulating", options.frames) as moved:
         simulate(

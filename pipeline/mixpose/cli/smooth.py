@@ -13,6 +13,7 @@ from mixpose import __version__
 from mixpose.cli.app_after import SmoothRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.request import output_of
 from mixpose.errors import RecordingError
 from mixpose.poses.estimates import header_of
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -28,7 +29,7 @@ def smooth_poses(request: SmoothRequest) -> None:
     Raises SessionError if the output would overwrite something else. Raises RecordingError if the
     poses cannot be read, were smoothed before, or say too little.
     """
-    path, output = request.poses, request.output
+    path, output = request.poses, output_of(request.output)
     poses = read_poses(path)
     if poses.header.get("smoothed"):
         raise RecordingError(

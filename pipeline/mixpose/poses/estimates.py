@@ -25,6 +25,7 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         mixpose=found.get("mixpose", version),
         seed=found.get("seed", 0),
         symmetries=poses.symmetries,
+        sources=poses.sources,
         sensors=tuple(names),
         objects=objects_of(poses.poses),
         smoothed=found.get("smoothed", {}),

@@ -146,6 +146,12 @@ class PoseFile:
     unit: str | None = None  # unit of all lengths; None where no header says it
     symmetries: Mapping[str, Floats] = field(default_factory=dict)  # in the unit of the file
 
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Recordings that the run read in place of the session's, by sensor name."""
+        found: Mapping[str, str] = self.header.get("sources", {})
+        return found
+
 
 def read_poses(path: str | Path) -> PoseFile:
     """Read a poses or truth file.

@@ -85,6 +85,7 @@ class _Header(_Line):
     unit: str | None = None
     symmetries: dict[str, list[_Matrix4]] = {}
     objects: dict[str, Annotated[int, Field(ge=1, le=10**6)]] = {}
+    sources: dict[str, str] = {}
 
 
 _Checked = TypeVar("_Checked", bound=_Line)

@@ -14,7 +14,7 @@ from mixpose.constants import constant
 from mixpose.poses.header import Header
 from mixpose.poses.writing import require_finite
 from mixpose.publishing.address import Address, parse
-from mixpose.publishing.message import SENDERS, Message, Sender, sender_for
+from mixpose.publishing.message import SENDERS, Message, Sender, TooLargeError, sender_for
 from mixpose.records import Estimate, FrameSet
 
 _REMEMBERED = 10_000  # latencies: a live source may run for days
@@ -106,7 +106,7 @@ class Channel:
         self._backlog = Backlog(rules.waiting)
         self._latencies = deque[float](maxlen=_REMEMBERED)
         self._stamped_by: str | None = None
-        self._sent = self._unheard = 0
+        self._sent = self._unheard = self._too_large = 0
         self._is_away = False
         self._began: float | None = None  # when the send began that goes on
         self._thread = threading.Thread(target=self._work, name="mixpose-publish", daemon=True)
@@ -139,6 +139,7 @@ class Channel:
         text = f"published to {self._address.text}: {self._sent} pose{'s' * (self._sent != 1)}"
         text += f", {self._unheard} more while nobody listened" if self._unheard else ""
         text += f", {dropped} dropped: the receiver was away or too slow" if dropped else ""
+        text += f", {self._too_large} dropped: too large" if self._too_large else ""
         if self._latencies:
             median, most = 1e3 * np.quantile(self._latencies, [0.5, 0.99])
             text += f"; {median:.1f} ms after {self._stamped_by}, 99 % within {most:.1f} ms"
@@ -154,6 +155,12 @@ class Channel:
                 self._began = time.monotonic()
                 heard = self._sender.send(message)
                 self._began = None
+            except TooLargeError as error:
+                self._began = None
+                self._too_large += 1
+                if self._too_large == 1:
+                    self._tell(f"warning: --publish {self._address.text}: {error}; not sent")
+                continue
             except OSError as error:
                 self._began = None
                 self._backlog.put_back(message)

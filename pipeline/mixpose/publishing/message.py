@@ -63,12 +63,17 @@ def path_word(label: str) -> str:
     return f"_{word}" if word[:1].isdigit() else word
 
 
+class TooLargeError(Exception):
+    """What a protocol cannot carry: how large it is and what to do, in words."""
+
+
 class Sender:
     """Sends poses by one protocol.
 
     It is made with an `Address` and the `Header` of the run, and refuses with a `SessionError` what
     is wrong about them. All else is called in a thread of its own, so that it may wait; an
-    `OSError` says that the receiver is not there, or has gone away.
+    `OSError` says that the receiver is not there, or has gone away, a `TooLargeError` that no
+    receiver can get this pose.
     """
 
     dropped = 0  # poses that some receiver did not get because it is slower than others

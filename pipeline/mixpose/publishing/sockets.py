@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import time
 from contextlib import suppress
@@ -11,10 +12,13 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, header_text, path_word
+from mixpose.publishing.message import Message, Sender, TooLargeError, header_text, path_word
+from mixpose.records import Estimate
 
 HEADER_S = 1.0
 """The header, which says the unit, is repeated so often: nobody knows who listens since when."""
+
+_BY_TCP = "publish to tcp:// or ws://, which carry any size"
 
 
 def connected(place: tuple[str, int]) -> socket.socket:
@@ -50,10 +54,17 @@ class Datagrams(Sender):
         kind, _, _, _, self._to = socket.getaddrinfo(*self._place, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(kind, socket.SOCK_DGRAM)
 
-    def put(self, data: bytes) -> None:
-        """Send one datagram."""
+    def put(self, data: bytes, what: str, advice: str) -> None:
+        """Send one datagram; a `TooLargeError` says what is too large and what to do."""
         assert self._socket is not None
-        self._socket.sendto(data, self._to)
+        try:
+            self._socket.sendto(data, self._to)
+        except OSError as error:
+            if error.errno != errno.EMSGSIZE:
+                raise
+            # systems and networks differ in how much they take, 65,507 bytes at most
+            size = f"{len(data):,} bytes, more than a datagram can be here"
+            raise TooLargeError(f"{what} has {size}; {advice}") from error
 
     def close(self) -> None:
         """Close the socket."""
@@ -101,10 +112,19 @@ class UdpSender(Datagrams):
         """Send a line, and from time to time the header before it."""
         now = time.monotonic()
         if now - self._told >= HEADER_S:
+            # one that is too large for now is so for ever
+            self._told = float("inf")
+            self.put(self._header, "the header", _BY_TCP)
             self._told = now
-            self.put(self._header)
-        self.put(message.text.encode())
+        estimate = message.estimate
+        what = f"the pose of {estimate.label} in frame {estimate.frame}"
+        advice = f"leave out --labels, or {_BY_TCP}" if _is_labelled(estimate) else _BY_TCP
+        self.put(message.text.encode(), what, advice)
         return True
+
+
+def _is_labelled(estimate: Estimate) -> bool:
+    return any(report.labels for report in estimate.sensors.values())
 
 
 class OscSender(Datagrams):
@@ -135,5 +155,8 @@ class OscSender(Datagrams):
         if T is not None:
             for value in (*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()):
                 built.add_arg(value, "f")
-        self.put(built.build().dgram)
+        what = f"the message of {estimate.label}"
+        self.put(
+            built.build().dgram, what, "shorten the name of the body, or the path of the address"
+        )
         return True

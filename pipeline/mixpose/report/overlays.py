@@ -12,6 +12,7 @@ import numpy as np
 
 from mixpose.errors import MixposeError, RecordingError
 from mixpose.frames import Source, open_source, pair
+from mixpose.frames.capture import is_stream
 from mixpose.pictures import Part, displayable, draw_pose
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
@@ -58,7 +59,7 @@ def overlay_frames(
     session: Session, poses: PoseFile, series: Series, errors: Errors | None
 ) -> tuple[list[OverlayFrame], list[str]]:
     """A few frames, ascending, with their poses on them, and sentences on what is not read."""
-    setups, opened, notices = _open(session)
+    setups, opened, notices = _open(session, poses.sources)
     chosen = chosen_frames(series, errors)
     lines = {line.frame: line for line in poses.poses}
     frames: list[OverlayFrame] = []
@@ -105,19 +106,25 @@ def chosen_frames(series: Series, errors: Errors | None) -> dict[int, str]:
     return {series.frames[i]: ", ".join(why) for i, why in sorted(reasons.items())}
 
 
-def _open(session: Session) -> tuple[dict[str, SensorSetup], dict[str, Source], list[str]]:
+def _open(
+    session: Session, replaced: Mapping[str, str]
+) -> tuple[dict[str, SensorSetup], dict[str, Source], list[str]]:
     """Recordings with images; a stream is over, and is not asked for again."""
     opened: dict[str, Source] = {}
     notices: list[str] = []
     for setup in session.sensors:
-        names = (setup.source,) if isinstance(setup.source, str) else setup.source
-        if setup.model == "lateration" or not names or any("://" in name for name in names):
+        own = replaced.get(setup.name)
+        if setup.model == "lateration" or not (own or setup.source):
+            continue
+        spec = source_spec(session, setup, own)
+        names = (spec.source,) if isinstance(spec.source, str) else spec.source
+        if any("://" in name or is_stream(str(spec.base / name)) for name in names):
             continue
         if len(opened) == _MOST_CAMERAS:
             notices.append(f"Only the first {_MOST_CAMERAS} cameras are shown.")
             break
         try:
-            source = open_source(source_spec(session, setup, None))
+            source = open_source(spec)
         except MixposeError as error:
             notices.append(f"The recording of {setup.name} cannot be read again: {error}")
             continue

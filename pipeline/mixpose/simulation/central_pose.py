@@ -178,8 +178,8 @@ def plan_companions(
         return ()
     if any(setup.sensor.dimension != 2 for setup in session.sensors):
         raise SessionError(
-            f"{session.path}: object: found {len(members) + 1} bodies before sensors of ranges; "
-            "simulate draws several bodies before cameras only"
+            f"{session.path}: object: found {len(members) + 1} bodies before range sensors or "
+            "clouds; simulate draws several bodies before cameras only"
         )
     placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
     companions = []

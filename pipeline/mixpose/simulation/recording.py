@@ -81,6 +81,7 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
     copied = copy_session(session)
     sources = list(zip(session.sensors, copied.sources))
     motion = swinging(session, central_pose(session, options.seed), options, options.seed)
+    companions = plan_companions(session, motion, options)
     try:
         numbers, files = plan_files(sources, options.frames)
         fps = _frames_per_second(session, options)
@@ -88,7 +89,6 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         setups = _as_they_stand(session.sensors, options)
         cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
         scenery = plan_scenery(session.body, motion, cameras, options)
-        companions = plan_companions(session, motion, options)
         scenery = replace(scenery, actors=(*companions, *scenery.actors))
         planner = Planner(session.body, motion, options, fps, scenery)
         numbered = enumerate(zip(setups, files, steps))

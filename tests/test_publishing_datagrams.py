@@ -1,0 +1,63 @@
+"""What is published in datagrams: none can be larger than the system takes."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mixpose.poses.header import Header
+from mixpose.publishing import Publishing
+from mixpose.records import Estimate, FrameSet
+from mixpose.rigid import from_rotation_vector
+
+HEADER = Header("mm", None, None, "0", 0, objects={"tool": 1})
+POSE = from_rotation_vector([0.1, 0.2, 0.3], [10.0, 20.0, 30.0])
+ESTIMATE = Estimate(7, 0.25, "tool", "ok", POSE, np.diag(np.arange(1.0, 7.0)), 0.9, {})
+
+
+def published(
+    scheme: str, header: Header, estimates: Sequence[Estimate]
+) -> tuple[list[bytes], list[str]]:
+    """What arrives, and what is told, with the address left out."""
+    told: list[str] = []
+    arrived = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:
+        receiving.bind(("127.0.0.1", 0))
+        url = f"{scheme}://127.0.0.1:{receiving.getsockname()[1]}"
+        with Publishing([url], header, told.append) as publishing:
+            for each in estimates:
+                publishing.watch(FrameSet(each.frame, each.time_s, {}), None, each)
+        receiving.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                arrived.append(receiving.recv(65536))
+    return arrived, [text.replace(url, "URL") for text in told]
+
+
+@pytest.mark.parametrize("scheme", ["udp", "osc"])
+def test_what_is_too_large_is_dropped_told_once_and_holds_nothing_up(scheme: str) -> None:
+    if scheme == "osc":
+        pytest.importorskip("pythonosc")
+    large = replace(ESTIMATE, object="tool" * 20_000)
+    arrived, (warning, end) = published(scheme, HEADER, [large, large, ESTIMATE])
+    assert b"tool" in arrived[-1]
+    assert warning.startswith("warning: --publish URL: the ")
+    assert " has 80," in warning
+    assert "bytes, more than a datagram can be here; " in warning
+    assert ("publish to tcp://" if scheme == "udp" else "shorten the name") in warning
+    assert end == "published to URL: 1 pose, 2 dropped: too large"
+
+
+def test_poses_go_on_without_a_header_that_is_too_large() -> None:
+    header = replace(HEADER, symmetries={"tool": np.tile(np.eye(4), (2000, 1, 1))})
+    arrived, told = published("udp", header, [replace(ESTIMATE, frame=k) for k in (1, 2, 3)])
+    assert [json.loads(data)["frame"] for data in arrived] == [2, 3]
+    assert len(told) == 2
+    assert "the header has " in told[0]
+    assert "publish to tcp:// or ws://, which carry any size" in told[0]
