@@ -15,7 +15,7 @@ from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, e
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.optimise import Ascent, ascend
 from mixpose.records import Floats, PointPattern
-from mixpose.rigid import perturb, twist_between
+from mixpose.rigid import inverse, perturb, transform, twist_between
 from mixpose.sensors import PinholeCamera
 
 NOISE_PX = 0.2
@@ -143,6 +143,26 @@ def test_neighbours_that_pull_send_a_fit_on_to_narrower_blurs(
     spread, samples = np.repeat([2.0, 0.01], 3), body.means[:, None]
     fit = fit_near(views, body, TRUTH, spread, EstimatorOptions(), samples)
     assert len(fit.blurs) > 1
+
+
+@pytest.mark.parametrize("apart_px", [1.0, 2.0, 3.0])
+def test_features_that_run_into_each_other_where_they_are_hidden_pull_at_nothing(
+    apart_px: float, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    # two behind each other for the first camera, which sees neither; the prediction has both
+    camera = pinhole_cameras[0]
+    first = transform(TRUTH, np.array([[20.0, 30.0, -10.0]]))[0]
+    ray = first - inverse(camera.T_sensor_world)[:3, 3]
+    side = np.cross(ray, [0.0, 0.0, 1.0])
+    beside = first + 60 * ray / np.linalg.norm(ray) + apart_px * side / np.linalg.norm(side)
+    pair = transform(inverse(TRUTH), np.array([first, beside]))
+    body = Body("pair", (*EIGHT.features, *map(PointFeature, pair)))
+    places = [one.project(transform(TRUTH, body.means))[0] for one in pinhole_cameras]
+    views = [view_of("0", camera, places[0][:8]), view_of("1", pinhole_cameras[1], places[1])]
+    T = fitted(views, body)
+    for sensor, y in zip(pinhole_cameras, places, strict=True):
+        found, _ = sensor.project(transform(T, body.means))
+        assert np.abs(found - y).max() < 0.01
 
 
 def test_how_far_narrower_blurs_move_the_pose_is_known_before(

@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from mixpose.body import Body
 from mixpose.fit.probable import FitRules, believed
@@ -297,8 +298,23 @@ def _are_noise(
     far = np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)) > 0
     beside = matches.beside * matches.beside  # NaN of features that are not in view
     pulls = beside * np.exp(beside / (-2 * blurs * blurs)[:, None])
-    others = bool((np.nansum(pulls, axis=1) >= rules.moved**2 * variances).any())
+    together = np.nansum(pulls, axis=1) + _pulls_of_missed(matches, blurs)
+    others = bool((together >= rules.moved**2 * variances).any())
     return not (far or others), others
+
+
+def _pulls_of_missed(matches: Matches, blurs: Floats) -> Floats:
+    """Squared pulls (L,), in σ_ε², of features that are missed on others beside them at blurs (L,).
+
+    The prediction is normalised: where two of its features overlap and no detection is, it gains by
+    moving them apart.
+    """
+    pulls = np.zeros(len(blurs))
+    for k in np.flatnonzero(matches.missed > 1.5):
+        is_missed = (matches.weights[k] > 0) & (matches.shares[k] == 0)
+        squared = pdist(matches.places[k, is_missed] / matches.sigmas[k], "sqeuclidean")
+        pulls[k] = 2 * float((squared * np.exp(squared / (-2 * blurs[k] ** 2))).sum())
+    return pulls
 
 
 def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:
