@@ -6,6 +6,14 @@ from mutation.mutant import Mutant
 
 _BODY = (
     Mutant(
+        "body-mirror-images-are-of-points",
+        "body/look_alikes.py",
+        "return replace(body, features=",
+        'return replace(body, shape="point", radii=None, features=',
+        "mirrored spheres are predicted a tenth of a pixel off",
+        ("test_body.py",),
+    ),
+    Mutant(
         "body-symmetric-on-average",
         "body/symmetry.py",
         "if one_to_one and distance.max() <= tolerance",

@@ -60,6 +60,14 @@ _NEAR = (
 
 _NARROW = (
     Mutant(
+        "fit-hidden-features-push-each-other-apart",
+        "fit/near.py",
+        "np.nansum(pulls, axis=1) + _pulls_of_missed(matches, blurs)",
+        "np.nansum(pulls, axis=1)",
+        "two hidden features that run into each other move the pose by seven deviations",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
         "return not (far or others), ",

@@ -13,6 +13,22 @@ _TRACK = "test_tracking_track.py"
 
 _PREDICTION = (
     Mutant(
+        "tracking-velocities-per-second-taken-per-frame",
+        "tracking/track.py",
+        "return (time_s is None) == (self.time_s is None)",
+        "return True",
+        "after a frame without a time the body is looked for far away",
+        ("test_tracking_track.py",),
+    ),
+    Mutant(
+        "tracking-clocks-may-go-back",
+        "tracking/track.py",
+        "max(time_s - self.time_s, 0.0)",
+        "time_s - self.time_s",
+        "a live clock that is set back ends in a traceback",
+        ("test_tracking_track.py",),
+    ),
+    Mutant(
         "tracking-errors-over-a-gap-count-for-one-frame",
         "tracking/frame.py",
         "np.abs(change / (1 + track.misses))",
@@ -45,7 +61,7 @@ _PREDICTION = (
     Mutant(
         "tracking-coasts-for-ever",
         "tracking/track.py",
-        "elif branch.velocity is not None and track.misses <= rules.coasting:",
+        "elif branch.velocity is not None and track.misses <= rules.coasting and is_timed:",
         "elif branch.velocity is not None:",
         "after an occlusion the body is looked for far beyond where it can be",
         (_TRACK,),
@@ -169,7 +185,7 @@ _MOTION = (
     Mutant(
         "tracking-clocks-with-nothing-in-common-believed",
         "tracking/track.py",
-        "all(abs(view.delay) <= longest for view in applied)",
+        "all(abs(view.delay) <= 10 * self.unknown_s for view in applied)",
         "all(abs(view.delay) <= 1e99 for view in applied)",
         "sensors of clocks that began at different times are moved away",
         (_DELAYS,),
@@ -236,6 +252,14 @@ _GATING = (
 )
 
 _RANGE_POSTERIOR = (
+    Mutant(
+        "tracking-ranges-forget-the-noise-of-cameras",
+        "tracking/likelihood.py",
+        "before.followed(RANGES, noise, before.moments, before.biases, before.fields)",
+        "before.followed(RANGES, noise)",
+        "after a frame of ranges alone cameras are as in the first frame",
+        ("test_tracking_ranges.py",),
+    ),
     Mutant(
         "tracking-ranges-any-clutter",
         "tracking/likelihood.py",

@@ -101,6 +101,22 @@ _LEVELS = (
 
 _SHAPES = (
     Mutant(
+        "extraction-noise-makes-two-spots-of-a-long-disk",
+        "extraction/ellipse.py",
+        "height = np.maximum(high - left, contrasts[own])",
+        "height = high - left",
+        "of oblique dots one in 25 is put at the middle of its hull",
+        ("test_extraction_blobs.py",),
+    ),
+    Mutant(
+        "extraction-rims-are-looked-at-once",
+        "extraction/ellipse.py",
+        "again = rims.ellipses.sound & ~is_near",
+        "again = rims.ellipses.sound & ~ellipses.sound",
+        "soft and broken rims are found in part",
+        ("test_extraction_blobs.py",),
+    ),
+    Mutant(
         "extraction-min-area-ignored",
         "extraction/blobs.py",
         "for one, area in both if area >= min_area]",

@@ -373,9 +373,17 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-twins-are-not-covered",
         "judgement/acceptance.py",
-        "told.covariance + wider",
-        "told.covariance",
+        "covariance += apart * away[:, None] * away",
+        "covariance += 0.0",
         "of two poses about as likely one is told as if there were no other",
+    ),
+    Mutant(
+        "judgement-one-of-two-poses-is-known-as-if-alone",
+        "judgement/acceptance.py",
+        "(1 - belief) * own + belief * beside",
+        "own + 0.0 * beside",
+        "a pose that stands for one known less well is told as sure as by itself",
+        ("test_judgement_acceptance.py",),
     ),
 )
 

@@ -98,8 +98,8 @@ _MATCHED = (
     Mutant(
         "objective-out-of-the-picture-is-free",
         "objective/matched.py",
-        "(norm + self.tops * np.vecdot(hidden, hidden))",
-        "(norm + 0.0 * np.vecdot(hidden, hidden))",
+        "(at.norm + self.tops * np.vecdot(hidden, hidden))",
+        "(at.norm + 0.0 * np.vecdot(hidden, hidden))",
         "a pose gains by moving features that meet nothing out of the picture",
     ),
     Mutant(
@@ -128,6 +128,22 @@ _MATCHED = (
 )
 
 _SAMPLED = (
+    Mutant(
+        "objective-sampled-needs-a-view",
+        "objective/paper.py",
+        "if not self.terms:  # no sensor has the body in view",
+        "if False:",
+        "a body that swings out of view ends in a traceback",
+        ("test_objective.py",),
+    ),
+    Mutant(
+        "objective-gravity-of-another-seed",
+        "objective/paper.py",
+        "body.world_offsets(samples.shape[1], seed=seed)",
+        "body.world_offsets(samples.shape[1])",
+        "with another seed features sag at random",
+        ("test_objective.py",),
+    ),
     Mutant(
         "objective-left-of-the-image-is-seen",
         "objective/paper.py",

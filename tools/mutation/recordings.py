@@ -6,6 +6,14 @@ from mutation.mutant import Mutant
 
 _PAIRING = (
     Mutant(
+        "frames-may-go-back-in-time",
+        "frames/pairing.py",
+        "frame.time_s < last_s",
+        "frame.time_s < -math.inf",
+        "a table of times that goes back ends in a traceback",
+        ("test_frames_pairing.py",),
+    ),
+    Mutant(
         "frames-pair-the-latest",
         "frames/pairing.py",
         "number = min(waiting)",
