@@ -112,6 +112,20 @@ def test_a_pixel_covers_the_length_across_a_ray_that_is_stated(name: str) -> Non
     assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
 
 
+def test_rays_of_strong_lenses_are_as_exact() -> None:
+    lens = np.array([5.2, 2.1, 1e-4, -1e-4, 0.09, 5.6, 3.5, 0.5])
+    camera = PinholeCamera(
+        np.array([[600.0, 0, 640], [0, 600.0, 480], [0, 0, 1]]), lens, (1280, 960)
+    )
+    places = np.stack(np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-0.75, 0.75, 30)), axis=-1)
+    x = np.concatenate([places.reshape(-1, 2), np.ones((1200, 1))], axis=1)
+    y, seen = camera.project(x)
+    rays = camera.rays(y[seen])
+    assert len(rays) == np.count_nonzero(seen) > 1000
+    again, _ = camera.project(rays.origins + rays.directions)
+    np.testing.assert_allclose(again, y[seen], atol=1e-6)
+
+
 def test_a_range_leaves_no_line_of_sight() -> None:
     assert SENSORS["lateration"].rays(np.array([[900.0]])) is None
     assert SENSORS["cloud"].rays(np.zeros((1, 3))) is None

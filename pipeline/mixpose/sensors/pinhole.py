@@ -13,6 +13,9 @@ from mixpose.sensors.base import hide, image_bounds, within
 from mixpose.sensors.distortion import LensDistortion
 from mixpose.sensors.rays import Rays, central_rays
 
+# Of a strong lens OpenCV's five rounds leave a pixel.
+_UNDONE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+
 NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
 
 
@@ -93,8 +96,8 @@ class PinholeCamera:
         distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
         if self.lens is None:
             return central_rays(self, y, distorted)
-        k = self.lens.coefficients
-        xy = cv2.undistortPoints(distorted.reshape(-1, 1, 2), np.eye(3), k).reshape(-1, 2)
+        given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
+        xy = cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2)
         return central_rays(self, y, np.asarray(xy, dtype=np.float64))
 
     def moved(self, motion: Floats) -> Self:
