@@ -63,3 +63,36 @@ def test_numbers_that_are_out_of_all_proportion_are_refused(scale: float, which:
         lines = [replace(one, covariance=scale * np.eye(6)) for one in lines]
     with pytest.raises(RecordingError, match="'tool' cannot be smoothed: covariances or times"):
         smooth_body(lines, rules=QUICK)
+
+
+def stamped(lines: list[PoseLine], jitter_ns: int) -> list[PoseLine]:
+    """Lines numbered by stamps in nanoseconds, 25 a second, off the even rate by chance."""
+    off = np.random.default_rng(1).integers(-jitter_ns, jitter_ns + 1, len(lines)).tolist()
+    stamps = [10**18 + 40_000_000 * k + off[k] for k in range(len(lines))]
+    return [
+        replace(one, frame=n, time_s=(n - 10**18) * 1e-9)
+        for one, n in zip(lines, stamps, strict=True)
+    ]
+
+
+def test_stamps_that_jitter_leave_no_gap_to_fill() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    lines = stamped(lines_of(measured(truth, covariance), covariance), 20_000)
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    assert found.filled == 0
+    assert [one.frame for one in found.estimates] == [one.frame for one in lines]
+
+
+def test_gaps_among_stamps_are_filled_evenly_and_lost_frames_keep_their_stamps() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    lines = stamped(lines_of(measured(truth, covariance), covariance), 20_000)
+    lines[10] = replace(lines[10], status="lost", T_world_object=None, covariance=None)
+    lost, before, after = lines[10], lines[20], lines[24]
+    del lines[21:24]
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    marked = [one for one in found.estimates if one.filled]
+    assert len(found.estimates) == 40
+    span = after.frame - before.frame
+    evenly = [before.frame + span * k // 4 for k in (1, 2, 3)]
+    assert [one.frame for one in marked] == [lost.frame, *evenly]
+    assert [one.time_s for one in marked] == pytest.approx([0.4, 0.84, 0.88, 0.92], abs=1e-4)

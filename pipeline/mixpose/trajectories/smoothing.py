@@ -178,11 +178,12 @@ def _segments(
         known: list[PoseLine] = []  # the one before in place of those that are not there
         frames: list[int] = []
         moments: list[float] = []
-        for k in part.tolist():
+        for last, k in pairwise([part[0], *part.tolist()]):
             line = lines[k]
             if frames and times[k] - moments[-1] <= fill_s:
-                between = range(frames[-1] + step, line.frame, max(step, 1))
-                share = (np.array(between, float) - frames[-1]) / (line.frame - frames[-1])
+                lost = [lines[i].frame for i in range(last + 1, k)]
+                between = _between(frames[-1], line.frame, step, lost)
+                share = np.array([(n - frames[-1]) / (line.frame - frames[-1]) for n in between])
                 own += [None] * len(between)
                 known += [known[-1]] * len(between)
                 moments += (moments[-1] + share * (times[k] - moments[-1])).tolist()
@@ -195,6 +196,14 @@ def _segments(
         track = replace(_track(known, np.array(moments)), measured=measured)
         segments.append(_Segment(tuple(own), tuple(frames), track))
     return segments
+
+
+def _between(before: int, after: int, step: int, lost: Sequence[int]) -> list[int]:
+    """Frames between two, evenly at about the usual step; those without a pose are some of them."""
+    span = after - before
+    count = max(round(span / max(step, 1)) - 1, 0)
+    even = [before + span * k // (count + 1) for k in range(1, count + 1)]
+    return sorted([*lost, *(n for n in even if all(2 * abs(n - one) >= step for one in lost))])
 
 
 def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Estimate]:
