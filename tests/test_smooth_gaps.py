@@ -96,3 +96,16 @@ def test_gaps_among_stamps_are_filled_evenly_and_lost_frames_keep_their_stamps()
     evenly = [before.frame + span * k // 4 for k in (1, 2, 3)]
     assert [one.frame for one in marked] == [lost.frame, *evenly]
     assert [one.time_s for one in marked] == pytest.approx([0.4, 0.84, 0.88, 0.92], abs=1e-4)
+
+
+def test_frames_that_are_filled_in_have_the_tip_of_the_body() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    tip = np.array([0.0, 0.0, -100.0])
+    lines = [replace(one, tip_object=tip) for one in lines_of(truth, covariance)]
+    del lines[20:22]
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    for one in found.estimates[20:22]:
+        assert one.filled
+        assert one.tip is not None
+        assert one.tip_covariance is not None
+        assert np.abs(one.tip - (truth[one.frame] @ [*tip, 1.0])[:3]).max() < 2.0

@@ -346,5 +346,6 @@ def _filled(
         score=0.0,
         sensors={},
         instance=like.instance,
+        tip_object=like.tip_object,
         filled=True,
     )
