@@ -277,3 +277,8 @@ def test_a_lost_frame_of_a_body_with_a_tip_is_written_as_it_was_read(tmp_path: P
     assert (lines[2]["tip"], lines[2]["tip_covariance"]) == (None, None)
     assert "tip" not in lines[3]
     assert again[2:] == told.splitlines()[2:]
+
+
+def test_a_time_of_ros_that_no_clock_has_is_refused() -> None:
+    with pytest.raises(RecordingError, match=r"frame 12: time 1e\+300 s is beyond what format"):
+        pose_message(replace(GOOD, time_s=1e300), "mm", 1e300)
