@@ -87,7 +87,7 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space
-    names = [re.sub(r"\s", "_", name) for name in trajectories.names]
+    names = _without_blanks(trajectories.names)
     rate, first = repr(trajectories.rate), trajectories.first
     axes = [f"{axis}{k + 1}" for k in range(markers) for axis in "XYZ"]
     keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
@@ -108,6 +108,20 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
         time = (first + k) / trajectories.rate
         stream.write("\t".join([str(first + k), f"{time:.9g}", *cells]) + "\n")
     stream.flush()
+
+
+def _without_blanks(names: Sequence[str]) -> list[str]:
+    """Names without white space, all different as those given."""
+    taken = {name for name in names if not re.search(r"\s", name)}
+    found = []
+    for name in names:
+        own = base = re.sub(r"\s", "_", name)
+        number = 2
+        while own != name and own in taken:
+            own, number = f"{base}_{number}", number + 1
+        taken.add(own)
+        found.append(own)
+    return found
 
 
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:
