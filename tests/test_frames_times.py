@@ -64,6 +64,8 @@ def test_frame_without_a_time_is_told(tmp_path: Path) -> None:
         ("frame,time\n", "line 1: found frame,time,"),
         ("frame,time_s\n0,0\n0,1\n", "line 3: frame 0 has a time already"),
         ("frame,time_s\n0,nan\n", "line 2: time_s: found 'nan'"),
+        ("frame,time_s\n0,1_0\n", "line 2: time_s: found '1_0'"),
+        ("frame,time_s\n1_0,1\n", "line 2: frame: found '1_0'"),
         ("frame,time_s\na,1\n", "line 2: frame: found 'a'"),
     ],
 )

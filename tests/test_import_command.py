@@ -77,3 +77,36 @@ def test_an_image_is_called_one_and_bodies_are_among_what_is_allowed(tmp_path: P
     (tmp_path / "n.yml").write_text("a: 1\n", encoding="utf-8")
     with pytest.raises(SessionError, match=r"COLMAP's .*; or a body: .csv, .rom, .vsk, .obj"):
         gather([tmp_path / "n.yml"], "mm", None)
+
+
+def imported(folder: Path, *bodies: str) -> list[str]:
+    """Import files of bodies beside a calibration, and the names that they got."""
+    (folder / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    for body in bodies:
+        (folder / body).parent.mkdir(exist_ok=True)
+        (folder / body).write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
+    done = command("import", "chain.yaml", *bodies, "-o", "s.toml", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return [one.body.name for one in load_session(folder / "s.toml").objects]
+
+
+def test_bodies_whose_files_are_called_like_numbers_of_others_have_names_of_their_own(
+    tmp_path: Path,
+) -> None:
+    assert imported(tmp_path, "s1/a.csv", "s2/a.csv", "a_1.csv") == ["a_2", "a_3", "a_1"]
+
+
+def test_a_session_that_cannot_be_read_again_does_not_block_the_next_try(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path) -> None:
+        raise SessionError(f"{path}: is not as it should be")
+
+    (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    with monkeypatch.context() as patched:
+        patched.setattr("mixpose.cli.importing.load_session", refused)
+        done = command("import", "chain.yaml", "-o", "s.toml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "is not as it should be" in done.stderr
+    assert not (tmp_path / "s.toml").exists()
+    assert imported(tmp_path, "a.csv") == ["a"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -224,6 +225,23 @@ def test_bop_results_keep_the_rules_of_the_toolkits_reader(unit: str, tmp_path: 
         np.testing.assert_allclose(row["R"], source.T_world_object[:3, :3], atol=1e-15)
         np.testing.assert_allclose(row["t"], source.T_world_object[:3, 3] * mm, rtol=1e-12)
         assert row["time"] == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize(
+    ("options", "number"),
+    [("", 2), ("--object b", 2), ("--obj-id 7", 8), ("--object b --obj-id 7", 7)],
+)
+def test_bop_numbers_of_objects_stay_whatever_is_left_out(
+    options: str, number: int, tmp_path: Path
+) -> None:
+    first, second = (
+        replace(estimate(3, status=s), object=o) for s, o in (("lost", "a"), ("ok", "b"))
+    )
+    poses = written(tmp_path / "poses.jsonl", first, second)
+    for more in ([], ["--only-ok"]):
+        output = tmp_path / f"{len(more)}.csv"
+        assert convert(poses, "--format", "bop", *more, *options.split(), "-o", output) == 0
+        assert [row["obj_id"] for row in bop_rows(output)] == [number]
 
 
 def noisy(path: Path) -> Path:

@@ -264,3 +264,21 @@ def test_a_stamp_of_ros_counts_nanoseconds_upwards(seconds: float, stamp: tuple[
     assert message["pose"]["covariance"][0] == 4.0  # m²
     with pytest.raises(RecordingError, match="frame 3: time 2147483648 s is beyond what format"):
         pose_message(estimate, "mm", 2.0**31)
+
+
+def test_a_lost_frame_of_a_body_with_a_tip_is_written_as_it_was_read(tmp_path: Path) -> None:
+    tip = np.array([0.0, 0.0, -100.0])
+    told = written("jsonl", *(replace(one, tip_object=tip) for one in (GOOD, LOST)), LOST)
+    path = tmp_path / "poses.jsonl"
+    path.write_text(told, encoding="utf-8")
+    again = written("jsonl", *read_poses(path).poses).splitlines()
+    lines = [json.loads(line) for line in again]
+    assert lines[1]["tip"] is not None
+    assert (lines[2]["tip"], lines[2]["tip_covariance"]) == (None, None)
+    assert "tip" not in lines[3]
+    assert again[2:] == told.splitlines()[2:]
+
+
+def test_a_time_of_ros_that_no_clock_has_is_refused() -> None:
+    with pytest.raises(RecordingError, match=r"frame 12: time 1e\+300 s is beyond what format"):
+        pose_message(replace(GOOD, time_s=1e300), "mm", 1e300)

@@ -348,6 +348,22 @@ def test_options_out_of_range_are_refused(wrong: dict[str, float]) -> None:
         SimulationOptions(**{"frames": 3, **wrong})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    "far",
+    [
+        {"amplitude_translation": 1e308},
+        {"background": -1e300},
+        {"fps": 1e-300},
+        {"clutter": 1e9},
+        {"others": 10**9},
+        {"spot_sigma": 1e300},
+    ],
+)
+def test_options_that_nothing_can_be_reckoned_with_are_refused(far: dict[str, float]) -> None:
+    with pytest.raises(SessionError, match=f"simulate: {next(iter(far))}: found .*; allowed: "):
+        SimulationOptions(**{"frames": 2, **far})  # type: ignore[arg-type]
+
+
 def test_progress_counts_the_frames(tmp_path: Path) -> None:
     done: list[int] = []
     simulate(session_of(tmp_path / "plan", camera()), tmp_path / "out", FEW, progress=done.append)

@@ -70,7 +70,8 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
     if name == "ros" and request.relative_to is not None:
         options["frame_id"] = request.relative_to
     header = header_of(poses, _unit(poses, request), __version__)
-    header = replace(header, objects=objects_of(lines))
+    if name != "bop" or (request.object is not None and request.obj_id is not None):
+        header = replace(header, objects=objects_of(lines))
     labels = tuple(dict.fromkeys(line.label for line in lines))
     with ExitStack() as stack:
         output = _output(stack, name, header, labels, options, request.output)

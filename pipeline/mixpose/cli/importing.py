@@ -49,4 +49,8 @@ def _written(imported: Imported, output: Path) -> Session:
         return session
     with output.open("x", encoding="utf-8", newline="\n") as stream:
         stream.write(session_text(imported, output))
-    return load_session(output)
+    try:
+        return load_session(output)
+    except SessionError:
+        output.unlink()  # so that the next try is not refused for it
+        raise

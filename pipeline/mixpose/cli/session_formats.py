@@ -20,7 +20,7 @@ from mixpose.errors import SessionError
 from mixpose.frames import Source
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, rate_of, write_c3d, write_trc
+from mixpose.poses.trajectories import Trajectories, numbers_of, rate_of, write_c3d, write_trc
 from mixpose.rigid import transform
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
@@ -83,11 +83,14 @@ def trajectories_of(
     bodies = _bodies(poses, lines, session)
     names = [(label, name) for label, body in bodies.items() for name in body.labels]
     columns = {pair: k for k, pair in enumerate(names)}
-    frames = [line.frame for line in poses.poses]
-    first, count = min(frames), max(frames) - min(frames) + 1
+    numbers = numbers_of(poses.poses)
+    first, last = min(numbers.values()), max(numbers.values())
+    if any(number != own for own, number in numbers.items()):
+        warn(f"{poses.path}: frames are numbered by stamps; in the file they count from {first}")
+    count = last - first + 1
     if count * len(names) > MOST_PLACES:
         raise SessionError(
-            f"{poses.path}: {len(names)} markers in frames {first} to {max(frames)}, allowed are "
+            f"{poses.path}: {len(names)} markers in frames {first} to {last}, allowed are "
             f"{MOST_PLACES} places; convert one object with --object, or run a part"
         )
     shape = count, len(names)
@@ -97,7 +100,7 @@ def trajectories_of(
     for line in lines:
         if line.T_world_object is None:
             continue
-        row, body = line.frame - first, bodies[line.label]
+        row, body = numbers[line.frame] - first, bodies[line.label]
         own = [columns[line.label, name] for name in body.labels]
         if not measured:
             places[row, own] = transform(line.T_world_object, body.means)
@@ -120,7 +123,7 @@ def trajectories_of(
         residuals,
         by_sensor,
         first,
-        fps or _rate(poses),
+        fps or _rate(poses, numbers),
         session.unit,
     )
 
@@ -139,9 +142,9 @@ def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Map
     return {label: body for label, body in known.items() if label in wanted}
 
 
-def _rate(poses: PoseFile) -> float:
+def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
     """Frames per second by the times of the poses; 1 where they have none."""
-    found = rate_of(poses.poses)
+    found = rate_of(poses.poses, numbers)
     if found is None:
         warn(f"{poses.path}: has no times; the rate is told as 1 frame a second; --fps says more")
         return 1.0

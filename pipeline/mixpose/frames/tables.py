@@ -23,7 +23,16 @@ from mixpose.frames.source import (
     numbers_text,
     selection,
 )
-from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, require_times, whole
+from mixpose.frames.times import (
+    Clock,
+    FrameTimes,
+    csv_rows,
+    finite,
+    header,
+    plain,
+    require_times,
+    whole,
+)
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -139,7 +148,7 @@ class DetectionTable(Source):
                 f"in frame {number}, as many are allowed; leave out what cannot be a feature"
             )
         try:
-            values = np.array([[float(cell) for cell in cells] for _, _, cells in group])
+            values = np.array([[float(plain(cell)) for cell in cells] for _, _, cells in group])
         except ValueError:
             self._complain(group)
         if not np.isfinite(values).all():

@@ -143,10 +143,17 @@ def header(cells: list[str]) -> tuple[str, ...]:
     return tuple(cell.strip().casefold() for cell in cells)
 
 
+def plain(cell: str) -> str:
+    """A cell that is to be a number; ValueError if it has what only Python takes for digits."""
+    if "_" in cell:
+        raise ValueError
+    return cell
+
+
 def finite(cell: str, path: Path, line: int, column: str) -> float:
     """Read a cell as a finite number, else raise RecordingError."""
     try:
-        value = float(cell)
+        value = float(plain(cell))
     except ValueError:
         _complain(cell, path, line, column, "a number")
     if not math.isfinite(value):
@@ -157,7 +164,7 @@ def finite(cell: str, path: Path, line: int, column: str) -> float:
 def whole(cell: str, path: Path, line: int, column: str) -> int:
     """Read a cell as a whole number (``12`` or ``12.0``), else raise RecordingError."""
     try:
-        value = int(cell)
+        value = int(plain(cell))
     except ValueError:
         number = finite(cell, path, line, column)
         value = int(number)

@@ -191,13 +191,25 @@ def _objects(imported: Imported, output: Path) -> list[str]:
             f'[object]\nname = "example"\npoints = {points}'
         ]
     heading = "[object]" if len(imported.bodies) == 1 else "[[object]]"
-    stems = [path.stem for path in imported.bodies]
     texts = []
-    for k, path in enumerate(imported.bodies):
-        name = stems[k] if stems.count(stems[k]) == 1 else f"{stems[k]}_{k + 1}"
+    for path, name in zip(imported.bodies, _names(imported.bodies), strict=True):
         file = json.dumps(_relative(path, output), ensure_ascii=False)
         texts.append(f"{heading}\nname = {json.dumps(name, ensure_ascii=False)}\nfile = {file}")
     return texts
+
+
+def _names(bodies: Sequence[Path]) -> list[str]:
+    """Names of bodies, all different: those of their files, with numbers where files share one."""
+    stems = [path.stem for path in bodies]
+    taken = {stem for stem in stems if stems.count(stem) == 1}
+    names = []
+    for number, stem in enumerate(stems, 1):
+        name = stem
+        while stems.count(stem) > 1 and (name == stem or name in taken):
+            name, number = f"{stem}_{number}", number + 1  # noqa: PLW2901
+        taken.add(name)
+        names.append(name)
+    return names
 
 
 def _relative(path: Path, output: Path) -> str:

@@ -41,7 +41,8 @@ class BopWriter(PoseWriter):
     R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
     camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
     the estimate took in seconds, as BOP has it, or -1 where that was not measured. BOP numbers its
-    objects: the first name that occurs is `obj_id`, the next one more.
+    objects: the first one of the header is `obj_id`, the next one more; names that it does not have
+    follow as they occur.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class BopWriter(PoseWriter):
         self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
         self._scene_id = scene_id
         self._first_obj_id = obj_id
-        self._obj_ids: dict[str, int] = {}
+        self._obj_ids = {name: obj_id + k for k, name in enumerate(header.objects)}
         self._stream.write(BOP_COLUMNS + "\n")
         self._stream.flush()
 

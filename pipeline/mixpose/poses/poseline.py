@@ -119,15 +119,17 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             name: MeasuredPoint(np.array(point.at), point.residual)
             for name, point in pose.points.items()
         },
-        "tip_object": _in_object(T, told.pop("tip")),
+        "tip_object": _in_object(T, told.pop("tip"), has_tip="tip" in values),
         "doubt": told.pop("why"),
     }
     return PoseLine(**told)
 
 
-def _in_object(T: Floats | None, tip: list[float] | None) -> Floats | None:
-    """The tip in the coordinates of the body, (3,)."""
-    return None if T is None or tip is None else np.asarray(T[:3, :3].T @ (tip - T[:3, 3]))
+def _in_object(T: Floats | None, tip: list[float] | None, *, has_tip: bool) -> Floats | None:
+    """The tip in the coordinates of the body, (3,); NaN of one that a lost line does not place."""
+    if T is None:
+        return np.full(3, np.nan) if has_tip else None
+    return None if tip is None else np.asarray(T[:3, :3].T @ (tip - T[:3, 3]))
 
 
 def _report(sensor: _Sensor) -> SensorReport:

@@ -65,12 +65,12 @@ def pose_message(
     """
     T, per_metre = estimate.T_world_object, UNITS_PER_METRE[unit]
     assert T is not None, "lost frames have no message"
-    second, nanosecond = divmod(round(1e9 * seconds), 10**9)
-    if abs(second) > _LARGEST_SECOND:
+    if abs(seconds) > _LARGEST_SECOND:
         raise RecordingError(
-            f"frame {estimate.frame}: time {second} s is beyond what format 'ros' can say, "
+            f"frame {estimate.frame}: time {seconds:.15g} s is beyond what format 'ros' can say, "
             f"{_LARGEST_SECOND} s; give the sensors times in seconds"
         )
+    second, nanosecond = divmod(round(1e9 * seconds), 10**9)
     return {
         "header": {"stamp": {"sec": second, "nanosec": nanosecond}, "frame_id": frame_id},
         "pose": {

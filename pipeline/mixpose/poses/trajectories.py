@@ -7,11 +7,14 @@ C3D: in binary, as most programs for movement read them (c3d.org); needs the pac
 
 from __future__ import annotations
 
+import math
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
+from statistics import median_low
 from typing import TextIO
 
 import numpy as np
@@ -27,6 +30,8 @@ TRC_MARK = "by mixpose"
 LAST_FRAME = 2**16 - 2
 """Frames are numbered from 1, in 16 bits; some readers count one beyond the last."""
 
+_STAMPED = 1000  # from frame to frame, as a rule: these are stamps, in us or ns
+_FARTHEST = 10**15  # frames that a gap counts as, more than fit in any file
 _SENSORS = 7  # that a bit each says of whether they measured a point
 _STEPS = 127  # of a residual, which is a signed byte for some readers
 _SCALE_AT = 12  # byte of the header where the scale stands
@@ -56,26 +61,52 @@ class Trajectories:
         return np.asarray(np.isfinite(self.residuals))
 
 
-def rate_of(lines: Sequence[PoseLine]) -> tuple[float, float] | None:
+def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
+    """Numbers that frames of pose lines have in such a file, by their own.
+
+    The same, but where frames are numbered by stamps: these count from 0, at the usual step of
+    their times, or of the stamps where there are none. Gaps stay gaps.
+    """
+    stamps = sorted({line.frame for line in lines})
+    steps = [after - before for before, after in pairwise(stamps)]
+    if not steps or median_low(steps) < _STAMPED:
+        return {number: number for number in stamps}
+    times = {line.frame: line.time_s for line in lines}
+    seconds = [time for number in stamps if (time := times[number]) is not None]
+    elapsed = [after - before for before, after in pairwise(seconds)]
+    if len(seconds) == len(stamps) and min(elapsed) > 0 and math.isfinite(sum(elapsed)):
+        usual = median_low(elapsed)
+        passed = [round(min(each / usual, float(_FARTHEST))) for each in elapsed]
+    else:
+        step = median_low(steps)
+        passed = [(2 * each + step) // (2 * step) for each in steps]
+    return dict(zip(stamps, accumulate((max(each, 1) for each in passed), initial=0), strict=True))
+
+
+def rate_of(
+    lines: Sequence[PoseLine], numbers: Mapping[int, int] | None = None
+) -> tuple[float, float] | None:
     """Frames per second by the times of pose lines, and how far off the times are, in frames.
 
-    None where lines have no times, or all are of one frame. Raises RecordingError if times do not
-    ascend with the frames.
+    `numbers` are those of `numbers_of`; else frames are as lines have them. None where lines have
+    no times, or all are of one frame. Raises RecordingError if times do not ascend with the frames.
     """
     times = {line.frame: line.time_s for line in lines if line.time_s is not None}
     if len(times) < 2:
         return None
-    frames = np.array(sorted(times), dtype=np.float64)
-    seconds = np.array([times[int(frame)] for frame in frames])
+    known = sorted(times)
+    places = [number if numbers is None else numbers[number] for number in known]
+    frames = np.array([place - places[0] for place in places], dtype=np.float64)
+    seconds = np.array([times[number] for number in known])
     if (np.diff(seconds) <= 0).any():
         k = int(np.argmax(np.diff(seconds) <= 0))
         raise RecordingError(
-            f"frame {frames[k + 1]:.0f} is at {seconds[k + 1]:g} s and the one before it at "
+            f"frame {known[k + 1]} is at {seconds[k + 1]:g} s and the one before it at "
             f"{seconds[k]:g} s; times that ascend are needed: say how many frames a second with "
             "--fps"
         )
-    rate = (frames[-1] - frames[0]) / (seconds[-1] - seconds[0])
-    off = np.abs((seconds - seconds[0]) * rate - (frames - frames[0])).max()
+    rate = frames[-1] / (seconds[-1] - seconds[0])
+    off = np.abs((seconds - seconds[0]) * rate - frames).max()
     return float(rate), float(off)
 
 
@@ -87,7 +118,7 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space
-    names = [re.sub(r"\s", "_", name) for name in trajectories.names]
+    names = _without_blanks(trajectories.names)
     rate, first = repr(trajectories.rate), trajectories.first
     axes = [f"{axis}{k + 1}" for k in range(markers) for axis in "XYZ"]
     keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
@@ -108,6 +139,20 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
         time = (first + k) / trajectories.rate
         stream.write("\t".join([str(first + k), f"{time:.9g}", *cells]) + "\n")
     stream.flush()
+
+
+def _without_blanks(names: Sequence[str]) -> list[str]:
+    """Names without white space, all different as those given."""
+    taken = {name for name in names if not re.search(r"\s", name)}
+    found = []
+    for name in names:
+        own = base = re.sub(r"\s", "_", name)
+        number = 2
+        while own != name and own in taken:
+            own, number = f"{base}_{number}", number + 1
+        taken.add(own)
+        found.append(own)
+    return found
 
 
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:

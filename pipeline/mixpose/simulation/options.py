@@ -11,19 +11,41 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mixpose.errors import SessionError
+from mixpose.limits import MOST_DETECTIONS
 
 DEFAULT_FPS = 25.0
 
 Rule: TypeAlias = tuple[Callable[[float], bool], str]
 
-_NOT_NEGATIVE: Rule = (lambda value: value >= 0, "a number of at least 0")
-_POSITIVE: Rule = (lambda value: value > 0, "a number greater than 0")
+# squares of larger numbers, and quotients of smaller ones, cannot be reckoned with
+_LARGEST, _SMALLEST = 1e12, 1e-12
+_MOST_COMPANIONS = 1000
+
+_NOT_NEGATIVE: Rule = (
+    lambda value: 0 <= value <= _LARGEST,
+    f"a number of at least 0, at most {_LARGEST:g}",
+)
+_POSITIVE: Rule = (
+    lambda value: _SMALLEST <= value <= _LARGEST,
+    f"a number greater than 0, from {_SMALLEST:g} to {_LARGEST:g}",
+)
 _PROBABILITY: Rule = (lambda value: 0 <= value <= 1, "a probability from 0 to 1")
 _COUNT: Rule = (lambda value: value >= 0 and value == int(value), "a whole number from 0")
+_FEW: Rule = (
+    lambda value: 0 <= value <= _MOST_COMPANIONS and value == int(value),
+    f"a whole number from 0 to {_MOST_COMPANIONS}",
+)
+_FALSE: Rule = (
+    lambda value: 0 <= value <= MOST_DETECTIONS,
+    f"a number from 0 to {MOST_DETECTIONS}",
+)
 _FRAMES: Rule = (lambda value: value >= 1 and value == int(value), "a whole number from 1")
-_SIGMA: Rule = (lambda value: value >= 0.1, "a number of at least 0.1 px")
+_SIGMA: Rule = (lambda value: 0.1 <= value <= 1e4, "a number of at least 0.1 px, at most 1e4 px")
 _QUALITY: Rule = (lambda value: 1 <= value <= 100, "a quality from 1 to 100")
-_ANY: Rule = (lambda value: True, "a number")
+_ANY: Rule = (
+    lambda value: abs(value) <= _LARGEST,
+    f"a number from {-_LARGEST:g} to {_LARGEST:g}",
+)
 
 
 def _option(default: Any, rule: Rule) -> Any:
@@ -51,7 +73,7 @@ class SimulationOptions:
     # standard deviation from feature to feature, as a share
     brightness_spread: float = _option(0.1, _NOT_NEGATIVE)
     # false features per frame and sensor: the whole part always, the rest by chance
-    clutter: float = _option(0.0, _NOT_NEGATIVE)
+    clutter: float = _option(0.0, _FALSE)
     hidden: float = _option(0.0, _PROBABILITY)  # that a feature is, in each view anew
     # features hidden in each view for certain, chosen by chance
     hidden_count: int = _option(0, _COUNT)
@@ -88,9 +110,9 @@ class SimulationOptions:
     # seconds by which sensors differ that have tables of times, as these say: the last is this much
     # later than the first
     out_of_step: float = _option(0.0, _NOT_NEGATIVE)
-    lamps: int = _option(0, _COUNT)  # behind the body
-    others: int = _option(0, _COUNT)  # bodies with as many markers
-    occluder: int = _option(0, _COUNT)  # dark bars that swing before it
+    lamps: int = _option(0, _FEW)  # behind the body
+    others: int = _option(0, _FEW)  # bodies with as many markers
+    occluder: int = _option(0, _FEW)  # dark bars that swing before it
     # brightness of mirror images in a table below the body, as a share; 0 without one
     mirror: float = _option(0.0, _PROBABILITY)
     jpeg: int | None = _option(None, _QUALITY)  # of the compression that images went through

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mixpose.constants import constant
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.trajectories.motion import ORDERS, foretold, updated
 from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, smooth_track, white_part
 
@@ -50,12 +50,17 @@ class SmoothingRules:
     sure: float = constant(0.999, "probability of a hypothesis from which its frame is ok")
 
 
-def fitted_model(track: Track, rules: SmoothingRules, motion: str | None = None) -> MotionModel:
+def fitted_model(
+    track: Track, longest: float, rules: SmoothingRules, motion: str | None = None
+) -> MotionModel | None:
     """The model of which a track is likeliest, among all `ORDERS` where no motion is asked for.
 
-    Times without a pose are left out.
+    Times without a pose are left out. What a body did between poses that are more than `longest`
+    apart tells nothing. None where all parts between such gaps are too short.
     """
-    blocks = _blocks(track, rules)
+    blocks = _blocks(track, longest, rules)
+    if not blocks:
+        return None
     x, best = np.zeros(3), (-np.inf, 0, np.zeros(3))
     for name, order in ORDERS.items():
         x[2] = 0.0
@@ -95,14 +100,25 @@ def local_scales(track: Track, model: MotionModel, rules: SmoothingRules) -> Flo
     return scales
 
 
-def _blocks(track: Track, rules: SmoothingRules) -> list[Track]:
-    """Parts of a track, evenly over it, that tell how the body moves."""
-    track = track.part(track.measured)
+def _blocks(track: Track, longest: float, rules: SmoothingRules) -> list[Track]:
+    """Parts of a track, evenly over it and without a long gap, that tell how the body moves."""
+    parts = _without_gaps(track.part(track.measured), longest, rules)
+    places = np.concatenate([np.zeros(0, int), *parts])
+    track = track.part(track.measured).part(places)
     if len(track) <= rules.frames:
-        return [track]
-    count = rules.frames // rules.block
-    starts = np.linspace(0, len(track) - rules.block, count).astype(int)
-    return [track.part(slice(k, k + rules.block)) for k in starts.tolist()]
+        chosen = [track] if parts else []
+    else:
+        count = rules.frames // rules.block
+        starts = np.linspace(0, len(track) - rules.block, count).astype(int)
+        chosen = [track.part(slice(k, k + rules.block)) for k in starts.tolist()]
+    return [one.part(own) for one in chosen for own in _without_gaps(one, longest, rules)]
+
+
+def _without_gaps(track: Track, longest: float, rules: SmoothingRules) -> list[Indices]:
+    """Places in a track between its long gaps, where they are enough to tell a motion."""
+    cuts = np.flatnonzero(np.diff(track.times) > longest) + 1
+    parts = np.split(np.arange(len(track)), cuts)
+    return [part for part in parts if len(part) >= rules.fewest]
 
 
 def _intensities(track: Track, order: int, x: Floats) -> Floats:

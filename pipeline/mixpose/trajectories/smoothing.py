@@ -8,7 +8,8 @@ smaller: it stays in the covariance as it was.  Where they scatter more, covaria
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -86,12 +87,13 @@ def smooth_body(
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
-        whole = tuple(ordered)
-        return SmoothedBody(whole, None, 0, 0, 0, (), times is not None)
-    model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
-    found: dict[int, Estimate] = {}
-    for segment in _segments(ordered, at, posed, fill_s, rules):
-        found.update(_smoothed(segment, model, rules))
+        return SmoothedBody(tuple(ordered), None, 0, 0, 0, (), times is not None)
+    longest = rules.restarts * float(np.median(np.diff(at[posed])))
+    with _possible(lines[0].label) as found:
+        model = fitted_model(_track([ordered[k] for k in told], at[told]), longest, rules, motion)
+        for segment in _segments(ordered, at, posed, max(longest, fill_s), fill_s):
+            if model is not None:
+                found.update(_smoothed(segment, model, rules))
     met = [ordered[k] for k in posed if ordered[k].frame in found]
     changed = [line for line in met if found[line.frame].status != line.status]
     refused = tuple(line.frame for line in changed if line.status == "ok")
@@ -105,6 +107,31 @@ def smooth_body(
         refused=refused,
         timed=times is not None,
     )
+
+
+@contextmanager
+def _possible(label: str) -> Iterator[dict[int, Estimate]]:
+    """Estimates by frame, to be worked out within.
+
+    Raises RecordingError in one line where numbers of the recording are too large or too small.
+    """
+    found: dict[int, Estimate] = {}
+    try:
+        with np.errstate(all="ignore"):
+            yield found
+        is_possible = all(
+            np.isfinite(values).all()
+            for one in found.values()
+            for values in (one.T_world_object, one.covariance)
+            if values is not None
+        )
+    except (np.linalg.LinAlgError, OverflowError, ZeroDivisionError):
+        is_possible = False
+    if not is_possible:
+        raise RecordingError(
+            f"poses of {label!r} cannot be smoothed: covariances or times are too large or too "
+            "small beside each other; allowed: poses as mixpose run writes them"
+        )
 
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
@@ -139,24 +166,24 @@ def _segments(
     lines: Sequence[PoseLine],
     times: Floats,
     posed: Sequence[int],
+    longest: float,
     fill_s: float,
-    rules: SmoothingRules,
 ) -> list[_Segment]:
-    """Lines with poses, cut at long gaps, with the frames between that are to be filled."""
-    at = times[posed]
-    usual, step = np.median(np.diff(at)), int(np.median(np.diff([lines[k].frame for k in posed])))
-    cuts = np.flatnonzero(np.diff(at) > max(rules.restarts * usual, fill_s)) + 1
+    """Lines with poses, cut at the longest gaps, with the frames between that are to be filled."""
+    step = int(np.median(np.diff([lines[k].frame for k in posed])))
+    cuts = np.flatnonzero(np.diff(times[posed]) > longest) + 1
     segments = []
     for part in np.split(np.array(posed), cuts):
         own: list[PoseLine | None] = []
         known: list[PoseLine] = []  # the one before in place of those that are not there
         frames: list[int] = []
         moments: list[float] = []
-        for k in part.tolist():
+        for last, k in pairwise([part[0], *part.tolist()]):
             line = lines[k]
             if frames and times[k] - moments[-1] <= fill_s:
-                between = range(frames[-1] + step, line.frame, max(step, 1))
-                share = (np.array(between, float) - frames[-1]) / (line.frame - frames[-1])
+                lost = [lines[i].frame for i in range(last + 1, k)]
+                between = _between(frames[-1], line.frame, step, lost)
+                share = np.array([(n - frames[-1]) / (line.frame - frames[-1]) for n in between])
                 own += [None] * len(between)
                 known += [known[-1]] * len(between)
                 moments += (moments[-1] + share * (times[k] - moments[-1])).tolist()
@@ -169,6 +196,14 @@ def _segments(
         track = replace(_track(known, np.array(moments)), measured=measured)
         segments.append(_Segment(tuple(own), tuple(frames), track))
     return segments
+
+
+def _between(before: int, after: int, step: int, lost: Sequence[int]) -> list[int]:
+    """Frames between two, evenly at about the usual step; those without a pose are some of them."""
+    span = after - before
+    count = max(round(span / max(step, 1)) - 1, 0)
+    even = [before + span * k // (count + 1) for k in range(1, count + 1)]
+    return sorted([*lost, *(n for n in even if all(2 * abs(n - one) >= step for one in lost))])
 
 
 def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Estimate]:
@@ -311,5 +346,6 @@ def _filled(
         score=0.0,
         sensors={},
         instance=like.instance,
+        tip_object=like.tip_object,
         filled=True,
     )

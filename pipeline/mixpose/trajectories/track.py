@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose import rigid
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Indices, Mask
 from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
 
 _DIFFUSE = 10.0  # times the motion from frame to frame: nothing is known of rates at first
@@ -28,7 +28,7 @@ class Track:
     def __len__(self) -> int:
         return len(self.times)
 
-    def part(self, some: slice | Mask) -> Track:
+    def part(self, some: slice | Mask | Indices) -> Track:
         """A part of the track."""
         poses, covariances = self.poses[some], self.covariances[some]
         return Track(self.times[some], poses, covariances, self.measured[some], self.free)

@@ -1,0 +1,111 @@
+"""Poses smoothed where recordings pause, and where their numbers are out of the ordinary."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pose_lines import covariance_of, lines_of, measured, rms_errors, swinging
+
+from mixpose.errors import RecordingError
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Estimate, Floats
+from mixpose.trajectories.intensity import SmoothingRules
+from mixpose.trajectories.smoothing import smooth_body
+
+QUICK = SmoothingRules(frames=40, block=40)  # enough to tell how the bodies of these tests move
+
+
+def poses_of(estimates: tuple[Estimate, ...]) -> Floats:
+    return np.stack([one.T_world_object for one in estimates if one.T_world_object is not None])
+
+
+def at_times(lines: list[PoseLine], times: Floats) -> list[PoseLine]:
+    return [replace(one, time_s=float(t)) for one, t in zip(lines, times, strict=True)]
+
+
+@pytest.mark.parametrize("pause_s", [60.0, 3600.0, 36000.0, 1e9])
+def test_a_pause_of_the_recording_does_not_tell_how_the_body_moves(pause_s: float) -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    poses = measured(truth, covariance)
+    lines, times = lines_of(poses, covariance), 0.04 * np.arange(40)
+    whole = smooth_body(lines, rules=QUICK)
+    parted = smooth_body(at_times(lines, times + pause_s * (np.arange(40) >= 20)), rules=QUICK)
+    assert whole.model is not None
+    assert parted.model is not None
+    assert parted.smoothed == 40
+    # each side alone has two ends more, where a pose is told by one side only
+    for kind in (0, 1):
+        error = rms_errors(truth, poses_of(parted.estimates))[kind]
+        assert error < 1.3 * rms_errors(truth, poses_of(whole.estimates))[kind]
+
+
+def test_parts_that_are_all_too_short_to_tell_a_motion_stay_as_they_were() -> None:
+    truth, covariance = swinging(20), covariance_of(0.1, 0.001)
+    k = np.arange(20, dtype=np.float64)
+    times = 0.04 * k + 60.0 * (k // 5)
+    lines = at_times(lines_of(truth, covariance), times)
+    found = smooth_body(lines, rules=QUICK)
+    assert found.model is None
+    assert found.smoothed == 0
+    np.testing.assert_array_equal(poses_of(found.estimates), truth)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+@pytest.mark.parametrize("which", ["covariances", "times"])
+def test_numbers_that_are_out_of_all_proportion_are_refused(scale: float, which: str) -> None:
+    truth, covariance = swinging(20), covariance_of(0.1, 0.001)
+    lines = lines_of(measured(truth, covariance), covariance)
+    if which == "times":
+        lines = at_times(lines, np.array([0.04 * scale * k for k in range(20)]))
+    else:
+        lines = [replace(one, covariance=scale * np.eye(6)) for one in lines]
+    with pytest.raises(RecordingError, match="'tool' cannot be smoothed: covariances or times"):
+        smooth_body(lines, rules=QUICK)
+
+
+def stamped(lines: list[PoseLine], jitter_ns: int) -> list[PoseLine]:
+    """Lines numbered by stamps in nanoseconds, 25 a second, off the even rate by chance."""
+    off = np.random.default_rng(1).integers(-jitter_ns, jitter_ns + 1, len(lines)).tolist()
+    stamps = [10**18 + 40_000_000 * k + off[k] for k in range(len(lines))]
+    return [
+        replace(one, frame=n, time_s=(n - 10**18) * 1e-9)
+        for one, n in zip(lines, stamps, strict=True)
+    ]
+
+
+def test_stamps_that_jitter_leave_no_gap_to_fill() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    lines = stamped(lines_of(measured(truth, covariance), covariance), 20_000)
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    assert found.filled == 0
+    assert [one.frame for one in found.estimates] == [one.frame for one in lines]
+
+
+def test_gaps_among_stamps_are_filled_evenly_and_lost_frames_keep_their_stamps() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    lines = stamped(lines_of(measured(truth, covariance), covariance), 20_000)
+    lines[10] = replace(lines[10], status="lost", T_world_object=None, covariance=None)
+    lost, before, after = lines[10], lines[20], lines[24]
+    del lines[21:24]
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    marked = [one for one in found.estimates if one.filled]
+    assert len(found.estimates) == 40
+    span = after.frame - before.frame
+    evenly = [before.frame + span * k // 4 for k in (1, 2, 3)]
+    assert [one.frame for one in marked] == [lost.frame, *evenly]
+    assert [one.time_s for one in marked] == pytest.approx([0.4, 0.84, 0.88, 0.92], abs=1e-4)
+
+
+def test_frames_that_are_filled_in_have_the_tip_of_the_body() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    tip = np.array([0.0, 0.0, -100.0])
+    lines = [replace(one, tip_object=tip) for one in lines_of(truth, covariance)]
+    del lines[20:22]
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    for one in found.estimates[20:22]:
+        assert one.filled
+        assert one.tip is not None
+        assert one.tip_covariance is not None
+        assert np.abs(one.tip - (truth[one.frame] @ [*tip, 1.0])[:3]).max() < 2.0
