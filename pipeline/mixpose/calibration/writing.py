@@ -14,6 +14,7 @@ from mixpose.session import Session
 from mixpose.session.rewriting import document_of, plain, put, put_motion, text_of
 
 MARK = "# Calibrated by mixpose"
+_LENS = {"focal", "principal_point", "distortion"}
 
 
 def calibrated_text(session: Session, found: Calibration, target: Path, version: str) -> str:
@@ -39,12 +40,13 @@ def _put_sensor(table: Any, found: Calibration, index: int) -> None:
         there = hasattr(sensor, key)
         return there and not np.array_equal(getattr(sensor, key), getattr(before, key))
 
-    if has_moved("T_sensor_world"):
+    is_lens = hasattr(sensor, "camera_matrix") and bool(_LENS & said.keys())
+    # a file of a calibration also says where its camera stands
+    was_filed = is_lens and table.pop("calibration", None) is not None
+    if was_filed or has_moved("T_sensor_world"):
         put_motion(table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose")))
-    if {"focal", "principal_point", "distortion"} & said.keys() and hasattr(
-        sensor, "camera_matrix"
-    ):
-        if table.pop("calibration", None) is not None and sensor.resolution is not None:
+    if is_lens:
+        if was_filed and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
         lens = [said[k] for k in ("focal", "principal_point") if k in said]
         _put(table, "camera_matrix", sensor.camera_matrix, ", ".join(lens) or None)

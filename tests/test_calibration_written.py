@@ -1,0 +1,75 @@
+"""The calibrated session: all that was found, and all that hangs on it, is in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from calibration_texts import kalibr
+from simulated_rigs import POINTS, alone, cameras, recording, task_of
+
+from mixpose.calibration import Calibration, Rig, calibrate
+from mixpose.calibration.writing import calibrated_text
+from mixpose.session import Session, load_session
+
+FRAMES = 10
+
+
+def written(session: Session, found: Calibration) -> Session:
+    target = session.folder / "calibrated.toml"
+    target.write_text(calibrated_text(session, found, target, "0"), encoding="utf-8")
+    return load_session(target)
+
+
+def rig_of(session: Session) -> Rig:
+    setups = session.sensors
+    return Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
+
+
+def calibrated(session: Session, rig: Rig | None = None, **options: Any) -> Calibration:
+    """From a recording by the session's own sensors."""
+    sensors: Any = [one.sensor for one in session.sensors]
+    frames = recording(sensors, FRAMES, 0.01)
+    task = replace(task_of(sensors, frames, **options), rig=rig or rig_of(session))
+    return calibrate(task, found=alone(sensors, frames))
+
+
+def text_of(objects: str = "[object]", head: str = "") -> str:
+    text = f'unit = "mm"\n{head}\n{objects}\nname = "six"\npoints = {POINTS.tolist()}\n'
+    for name, camera in zip(("left", "right"), cameras(2), strict=True):
+        text += (
+            f'\n[[sensor]]\nname = "{name}"\nmodel = "pinhole"\nsource = "{name}.csv"\nfps = 30\n'
+            f"camera_matrix = {camera.camera_matrix.tolist()}\nresolution = [640, 512]\n"
+            f"T_sensor_world = {camera.T_sensor_world.tolist()}\n"
+        )
+    return text
+
+
+def session_in(folder: Path, text: str) -> Session:
+    path = folder / "session.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_session(path)
+
+
+def test_a_camera_that_a_calibration_file_places_stays_there_when_its_lens_is_sought(
+    tmp_path: Path,
+) -> None:
+    # what is written hangs on what is sought, not on where it is found
+    lenses = {0: ("focal",), 1: ("focal",)}
+    found = calibrated(session_in(tmp_path, text_of()), free=lenses)
+    (tmp_path / "camchain.yaml").write_text(kalibr(), encoding="utf-8")
+    text = text_of().partition("[[sensor]]")[0]
+    for camera in ("cam1", "cam0"):
+        text += (
+            f'[[sensor]]\nname = "{camera}"\nmodel = "pinhole"\nsource = "{camera}.csv"\n'
+            f'calibration = {{ file = "camchain.yaml", camera = "{camera}" }}\n'
+        )
+    session = session_in(tmp_path, text)
+    rig = rig_of(session)
+    new = written(session, replace(found, before=rig, after=rig))
+    for one, other in zip(session.sensors, new.sensors, strict=True):
+        old: Any = one.sensor
+        np.testing.assert_allclose(other.sensor.T_sensor_world, old.T_sensor_world, atol=1e-6)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(other.sensor.camera_matrix, old.camera_matrix, atol=1e-6)  # type: ignore[attr-defined]
