@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from calibration_texts import kalibr
 from simulated_rigs import POINTS, alone, cameras, recording, task_of
 
 from mixpose.calibration import Calibration, Rig, calibrate
+from mixpose.calibration.rig import centre_of
+from mixpose.calibration.words import in_length
 from mixpose.calibration.writing import calibrated_text
 from mixpose.session import Session, load_session
 
@@ -28,11 +31,11 @@ def rig_of(session: Session) -> Rig:
     return Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
 
 
-def calibrated(session: Session, rig: Rig | None = None, **options: Any) -> Calibration:
+def calibrated(session: Session, **options: Any) -> Calibration:
     """From a recording by the session's own sensors."""
     sensors: Any = [one.sensor for one in session.sensors]
     frames = recording(sensors, FRAMES, 0.01)
-    task = replace(task_of(sensors, frames, **options), rig=rig or rig_of(session))
+    task = replace(task_of(sensors, frames, **options), rig=rig_of(session), body=session.body)
     return calibrate(task, found=alone(sensors, frames))
 
 
@@ -73,3 +76,29 @@ def test_a_camera_that_a_calibration_file_places_stays_there_when_its_lens_is_so
         old: Any = one.sensor
         np.testing.assert_allclose(other.sensor.T_sensor_world, old.T_sensor_world, atol=1e-6)  # type: ignore[attr-defined]
         np.testing.assert_allclose(other.sensor.camera_matrix, old.camera_matrix, atol=1e-6)  # type: ignore[attr-defined]
+
+
+def test_a_known_length_scales_all_that_is_written(tmp_path: Path) -> None:
+    start = "[start]\nrotation_vector = [0, 0, 0.1]\ntranslation = [1, 2, 3]\ndistance = 30\n"
+    tool = '[object]\ntip = [0, 0, -150]\nshape = "sphere"\nradius = 4\n'
+    gravity = "gravity = { direction = [0, 0, -1], sigma = 0.5 }"
+    session = session_in(tmp_path, text_of(tool + gravity) + start)
+    a, b = (centre_of(one.sensor) for one in session.sensors)
+    found = calibrated(session, free={})
+    new = written(session, in_length(found, f"left:right={2 * np.linalg.norm(b - a)}"))
+    for one, other in zip(session.sensors, new.sensors, strict=True):
+        # the camera that stays as well
+        np.testing.assert_allclose(centre_of(other.sensor), 2 * centre_of(one.sensor), atol=1e-5)
+    body, start_of = new.body, new.start
+    np.testing.assert_allclose(body.means, 2 * POINTS, atol=1e-6)
+    assert body.radii == pytest.approx([8.0] * len(POINTS))
+    assert body.tip == pytest.approx([0, 0, -300])
+    assert body.gravity is not None
+    assert body.gravity.sigma == pytest.approx(1.0)
+    assert start_of is not None
+    assert session.start is not None
+    assert start_of.distance == pytest.approx(60)
+    np.testing.assert_allclose(start_of.T_world_object[:3, 3], [2, 4, 6])
+    np.testing.assert_allclose(
+        start_of.T_world_object[:3, :3], session.start.T_world_object[:3, :3], atol=1e-12
+    )

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from mixpose.body import Body
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block
 from mixpose.records import Floats
 from mixpose.session import Session
-from mixpose.session.rewriting import document_of, plain, put, put_motion, text_of
+from mixpose.session.rewriting import document_of, plain, put, put_motion, put_starts, text_of
 
 MARK = "# Calibrated by mixpose"
 _LENS = {"focal", "principal_point", "distortion"}
@@ -24,15 +25,18 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     """
     document = document_of(session, target)
     for index, table in enumerate(document["sensor"]):
-        _put_sensor(table, found, index)
-    if any(block.kind == "body" for block in found.blocks):
-        _put_body(document["object"], found, session)
+        _put_sensor(table, found, session, index)
+    scale = found.after.scale
+    if scale != 1 or any(block.kind == "body" for block in found.blocks):
+        _put_body(document["object"], session.body, found.after.points, scale)
+    if scale != 1:
+        put_starts(document, session, np.eye(4), scale)
     origin = f"{session.path.name}, {len(found.used)} frames"
     return f"{MARK} {version} from {origin}.\n{text_of(document)}"
 
 
-def _put_sensor(table: Any, found: Calibration, index: int) -> None:
-    before: Any = found.before.sensors[index]
+def _put_sensor(table: Any, found: Calibration, session: Session, index: int) -> None:
+    before: Any = session.sensors[index].sensor
     sensor: Any = found.after.sensors[index]
     said = {block.kind: _said(found, block) for block in found.blocks if block.sensor == index}
 
@@ -80,11 +84,18 @@ def _said(found: Calibration, block: Block) -> str:
     return ", ".join(parts)
 
 
-def _put_body(table: Any, found: Calibration, session: Session) -> None:
-    """Features as points, which replace a file of them."""
-    if table.pop("file", None) is not None:
-        if session.body.normals is not None:
-            table["normals"] = plain(session.body.normals)
-        if session.body.covariances.any():
-            table["sigma"] = [plain(covariance) for covariance in session.body.covariances]
-    table["points"] = plain(found.after.points)
+def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
+    """Features as points, which replace a file of them; other lengths of the body are scaled."""
+    had_file = table.pop("file", None) is not None
+    if had_file and body.normals is not None:
+        table["normals"] = plain(body.normals)
+    if (had_file or scale != 1) and body.covariances.any():
+        table["sigma"] = [plain(scale**2 * covariance) for covariance in body.covariances]
+    table["points"] = plain(points)
+    if scale == 1:
+        return
+    for key in ("radius", "tip"):
+        if key in table:
+            put(table, key, plain(scale * np.array(table[key], float)))
+    if body.gravity is not None:
+        put(table["gravity"], "sigma", plain(scale * body.gravity.sigma))

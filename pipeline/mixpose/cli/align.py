@@ -21,11 +21,19 @@ from mixpose.records import Estimate, Floats
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.session import Session, load_session
-from mixpose.session.rewriting import document_of, objects_of, plain, put, put_motion, text_of
+from mixpose.session.rewriting import (
+    ALL_DIGITS,
+    document_of,
+    objects_of,
+    plain,
+    put,
+    put_motion,
+    put_starts,
+    text_of,
+)
 from mixpose.trajectories.floor import Axis, Floor, floor_of
 
 MARK = "# Aligned by mixpose"
-_ALL = 17  # digits: the frame is as exact as float64
 
 
 def align_session(request: AlignRequest) -> None:
@@ -91,17 +99,16 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
         sensor: Any = setup.sensor
         if hasattr(sensor, "position"):
             place = rigid.transform(T_new_old, sensor.position[None])[0]
-            put(table, "position", plain(place, _ALL))
+            put(table, "position", plain(place, ALL_DIGITS))
         else:
-            put_motion(table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=_ALL)
+            put_motion(
+                table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=ALL_DIGITS
+            )
+    put_starts(document, session, T_new_old)
     for table, one in zip(objects_of(document), session.objects, strict=True):
-        start = document if "start" in document else table
-        if one.start is not None and "start" in start:
-            T = T_new_old @ one.start.T_world_object
-            put_motion(start["start"], "T_world_object", T, digits=_ALL)
         if one.body.gravity is not None:
             direction = T_new_old[:3, :3] @ np.array(table["gravity"]["direction"], float)
-            put(table["gravity"], "direction", plain(direction, _ALL))
+            put(table["gravity"], "direction", plain(direction, ALL_DIGITS))
     return f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n{text_of(document)}"
 
 

@@ -13,6 +13,8 @@ import tomlkit
 from mixpose.records import Floats
 from mixpose.session.setup import Session
 
+ALL_DIGITS = 17  # of float64
+
 
 def document_of(session: Session, target: Path) -> Any:
     """The TOML document of a session, with paths as they are from where it will be written."""
@@ -47,8 +49,21 @@ def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits:
     put(table, key, plain(T, digits), said)
 
 
+def put_starts(document: Any, session: Session, T_new_old: Floats, scale: float = 1.0) -> None:
+    """Where bodies are at first, in another frame of a world whose lengths were scaled before."""
+    for table, one in zip(objects_of(document), session.objects, strict=True):
+        home = document if "start" in document else table
+        if one.start is None or "start" not in home:
+            continue
+        T = one.start.T_world_object.copy()
+        T[:3, 3] *= scale
+        put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        if scale != 1 and one.start.distance is not None:
+            put(home["start"], "distance", plain(scale * one.start.distance))
+
+
 def plain(values: Floats | float, digits: int = 10) -> Any:
-    """Nested lists of numbers with so many digits; 17 are all that there are."""
+    """Nested lists of numbers with so many digits."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 0:
         return float(f"{float(array):.{digits}g}") + 0.0
