@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import command, mixpose
+from command_line import assert_one_line, command, mixpose
 
 from mixpose.cli.notices import watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
@@ -82,6 +82,14 @@ def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: P
         (line,) = done.stderr.strip().splitlines()  # no line about what is free and searched
         assert f"--world {word}: allowed: left, right, or the body in a frame" in line
         assert "body@0, body@5, body@10, ..." in line
+
+
+def test_another_world_is_refused_where_directions_of_the_old_one_are_held(tmp_path: Path) -> None:
+    text = (RECORDING / "session.toml").read_text()
+    held = '[estimator]\nfree = ["x", "y", "rz"]\n\n[[sensor]]'
+    (tmp_path / "session.toml").write_text(text.replace("[[sensor]]", held, 1))
+    done = command("calibrate", "session.toml", "-o", "x.toml", "--world", "right", cwd=tmp_path)
+    assert_one_line(done, 2, "estimator.free: found x, y, rz", "where the world becomes another")
 
 
 def test_the_sensor_that_is_held_is_called_so_in_a_check(bumped: Path) -> None:

@@ -13,8 +13,9 @@ from simulated_rigs import POINTS, alone, cameras, recording, task_of
 
 from mixpose.calibration import Calibration, Rig, calibrate
 from mixpose.calibration.rig import centre_of
-from mixpose.calibration.words import in_length
+from mixpose.calibration.words import in_length, in_world
 from mixpose.calibration.writing import calibrated_text
+from mixpose.rigid import inverse
 from mixpose.session import Session, load_session
 
 FRAMES = 10
@@ -102,3 +103,24 @@ def test_a_known_length_scales_all_that_is_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         start_of.T_world_object[:3, :3], session.start.T_world_object[:3, :3], atol=1e-12
     )
+
+
+def test_another_world_moves_the_start_and_gravity_with_the_sensors(tmp_path: Path) -> None:
+    start = "[start]\nrotation_vector = [0, 0, 0.1]\ntranslation = [1, 2, 3]\n"
+    body = "[object]\ngravity = { direction = [0, 0, -1], sigma = 0.5 }"
+    session = session_in(tmp_path, text_of(body) + start)
+    found = in_world(calibrated(session, free={}), "right")
+    new = written(session, found)
+    T_old_new = inverse(cameras(2)[1].T_sensor_world)
+    assert session.start is not None
+    assert new.start is not None
+    np.testing.assert_allclose(
+        T_old_new @ new.start.T_world_object, session.start.T_world_object, atol=1e-9
+    )
+    assert new.body.gravity is not None
+    np.testing.assert_allclose(
+        T_old_new[:3, :3] @ new.body.gravity.direction, [0, 0, -1], atol=1e-9
+    )
+    for one, other in zip(session.sensors, new.sensors, strict=True):
+        T: Any = [each.sensor for each in (one, other)]
+        np.testing.assert_allclose(T[1].T_sensor_world, T[0].T_sensor_world @ T_old_new, atol=1e-6)

@@ -192,6 +192,7 @@ def in_world(found: Calibration, words: str) -> Calibration:
         after=replace(found.after, sensors=moved),
         poses={number: T_new_world @ T for number, T in found.poses.items()},
         gauge=(*found.gauge, f"the world is that of {words}"),
+        T_new_old=T_new_world,
     )
 
 

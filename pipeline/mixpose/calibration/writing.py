@@ -12,7 +12,15 @@ from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block
 from mixpose.records import Floats
 from mixpose.session import Session
-from mixpose.session.rewriting import document_of, plain, put, put_motion, put_starts, text_of
+from mixpose.session.rewriting import (
+    document_of,
+    plain,
+    put,
+    put_gravity,
+    put_motion,
+    put_starts,
+    text_of,
+)
 
 MARK = "# Calibrated by mixpose"
 _LENS = {"focal", "principal_point", "distortion"}
@@ -29,8 +37,11 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     scale = found.after.scale
     if scale != 1 or any(block.kind == "body" for block in found.blocks):
         _put_body(document["object"], session.body, found.after.points, scale)
-    if scale != 1:
-        put_starts(document, session, np.eye(4), scale)
+    T_new_old = found.T_new_old
+    if scale != 1 or T_new_old is not None:
+        put_starts(document, session, np.eye(4) if T_new_old is None else T_new_old, scale)
+    if T_new_old is not None:
+        put_gravity(document, session, T_new_old)
     origin = f"{session.path.name}, {len(found.used)} frames"
     return f"{MARK} {version} from {origin}.\n{text_of(document)}"
 

@@ -24,11 +24,12 @@ from mixpose.session import Session, load_session
 from mixpose.session.rewriting import (
     ALL_DIGITS,
     document_of,
-    objects_of,
     plain,
     put,
+    put_gravity,
     put_motion,
     put_starts,
+    refuse_held,
     text_of,
 )
 from mixpose.trajectories.floor import Axis, Floor, floor_of
@@ -44,11 +45,7 @@ def align_session(request: AlignRequest) -> None:
     """
     path = request.session
     session = load_session(path)
-    if len(session.estimator.free) < len(rigid.TWIST_NAMES):
-        raise SessionError(
-            f"{path}: estimator.free: found {', '.join(session.estimator.free)}, directions of the "
-            "world as it is; allowed: all six, in a session that is aligned"
-        )
+    refuse_held(session)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
     sources = request.source or ()
@@ -105,10 +102,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
                 table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=ALL_DIGITS
             )
     put_starts(document, session, T_new_old)
-    for table, one in zip(objects_of(document), session.objects, strict=True):
-        if one.body.gravity is not None:
-            direction = T_new_old[:3, :3] @ np.array(table["gravity"]["direction"], float)
-            put(table["gravity"], "direction", plain(direction, ALL_DIGITS))
+    put_gravity(document, session, T_new_old)
     return f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n{text_of(document)}"
 
 

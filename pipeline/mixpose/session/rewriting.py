@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from mixpose.errors import SessionError
 from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.session.setup import Session
 
 ALL_DIGITS = 17  # of float64
@@ -60,6 +62,23 @@ def put_starts(document: Any, session: Session, T_new_old: Floats, scale: float 
         put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
         if scale != 1 and one.start.distance is not None:
             put(home["start"], "distance", plain(scale * one.start.distance))
+
+
+def put_gravity(document: Any, session: Session, T_new_old: Floats) -> None:
+    """Where gravity points, in another frame of the world."""
+    for table, one in zip(objects_of(document), session.objects, strict=True):
+        if one.body.gravity is not None:
+            direction = T_new_old[:3, :3] @ one.body.gravity.direction
+            put(table["gravity"], "direction", plain(direction, ALL_DIGITS))
+
+
+def refuse_held(session: Session) -> None:
+    """Raise a SessionError where directions of the world are held, which is to be another one."""
+    if len(session.estimator.free) < len(TWIST_NAMES):
+        raise SessionError(
+            f"{session.path}: estimator.free: found {', '.join(session.estimator.free)}, "
+            "directions of the world as it is; allowed: all six, where the world becomes another"
+        )
 
 
 def plain(values: Floats | float, digits: int = 10) -> Any:
