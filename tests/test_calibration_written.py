@@ -124,3 +124,23 @@ def test_another_world_moves_the_start_and_gravity_with_the_sensors(tmp_path: Pa
     for one, other in zip(session.sensors, new.sensors, strict=True):
         T: Any = [each.sensor for each in (one, other)]
         np.testing.assert_allclose(T[1].T_sensor_world, T[0].T_sensor_world @ T_old_new, atol=1e-6)
+
+
+def test_a_body_in_double_brackets_is_put_where_it_was(tmp_path: Path) -> None:
+    session = session_in(tmp_path, text_of("[[object]]"))
+    found = calibrated(session, body_free=True)
+    new = written(session, found)
+    np.testing.assert_allclose(new.body.means, found.after.points, rtol=1e-8, atol=1e-8)
+    assert (new.body.means != POINTS).any()
+
+
+def test_a_known_length_scales_bodies_that_were_not_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "wand.csv").write_text("name,x,y,z\na,0,0,0\nb,9,0,0\nc,0,7,0\n")
+    segments = [[[0, 0, 5], [50, 0, 5]], [[0, 0, 5], [0, 60, 5]]]
+    others = f'[[object]]\nname = "wand"\nfile = "wand.csv"\nsegments = {segments}\n\n'
+    text = text_of("[[object]]").replace("[[sensor]]", f"{others}[[sensor]]", 1)
+    session = session_in(tmp_path, text)
+    a, b = (centre_of(one.sensor) for one in session.sensors)
+    found = in_length(calibrated(session, free={}), f"left:right={2 * np.linalg.norm(b - a)}")
+    for one, other in zip(session.objects, written(session, found).objects, strict=True):
+        np.testing.assert_allclose(other.body.nodes.points, 2 * one.body.nodes.points, atol=1e-6)

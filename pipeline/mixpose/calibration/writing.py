@@ -14,6 +14,7 @@ from mixpose.records import Floats
 from mixpose.session import Session
 from mixpose.session.rewriting import (
     document_of,
+    objects_of,
     plain,
     put,
     put_gravity,
@@ -35,8 +36,12 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     for index, table in enumerate(document["sensor"]):
         _put_sensor(table, found, session, index)
     scale = found.after.scale
+    first, *others = zip(objects_of(document), session.objects, strict=True)
     if scale != 1 or any(block.kind == "body" for block in found.blocks):
-        _put_body(document["object"], session.body, found.after.points, scale)
+        _put_body(first[0], first[1].body, found.after.points, scale)
+    if scale != 1:
+        for table, one in others:
+            _put_body(table, one.body, scale * one.body.means, scale)
     T_new_old = found.T_new_old
     if scale != 1 or T_new_old is not None:
         put_starts(document, session, np.eye(4) if T_new_old is None else T_new_old, scale)
@@ -102,10 +107,12 @@ def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
         table["normals"] = plain(body.normals)
     if (had_file or scale != 1) and body.covariances.any():
         table["sigma"] = [plain(scale**2 * covariance) for covariance in body.covariances]
-    table["points"] = plain(points)
+    count = len(body) - len(table.get("segments", ()))
+    if count:  # segments come after the points
+        table["points"] = plain(points[:count])
     if scale == 1:
         return
-    for key in ("radius", "tip"):
+    for key in ("segments", "radius", "tip"):
         if key in table:
             put(table, key, plain(scale * np.array(table[key], float)))
     if body.gravity is not None:
