@@ -134,6 +134,20 @@ def test_a_body_in_double_brackets_is_put_where_it_was(tmp_path: Path) -> None:
     assert (new.body.means != POINTS).any()
 
 
+def test_markers_keep_their_names_when_their_places_are_sought(tmp_path: Path) -> None:
+    names = ("base", "tip", "left", "right", "mast", 'the "far" one')
+    session = session_in(tmp_path, text_of())
+    found = calibrated(session, body_free=True)
+    rows = [
+        f'"{n.replace(chr(34), chr(34) * 2)}",{x},{y},{z}' for n, (x, y, z) in zip(names, POINTS)
+    ]
+    (tmp_path / "six.csv").write_text("\n".join(["name,x,y,z", *rows]), encoding="utf-8")
+    text = text_of().replace(f"points = {POINTS.tolist()}", 'file = "six.csv"')
+    new = written(session_in(tmp_path, text), found)
+    assert new.body.labels == names
+    np.testing.assert_allclose(new.body.means, found.after.points, rtol=1e-8, atol=1e-8)
+
+
 def test_a_known_length_scales_bodies_that_were_not_looked_at(tmp_path: Path) -> None:
     (tmp_path / "wand.csv").write_text("name,x,y,z\na,0,0,0\nb,9,0,0\nc,0,7,0\n")
     segments = [[[0, 0, 5], [50, 0, 5]], [[0, 0, 5], [0, 60, 5]]]

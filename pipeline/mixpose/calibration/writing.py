@@ -110,6 +110,8 @@ def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
     count = len(body) - len(table.get("segments", ()))
     if count:  # segments come after the points
         table["points"] = plain(points[:count])
+    if had_file and body.names:
+        table["names"] = list(body.names)
     if scale == 1:
         return
     for key in ("segments", "radius", "tip"):
