@@ -30,6 +30,7 @@ from mixpose.session.rewriting import (
     put_motion,
     put_starts,
     refuse_held,
+    refuse_lost_code,
     text_of,
 )
 from mixpose.trajectories.floor import Axis, Floor, floor_of
@@ -44,8 +45,9 @@ def align_session(request: AlignRequest) -> None:
     held in it. Raises RecordingError if the poses tell no floor.
     """
     path = request.session
-    session = load_session(path)
+    session = load_session(path, allow_code=request.allow_code)
     refuse_held(session)
+    refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
     sources = request.source or ()

@@ -43,7 +43,7 @@ from mixpose.records import Floats
 from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
-from mixpose.session.rewriting import refuse_held
+from mixpose.session.rewriting import refuse_held, refuse_lost_code
 
 
 def calibrate_session(request: CalibrateRequest) -> None:
@@ -54,14 +54,16 @@ def calibrate_session(request: CalibrateRequest) -> None:
     show the body.
     """
     path = request.session
-    session = load_session(path)
+    session = load_session(path, allow_code=request.allow_code)
     output = request.output
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     if is_stdout(output) and is_stdout(request.report):
         raise SessionError("--report -: found -o - too; name a file for one of them")
-    if request.world is not None and output is not None:
-        refuse_held(session)
+    if output is not None:
+        refuse_lost_code(session, output)
+        if request.world is not None:
+            refuse_held(session)
     inputs = [path] if request.poses is None else [path, request.poses]
     for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:

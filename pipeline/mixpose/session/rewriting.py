@@ -25,6 +25,23 @@ def document_of(session: Session, target: Path) -> Any:
     return document
 
 
+def refuse_lost_code(session: Session, target: Path) -> None:
+    """Raise a SessionError where functions of the session's own are not found from a target."""
+    for setup in session.sensors:
+        module, colon, _ = setup.extract.method.partition(":")
+        name = module.partition(".")[0]
+        if colon and _has_module(session.folder, name) and not _has_module(target.parent, name):
+            raise SessionError(
+                f'{session.path}: extract.method: "{setup.extract.method}" is looked for beside '
+                f"the session, and {target.parent.absolute()} has no {name}; allowed: -o in "
+                f"{session.folder.absolute()}, or {name} copied there"
+            )
+
+
+def _has_module(folder: Path, name: str) -> bool:
+    return (folder / f"{name}.py").is_file() or (folder / name).is_dir()
+
+
 def text_of(document: Any) -> str:
     """The text of a TOML document."""
     return str(tomlkit.dumps(document))
