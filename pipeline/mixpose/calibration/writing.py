@@ -48,7 +48,7 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     if T_new_old is not None:
         put_gravity(document, session, T_new_old)
     origin = f"{session.path.name}, {len(found.used)} frames"
-    return f"{MARK} {version} from {origin}.\n{text_of(document)}"
+    return text_of(document, session, f"{MARK} {version} from {origin}.\n")
 
 
 def _put_sensor(table: Any, found: Calibration, session: Session, index: int) -> None:

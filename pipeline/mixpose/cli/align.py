@@ -105,7 +105,8 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
             )
     put_starts(document, session, T_new_old)
     put_gravity(document, session, T_new_old)
-    return f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n{text_of(document)}"
+    head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"
+    return text_of(document, session, head)
 
 
 def _tell(session: Session, floor: Floor, up: Axis) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,13 @@ from mixpose.rigid import TWIST_NAMES
 from mixpose.session.setup import Session
 
 ALL_DIGITS = 17  # of float64
+_BOM = "\ufeff"
+_BARE_END = re.compile(r"(?<!\r)\n")
 
 
 def document_of(session: Session, target: Path) -> Any:
     """The TOML document of a session, with paths as they are from where it will be written."""
-    document = tomlkit.parse(session.path.read_text(encoding="utf-8-sig"))
+    document = tomlkit.parse(_written(session).removeprefix(_BOM))
     _lead_back(document, session.folder, target.parent)
     return document
 
@@ -42,9 +45,20 @@ def _has_module(folder: Path, name: str) -> bool:
     return (folder / f"{name}.py").is_file() or (folder / name).is_dir()
 
 
-def text_of(document: Any) -> str:
-    """The text of a TOML document."""
-    return str(tomlkit.dumps(document))
+def text_of(document: Any, session: Session, head: str = "") -> str:
+    """The text of a TOML document below a head, its bytes as those of the session file.
+
+    So a byte order mark is kept, and where all lines end in CR LF, new ones do too.
+    """
+    written, text = _written(session), head + str(tomlkit.dumps(document))
+    if "\r\n" in written and not _BARE_END.search(written):
+        text = _BARE_END.sub("\r\n", text)
+    return _BOM + text if written.startswith(_BOM) else text
+
+
+def _written(session: Session) -> str:
+    """The text of the session file, with a byte order mark and line ends as they are."""
+    return session.path.read_bytes().decode("utf-8")
 
 
 def objects_of(document: Any) -> Iterator[Any]:
