@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import mixpose
+from command_line import assert_one_line, command, mixpose
 from pose_lines import covariance_of, lines_of, write_poses
 
 import mixpose as package
@@ -152,3 +152,25 @@ def test_a_session_with_held_directions_and_words_that_name_nothing_are_refused(
     done = mixpose("align", "session.toml", "--floor", "board@3", "-o", "a.toml", cwd=tmp_path)
     assert done.returncode == 2
     assert "OBJECT@FRAME with one of tool" in done.stderr
+
+
+def test_functions_of_the_session_are_run_where_allowed_and_found_from_where_it_is_written(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "spots.py").write_text(
+        "from dataclasses import replace\n\nfrom mixpose.extraction import extract\n\n\n"
+        "def find(image, options):\n    return extract(image, replace(options, method='blobs'))\n"
+    )
+    (tmp_path / "other").mkdir()
+    recording = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
+    text = (recording / "session.toml").read_text().replace('"blobs"', '"spots:find"')
+    for side in ("left", "right"):
+        text = text.replace(f'"{side}*.png"', f"'{recording / side}*.png'")
+    (tmp_path / "session.toml").write_text(text)
+    words = ("align", "session.toml", "--floor", "tracker@0", "-o")
+    assert_one_line(command(*words, "x.toml", cwd=tmp_path), 2, "add --allow-code")
+    done = command(*words, "other/x.toml", "--allow-code", cwd=tmp_path)
+    assert_one_line(done, 2, "other has no spots; allowed: -o in", "or spots copied there")
+    assert command(*words, "x.toml", "--allow-code", cwd=tmp_path).returncode == 0
+    (tmp_path / "other/spots.py").write_bytes((tmp_path / "spots.py").read_bytes())
+    assert command(*words, "other/x.toml", "--allow-code", cwd=tmp_path).returncode == 0

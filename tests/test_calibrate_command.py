@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import command, mixpose
+from command_line import assert_one_line, command, mixpose
 
 from mixpose.cli.notices import watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
@@ -82,6 +82,32 @@ def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: P
         (line,) = done.stderr.strip().splitlines()  # no line about what is free and searched
         assert f"--world {word}: allowed: left, right, or the body in a frame" in line
         assert "body@0, body@5, body@10, ..." in line
+
+
+def test_another_world_is_refused_where_directions_of_the_old_one_are_held(tmp_path: Path) -> None:
+    text = (RECORDING / "session.toml").read_text()
+    held = '[estimator]\nfree = ["x", "y", "rz"]\n\n[[sensor]]'
+    (tmp_path / "session.toml").write_text(text.replace("[[sensor]]", held, 1))
+    done = command("calibrate", "session.toml", "-o", "x.toml", "--world", "right", cwd=tmp_path)
+    assert_one_line(done, 2, "estimator.free: found x, y, rz", "where the world becomes another")
+
+
+def test_functions_of_the_session_are_run_where_allowed_and_found_from_where_it_is_written(
+    bumped: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "spots.py").write_text(
+        "from dataclasses import replace\n\nfrom mixpose.extraction import extract\n\n\n"
+        "def find(image, options):\n    return extract(image, replace(options, method='blobs'))\n"
+    )
+    (tmp_path / "other").mkdir()
+    text = bumped.read_text().replace('method = "blobs"', 'method = "spots:find"')
+    (tmp_path / "session.toml").write_text(text)
+    words = ("calibrate", "session.toml", "--free", "right:pose", "-o")
+    assert_one_line(command(*words, "x.toml", cwd=tmp_path), 2, "add --allow-code")
+    done = command(*words, "other/x.toml", "--allow-code", cwd=tmp_path)
+    assert_one_line(done, 2, "other has no spots; allowed: -o in", "or spots copied there")
+    done = command(*words, "x.toml", "--allow-code", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_sensor_that_is_held_is_called_so_in_a_check(bumped: Path) -> None:

@@ -13,9 +13,10 @@ from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, calibrate
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
-from mixpose.calibration.words import in_world, with_length
+from mixpose.calibration.words import in_length, in_world, known_length
 from mixpose.errors import SessionError
-from mixpose.rigid import inverse, rotation_angle_deg, transform
+from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.sensors import RangeSensor
 
 Floats = np.ndarray
 LENS = np.array([-0.08, 0.01, 5e-4, -4e-4])
@@ -71,17 +72,29 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
     frames = recording(true, 30, 0.02)
     length = float(np.linalg.norm(centre_of(true[1]) - centre_of(true[0])))
     small = Body("six", tuple(PointFeature(p) for p in 0.97 * POINTS))
-    rig = Rig.of(("s0", "s1"), true, small)
+    # where the sensors are said to be tells no scale
+    rig = bumped(task_of(true, frames), 1, 0.5, 20.0).rig
+    rig = replace(rig, points=small.means)
     task = task_of(true, frames, free={1: ("pose",)}, body_free=True)
-    scaled, pair = with_length(rig, f"s0:s1={length}")
-    found = calibrate(replace(task, rig=scaled, body=small, length=pair), found=alone(true, frames))
+    pair, _ = known_length(rig, f"s0:s1={length}")
+    task = replace(task, rig=rig, body=small, length=pair)
+    small_poses = {
+        key: replace(one, poses=from_parts(one.poses[:, :3, :3], 0.97 * one.poses[:, :3, 3]))
+        for key, one in alone(true, frames).items()
+    }
+    found = in_length(calibrate(task, found=small_poses), f"s0:s1={length}")
+    a, b = (centre_of(sensor) for sensor in found.after.sensors)
+    assert np.linalg.norm(b - a) == pytest.approx(length)
     size = np.linalg.norm(found.after.points - found.after.points.mean(axis=0), axis=1)
     right = np.linalg.norm(POINTS - POINTS.mean(axis=0), axis=1)
     assert size == pytest.approx(right, rel=1e-3)
     assert "the known length between two sensors stays" in found.gauge
     for words in ("s0:s0=3", "s0:s1=-1", "s0:s1=a", "s0=3", "s0:x=3"):
         with pytest.raises(SessionError, match="allowed: SENSOR:SENSOR=LENGTH"):
-            with_length(rig, words)
+            known_length(rig, words)
+    ranging = Rig.of(("s0", "s1", "s2"), [*true, RangeSensor(np.zeros(3))], small)
+    with pytest.raises(SessionError, match="'s2' measures lengths"):
+        known_length(ranging, f"s0:s1={length}")
 
 
 def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None:

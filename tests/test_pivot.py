@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import mixpose
+from command_line import command, mixpose
 from pose_lines import covariance_of, lines_of, measured, write_poses
 from scipy.stats import chi2
 
@@ -168,3 +168,32 @@ def test_options_that_name_nothing_are_refused(tmp_path: Path) -> None:
     assert "--reference base" in done.stderr
     assert mixpose("pivot", path, "--reference", "tool").returncode == 2
     assert mixpose("pivot", path, "--into", tmp_path / "none.toml").returncode == 2
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("ends", [b"\n", b"\r\n"])
+@pytest.mark.parametrize("old", ["", "tip = [1, 2, 3] # by eye\n"])
+def test_all_but_the_tip_stays_byte_for_byte(
+    tmp_path: Path, mark: bytes, ends: bytes, old: str
+) -> None:
+    head = '# the new tool\n\nunit = "mm"\n[object]\nname = "tool"\n'
+    rest = (
+        "points = [\n  [0, 0, 0], # π\n  [50, 0, 0],\n  [0, 60, 0],\n]\n"
+        '\n[[sensor]]\nname = "left"   # over the door\nmodel = "pinhole"\nsource = "*.png"\n'
+        "camera_matrix = [[800, 0, 320], [0, 800, 240], [0, 0, 1]]\n"
+    )
+
+    def as_bytes(text: str) -> bytes:
+        return mark + text.encode().replace(b"\n", ends)
+
+    session, poses = tmp_path / "s.toml", tmp_path / "poses.jsonl"
+    session.write_bytes(as_bytes(head + old + rest))
+    pivoting = run_of(1)
+    write_poses(poses, lines_of(pivoting.poses, pivoting.covariances[0]))
+    done = command("pivot", poses, "--into", session)
+    assert done.returncode == 0, done.stderr
+    after = session.read_bytes()
+    assert after.count(b"\n") == after.count(ends)
+    (tip,) = [line for line in after.split(ends) if line.startswith(b"tip = [")]
+    assert b"one standard deviation" in tip
+    assert after.replace(tip + ends, b"") == as_bytes(head + rest)

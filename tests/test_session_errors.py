@@ -267,6 +267,15 @@ MORE_WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"matrix": "camera_matrix = [[800, 0, 640], [5, 800, 512], [0, 0, 1]]"},
         [LEFT + "camera_matrix: found", "512.0], [0.0, 0.0, 1.0]]; allowed"],
     ),
+    ({"normals": 'names = ["a", "b"]'}, ["object.names: found 2 names for 4 points; allowed: one"]),
+    (
+        {"normals": 'names = ["a", "b", "c", " a"]'},
+        ["object.names[3]: found", "allowed: a name of its own for each point"],
+    ),
+    (
+        {"points": 'file = "m.csv"', "normals": 'names = ["a", "b", "c"]'},
+        ["object.names: stands beside file, which has names; allowed: one of the two"],
+    ),
 ]
 
 
@@ -274,6 +283,7 @@ MORE_WRONG: list[tuple[dict[str, str], list[str]]] = [
 def test_what_can_be_read_and_cannot_be_meant_is_told(
     tmp_path: Path, changed: dict[str, str], words: list[str]
 ) -> None:
+    (tmp_path / "m.csv").write_text("name,x,y,z\na,0,0,0\nb,10,0,0\nc,0,20,0\n")
     message = message_of(tmp_path, with_lines(**changed))
     for word in words:
         assert word in message

@@ -77,6 +77,7 @@ class Calibration:
     explained: Floats
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]  # (4, 4), by frame number
+    T_new_old: Floats | None = None  # (4, 4): to the world of `after`, where it is another one
 
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
         """Sensors that most likely stand elsewhere: what they saw is not explained."""

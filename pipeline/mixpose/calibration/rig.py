@@ -43,6 +43,7 @@ class Rig:
     delays: Floats  # (L,): seconds by which a sensor's frames are taken later than their times say
     drifts: Floats  # (L,): seconds per second by which that grows
     labels: tuple[str, ...]  # what the features are called in messages
+    scale: float = 1.0  # of all lengths, against those that the session says
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:

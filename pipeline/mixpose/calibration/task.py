@@ -65,7 +65,7 @@ class Task:
     # whether a frame's pose tells of the next one's where sensors alone tell little
     fuse: bool = True
     known: Mapping[int, Floats] | None = None  # poses by frame number, where they are known
-    length: tuple[int, int] | None = None  # sensors whose distance is known, and right in `rig`
+    length: tuple[int, int] | None = None  # sensors whose distance is known
     # by sensor, how far what is held of it may be off
     errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 

@@ -16,7 +16,7 @@ from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import KINDS, Kind, Rig, centre_of, kinds_of
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.rigid import inverse
+from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError, RangeSensor
 from mixpose.session.values import as_number
 
@@ -105,10 +105,10 @@ def words_of(names: Sequence[str], free: Mapping[int, Sequence[Kind]], body: boo
     return " ".join(parts + ["body"] * body) or "nothing"
 
 
-def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
-    """Scale rig and body so that two sensors are as far apart as ``SENSOR:SENSOR=LENGTH`` says.
+def known_length(rig: Rig, words: str) -> tuple[tuple[int, int], float]:
+    """Two sensors and how far they are apart, as ``SENSOR:SENSOR=LENGTH`` says.
 
-    Raises a SessionError if the words are no two sensors and a length.
+    Raises a SessionError if the words are no two sensors and a length, or a sensor tells scale.
     """
     names, _, value = words.partition("=")
     first, _, second = names.partition(":")
@@ -118,22 +118,51 @@ def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
             f"--length {words}: allowed: SENSOR:SENSOR=LENGTH with two of {', '.join(rig.names)} "
             "and a length above 0"
         )
+    for name, sensor in zip(rig.names, rig.sensors, strict=True):
+        if not hasattr(sensor, "camera_matrix"):
+            raise SessionError(
+                f"--length {words}: sensor {name!r} measures lengths, which give the scale; "
+                "allowed: a session of cameras alone"
+            )
     pair = (rig.names.index(first), rig.names.index(second))
-    centres = [centre_of(rig.sensors[k]) for k in pair]
-    apart = float(np.linalg.norm(centres[1] - centres[0]))
-    if apart == 0:
+    if _apart(rig, pair) == 0:
         raise SessionError(f"--length {words}: the session has both at one place")
-    factor = length / apart
-    sensors = tuple(_scaled(sensor, factor) for sensor in rig.sensors)
-    return replace(rig, sensors=sensors, points=rig.points * factor), pair
+    return pair, length
 
 
-def _scaled(sensor: Any, factor: float) -> Any:
-    if hasattr(sensor, "T_sensor_world"):
-        T = sensor.T_sensor_world.copy()
-        T[:3, 3] *= factor
-        return replace(sensor, T_sensor_world=T)
-    return replace(sensor, position=sensor.position * factor)
+def _apart(rig: Rig, pair: tuple[int, int]) -> float:
+    first, second = (centre_of(rig.sensors[k]) for k in pair)
+    return float(np.linalg.norm(second - first))
+
+
+def in_length(found: Calibration, words: str) -> Calibration:
+    """The calibration of cameras, all lengths scaled by what `known_length` reads.
+
+    The body and the poses as well: no image changes.
+    """
+    pair, length = known_length(found.after, words)
+    factor = length / _apart(found.after, pair)
+    units = [unit for block in found.blocks for unit in block.units]
+    sizes = np.array([factor if unit == "length" else 1.0 for unit in units])
+    return replace(
+        found,
+        before=_scaled(found.before, factor),
+        after=_scaled(found.after, factor),
+        deviations=found.deviations * sizes,
+        covariance=found.covariance * np.outer(sizes, sizes),
+        poses={number: _shifted(T, factor) for number, T in found.poses.items()},
+    )
+
+
+def _scaled(rig: Rig, factor: float) -> Rig:
+    cameras: list[Any] = list(rig.sensors)
+    moved = [replace(one, T_sensor_world=_shifted(one.T_sensor_world, factor)) for one in cameras]
+    points, scale = rig.points * factor, rig.scale * factor
+    return replace(rig, sensors=tuple(moved), points=points, scale=scale)
+
+
+def _shifted(T: Floats, factor: float) -> Floats:
+    return from_parts(T[:3, :3], factor * T[:3, 3])
 
 
 def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
@@ -163,6 +192,7 @@ def in_world(found: Calibration, words: str) -> Calibration:
         after=replace(found.after, sensors=moved),
         poses={number: T_new_world @ T for number, T in found.poses.items()},
         gauge=(*found.gauge, f"the world is that of {words}"),
+        T_new_old=T_new_world,
     )
 
 

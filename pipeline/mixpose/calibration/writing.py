@@ -7,13 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from mixpose.body import Body
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block
 from mixpose.records import Floats
 from mixpose.session import Session
-from mixpose.session.rewriting import document_of, plain, put, put_motion, text_of
+from mixpose.session.rewriting import (
+    document_of,
+    objects_of,
+    plain,
+    put,
+    put_gravity,
+    put_motion,
+    put_starts,
+    text_of,
+)
 
 MARK = "# Calibrated by mixpose"
+_LENS = {"focal", "principal_point", "distortion"}
 
 
 def calibrated_text(session: Session, found: Calibration, target: Path, version: str) -> str:
@@ -23,15 +34,25 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     """
     document = document_of(session, target)
     for index, table in enumerate(document["sensor"]):
-        _put_sensor(table, found, index)
-    if any(block.kind == "body" for block in found.blocks):
-        _put_body(document["object"], found, session)
+        _put_sensor(table, found, session, index)
+    scale = found.after.scale
+    first, *others = zip(objects_of(document), session.objects, strict=True)
+    if scale != 1 or any(block.kind == "body" for block in found.blocks):
+        _put_body(first[0], first[1].body, found.after.points, scale)
+    if scale != 1:
+        for table, one in others:
+            _put_body(table, one.body, scale * one.body.means, scale)
+    T_new_old = found.T_new_old
+    if scale != 1 or T_new_old is not None:
+        put_starts(document, session, np.eye(4) if T_new_old is None else T_new_old, scale)
+    if T_new_old is not None:
+        put_gravity(document, session, T_new_old)
     origin = f"{session.path.name}, {len(found.used)} frames"
-    return f"{MARK} {version} from {origin}.\n{text_of(document)}"
+    return text_of(document, session, f"{MARK} {version} from {origin}.\n")
 
 
-def _put_sensor(table: Any, found: Calibration, index: int) -> None:
-    before: Any = found.before.sensors[index]
+def _put_sensor(table: Any, found: Calibration, session: Session, index: int) -> None:
+    before: Any = session.sensors[index].sensor
     sensor: Any = found.after.sensors[index]
     said = {block.kind: _said(found, block) for block in found.blocks if block.sensor == index}
 
@@ -39,12 +60,13 @@ def _put_sensor(table: Any, found: Calibration, index: int) -> None:
         there = hasattr(sensor, key)
         return there and not np.array_equal(getattr(sensor, key), getattr(before, key))
 
-    if has_moved("T_sensor_world"):
+    is_lens = hasattr(sensor, "camera_matrix") and bool(_LENS & said.keys())
+    # a file of a calibration also says where its camera stands
+    was_filed = is_lens and table.pop("calibration", None) is not None
+    if was_filed or has_moved("T_sensor_world"):
         put_motion(table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose")))
-    if {"focal", "principal_point", "distortion"} & said.keys() and hasattr(
-        sensor, "camera_matrix"
-    ):
-        if table.pop("calibration", None) is not None and sensor.resolution is not None:
+    if is_lens:
+        if was_filed and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
         lens = [said[k] for k in ("focal", "principal_point") if k in said]
         _put(table, "camera_matrix", sensor.camera_matrix, ", ".join(lens) or None)
@@ -78,11 +100,22 @@ def _said(found: Calibration, block: Block) -> str:
     return ", ".join(parts)
 
 
-def _put_body(table: Any, found: Calibration, session: Session) -> None:
-    """Features as points, which replace a file of them."""
-    if table.pop("file", None) is not None:
-        if session.body.normals is not None:
-            table["normals"] = plain(session.body.normals)
-        if session.body.covariances.any():
-            table["sigma"] = [plain(covariance) for covariance in session.body.covariances]
-    table["points"] = plain(found.after.points)
+def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
+    """Features as points, which replace a file of them; other lengths of the body are scaled."""
+    had_file = table.pop("file", None) is not None
+    if had_file and body.normals is not None:
+        table["normals"] = plain(body.normals)
+    if (had_file or scale != 1) and body.covariances.any():
+        table["sigma"] = [plain(scale**2 * covariance) for covariance in body.covariances]
+    count = len(body) - len(table.get("segments", ()))
+    if count:  # segments come after the points
+        table["points"] = plain(points[:count])
+    if had_file and body.names:
+        table["names"] = list(body.names)
+    if scale == 1:
+        return
+    for key in ("segments", "radius", "tip"):
+        if key in table:
+            put(table, key, plain(scale * np.array(table[key], float)))
+    if body.gravity is not None:
+        put(table["gravity"], "sigma", plain(scale * body.gravity.sigma))

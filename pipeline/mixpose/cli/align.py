@@ -21,11 +21,21 @@ from mixpose.records import Estimate, Floats
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.session import Session, load_session
-from mixpose.session.rewriting import document_of, objects_of, plain, put, put_motion, text_of
+from mixpose.session.rewriting import (
+    ALL_DIGITS,
+    document_of,
+    plain,
+    put,
+    put_gravity,
+    put_motion,
+    put_starts,
+    refuse_held,
+    refuse_lost_code,
+    text_of,
+)
 from mixpose.trajectories.floor import Axis, Floor, floor_of
 
 MARK = "# Aligned by mixpose"
-_ALL = 17  # digits: the frame is as exact as float64
 
 
 def align_session(request: AlignRequest) -> None:
@@ -35,12 +45,9 @@ def align_session(request: AlignRequest) -> None:
     held in it. Raises RecordingError if the poses tell no floor.
     """
     path = request.session
-    session = load_session(path)
-    if len(session.estimator.free) < len(rigid.TWIST_NAMES):
-        raise SessionError(
-            f"{path}: estimator.free: found {', '.join(session.estimator.free)}, directions of the "
-            "world as it is; allowed: all six, in a session that is aligned"
-        )
+    session = load_session(path, allow_code=request.allow_code)
+    refuse_held(session)
+    refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
     sources = request.source or ()
@@ -91,18 +98,15 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
         sensor: Any = setup.sensor
         if hasattr(sensor, "position"):
             place = rigid.transform(T_new_old, sensor.position[None])[0]
-            put(table, "position", plain(place, _ALL))
+            put(table, "position", plain(place, ALL_DIGITS))
         else:
-            put_motion(table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=_ALL)
-    for table, one in zip(objects_of(document), session.objects, strict=True):
-        start = document if "start" in document else table
-        if one.start is not None and "start" in start:
-            T = T_new_old @ one.start.T_world_object
-            put_motion(start["start"], "T_world_object", T, digits=_ALL)
-        if one.body.gravity is not None:
-            direction = T_new_old[:3, :3] @ np.array(table["gravity"]["direction"], float)
-            put(table["gravity"], "direction", plain(direction, _ALL))
-    return f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n{text_of(document)}"
+            put_motion(
+                table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=ALL_DIGITS
+            )
+    put_starts(document, session, T_new_old)
+    put_gravity(document, session, T_new_old)
+    head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"
+    return text_of(document, session, head)
 
 
 def _tell(session: Session, floor: Floor, up: Axis) -> None:

@@ -130,3 +130,4 @@ class AlignRequest:
     )
     up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
     source: Recordings = None
+    allow_code: AllowCode = False

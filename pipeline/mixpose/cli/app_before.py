@@ -60,6 +60,7 @@ class CalibrateRequest:
     check: bool = option(False, "Only say whether the calibration still holds.")
     report: Path | None = option(None, "A page with pictures; or stdout (-).", metavar="FILE.html")
     source: Recordings = None
+    allow_code: AllowCode = False
 
 
 @dataclass(frozen=True)

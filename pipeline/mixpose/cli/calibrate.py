@@ -17,7 +17,14 @@ from mixpose.calibration.searching import MARK as SAVED_MARK
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
-from mixpose.calibration.words import check_world, error_of_held, in_world, with_length, words_of
+from mixpose.calibration.words import (
+    check_world,
+    error_of_held,
+    in_length,
+    in_world,
+    known_length,
+    words_of,
+)
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
@@ -36,6 +43,7 @@ from mixpose.records import Floats
 from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
+from mixpose.session.rewriting import refuse_held, refuse_lost_code
 
 
 def calibrate_session(request: CalibrateRequest) -> None:
@@ -46,12 +54,16 @@ def calibrate_session(request: CalibrateRequest) -> None:
     show the body.
     """
     path = request.session
-    session = load_session(path)
+    session = load_session(path, allow_code=request.allow_code)
     output = request.output
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     if is_stdout(output) and is_stdout(request.report):
         raise SessionError("--report -: found -o - too; name a file for one of them")
+    if output is not None:
+        refuse_lost_code(session, output)
+        if request.world is not None:
+            refuse_held(session)
     inputs = [path] if request.poses is None else [path, request.poses]
     for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
@@ -85,6 +97,8 @@ def _calibrated(
                 refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
                 saved = kept.enter_context(_kept(partial, _key_of(session, task)))
             found = calibrate(task, rules, progress=progress, found=saved)
+        if request.length is not None:
+            found = in_length(found, request.length)
         yield found if request.world is None else in_world(found, request.world)
 
 
@@ -115,9 +129,9 @@ def task_of(
     # one word of --free may hold several
     free_words = [part for word in request.free or () for part in word.split()]
     free, body = free_parameters(rig, free_words, poses_known=known is not None)
-    pair = None
-    if request.length is not None:
-        rig, pair = with_length(rig, request.length)
+    pair = None if request.length is None else known_length(rig, request.length)[0]
+    if pair is not None and known is not None:
+        raise SessionError("--length: stands beside --poses, which give the scale; drop one")
     kinds = {kind for each in free.values() for kind in each}
     runs = bool(kinds & {"delay", "drift"})
     frames = read_frames(

@@ -138,4 +138,4 @@ def _put_into(path: Path, tool: str, poses: PoseFile, tip: Tip) -> None:
     table = list(objects_of(document))[names.index(name)]
     deviations = ", ".join(f"{d:.2g}" for d in np.sqrt(tip.covariance.diagonal()))
     put(table, "tip", plain(tip.place, _DIGITS), f"one standard deviation: {deviations}")
-    write_text(path, text_of(document), "--into")
+    write_text(path, text_of(document, session), "--into")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     normals = _normals(table, markers, count)
     _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
-    gravity, names = _gravity(table), _names(markers)
+    gravity = _gravity(table)
+    names = _names(markers) if table.names is None else _stated_names(table.names, table, markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
 
 
@@ -92,6 +94,22 @@ def _names(markers: Markers | None) -> tuple[str, ...]:
         return ()
     names = tuple(" ".join(name.split()) for name in markers.names)
     return names if all(names) and len({*names}) == len(names) == len(markers.points) else ()
+
+
+def _stated_names(
+    stated: Sequence[str], table: ObjectTable, markers: Markers | None
+) -> tuple[str, ...]:
+    if table.file is not None:
+        raise BadKeyError("stands beside file, which has names; allowed: one of the two", "names")
+    count = 0 if markers is None else len(markers.points)
+    names = tuple(" ".join(name.split()) for name in stated)
+    if len(names) != count:
+        text = f"found {len(names)} names for {count} points"
+        raise BadKeyError(f"{text}; allowed: one per point", "names")
+    for i, name in enumerate(names):
+        if not name or name in names[:i]:
+            raise BadKeyError(found(name, "a name of its own for each point"), "names", i)
+    return names
 
 
 def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) -> Floats | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,20 +11,54 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from mixpose.errors import SessionError
 from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.session.setup import Session
+
+ALL_DIGITS = 17  # of float64
+_BOM = "\ufeff"
+_BARE_END = re.compile(r"(?<!\r)\n")
 
 
 def document_of(session: Session, target: Path) -> Any:
     """The TOML document of a session, with paths as they are from where it will be written."""
-    document = tomlkit.parse(session.path.read_text(encoding="utf-8-sig"))
+    document = tomlkit.parse(_written(session).removeprefix(_BOM))
     _lead_back(document, session.folder, target.parent)
     return document
 
 
-def text_of(document: Any) -> str:
-    """The text of a TOML document."""
-    return str(tomlkit.dumps(document))
+def refuse_lost_code(session: Session, target: Path) -> None:
+    """Raise a SessionError where functions of the session's own are not found from a target."""
+    for setup in session.sensors:
+        module, colon, _ = setup.extract.method.partition(":")
+        name = module.partition(".")[0]
+        if colon and _has_module(session.folder, name) and not _has_module(target.parent, name):
+            raise SessionError(
+                f'{session.path}: extract.method: "{setup.extract.method}" is looked for beside '
+                f"the session, and {target.parent.absolute()} has no {name}; allowed: -o in "
+                f"{session.folder.absolute()}, or {name} copied there"
+            )
+
+
+def _has_module(folder: Path, name: str) -> bool:
+    return (folder / f"{name}.py").is_file() or (folder / name).is_dir()
+
+
+def text_of(document: Any, session: Session, head: str = "") -> str:
+    """The text of a TOML document below a head, its bytes as those of the session file.
+
+    So a byte order mark is kept, and where all lines end in CR LF, new ones do too.
+    """
+    written, text = _written(session), head + str(tomlkit.dumps(document))
+    if "\r\n" in written and not _BARE_END.search(written):
+        text = _BARE_END.sub("\r\n", text)
+    return _BOM + text if written.startswith(_BOM) else text
+
+
+def _written(session: Session) -> str:
+    """The text of the session file, with a byte order mark and line ends as they are."""
+    return session.path.read_bytes().decode("utf-8")
 
 
 def objects_of(document: Any) -> Iterator[Any]:
@@ -47,8 +82,38 @@ def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits:
     put(table, key, plain(T, digits), said)
 
 
+def put_starts(document: Any, session: Session, T_new_old: Floats, scale: float = 1.0) -> None:
+    """Where bodies are at first, in another frame of a world whose lengths were scaled before."""
+    for table, one in zip(objects_of(document), session.objects, strict=True):
+        home = document if "start" in document else table
+        if one.start is None or "start" not in home:
+            continue
+        T = one.start.T_world_object.copy()
+        T[:3, 3] *= scale
+        put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        if scale != 1 and one.start.distance is not None:
+            put(home["start"], "distance", plain(scale * one.start.distance))
+
+
+def put_gravity(document: Any, session: Session, T_new_old: Floats) -> None:
+    """Where gravity points, in another frame of the world."""
+    for table, one in zip(objects_of(document), session.objects, strict=True):
+        if one.body.gravity is not None:
+            direction = T_new_old[:3, :3] @ one.body.gravity.direction
+            put(table["gravity"], "direction", plain(direction, ALL_DIGITS))
+
+
+def refuse_held(session: Session) -> None:
+    """Raise a SessionError where directions of the world are held, which is to be another one."""
+    if len(session.estimator.free) < len(TWIST_NAMES):
+        raise SessionError(
+            f"{session.path}: estimator.free: found {', '.join(session.estimator.free)}, "
+            "directions of the world as it is; allowed: all six, where the world becomes another"
+        )
+
+
 def plain(values: Floats | float, digits: int = 10) -> Any:
-    """Nested lists of numbers with so many digits; 17 are all that there are."""
+    """Nested lists of numbers with so many digits."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 0:
         return float(f"{float(array):.{digits}g}") + 0.0

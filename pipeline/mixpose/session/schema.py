@@ -80,6 +80,10 @@ class ObjectTable(Table):
     points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
     """Features in the body's own coordinates, in `unit`, in any order.
     Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`"""
+    names: list[Text] | None = Field(None, description="a list of names, one per point")
+    """What the points are called, each otherwise, where there is no `file` with names; else their
+    numbers from 1.
+    Example: `names = ["base", "tip", "mast"]`"""
     file: str | None = Field(
         None, min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"
     )
