@@ -139,3 +139,23 @@ def test_a_truncated_image_is_told(recording: Path) -> None:
 def test_an_image_of_the_wrong_size_is_told(recording: Path) -> None:
     cv2.imwrite(str(recording / "left0001.png"), np.zeros((100, 120), dtype=np.uint8))
     assert_one_line(command("run", recording / "session.toml"), 3, "left0001.png", "120", "640")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("mydata.tum", "1 2 3\n"),
+        ("other.tum", "0.0 1 2 3 0 0 0 1\n"),  # of another program
+        ("table.csv", "1\n2\n"),
+        ("notes.yaml", "# frame grabber settings\nexposure: 3\n"),
+        ("times.tum", "# time is the frame number, as always\n1 2\n"),
+    ],
+)
+def test_files_of_others_that_begin_like_poses_are_kept(
+    name: str, text: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    truth = SYNTHETIC / "two_cameras" / "truth.jsonl"
+    assert_one_line(command("convert", truth, "-o", path), 2, name, "mixpose did not write")
+    assert path.read_text(encoding="utf-8") == text

@@ -146,7 +146,7 @@ def test_a_trajectory_of_each_body_goes_to_a_file_of_its_own(tmp_path: Path) -> 
     last = (tmp_path / "out.rod-1.tum").read_text().splitlines()[-1]
     assert last == "1.0 0.2 0.0 0.0 0.0 0.0 0.0 1.0"
     convert_poses(ConvertRequest(file.path, tmp_path / "one.tum", object="rod-0"))
-    assert (tmp_path / "one.tum").read_text().splitlines()[1].startswith("0.0 0.1 ")
+    assert (tmp_path / "one.tum").read_text().splitlines()[2].startswith("0.0 0.1 ")
 
 
 def test_a_file_per_body_is_needed_from_two_bodies_on() -> None:

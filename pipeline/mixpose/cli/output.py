@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -12,17 +13,21 @@ from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
+from mixpose.poses.benchmarks import BOP_COLUMNS, TUM_COLUMNS
+from mixpose.poses.csvtable import FRAME_COLUMNS
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
-from mixpose.poses.writing import PoseWriter
+from mixpose.poses.writing import NO_TIMES, PoseWriter
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
-_FIRST_WORDS = (
-    *('{"type": "header"', "frame,time_s,object", "scene_id,im_id"),
-    *("# time is the frame number", "# frame "),
+_HEADER = '{"type": "header"'
+_FIRST_LINES = re.compile(
+    rf"{re.escape(_HEADER)}.*|{','.join(FRAME_COLUMNS[:3])},.*|{re.escape(BOP_COLUMNS)}"
+    rf"|{re.escape(TUM_COLUMNS)}|{re.escape(NO_TIMES)}|# frame -?\d+, (ok|ambiguous)"
 )
+"""Of files of poses, whole as they are written."""
 
 
 class Output:
@@ -140,12 +145,11 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     Raises SessionError if it is an input of the run, or holds something else.
     """
     beginning = _beginning(path, inputs)
-    first = beginning.partition("\n")[0]
-    numbers_only = first and all(_is_number(word) for word in first.split())
+    first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
-    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
+    if beginning and not (_FIRST_LINES.fullmatch(first) or is_rerun):
         raise _foreign(path)
-    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
+    if first.startswith(_HEADER) and '"mixpose": ' not in first:
         raise SessionError(f"-o {path}: holds poses of another origin; name another file")
 
 
@@ -182,14 +186,6 @@ def _foreign(path: Path, option: str = "-o") -> SessionError:
     return SessionError(
         f"{option} {path}: holds something that mixpose did not write; name another file"
     )
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def is_stdout(named: Path | None) -> bool:
