@@ -159,3 +159,20 @@ def test_files_of_others_that_begin_like_poses_are_kept(
     truth = SYNTHETIC / "two_cameras" / "truth.jsonl"
     assert_one_line(command("convert", truth, "-o", path), 2, name, "mixpose did not write")
     assert path.read_text(encoding="utf-8") == text
+
+
+@pytest.mark.parametrize("format_name", ["c3d", "trc"])
+def test_markers_go_into_no_file_that_only_speaks_of_mixpose(
+    format_name: str, recording: Path
+) -> None:
+    if format_name == "c3d":
+        pytest.importorskip("ezc3d")
+    shutil.copy(SYNTHETIC / "two_cameras" / "truth.jsonl", recording)
+    text = "# Calibrated by mixpose 1.0 from session.toml\n"
+    (recording / "cal.toml").write_text(text, encoding="utf-8")
+    options = ("convert", "truth.jsonl", "--format", format_name, "-o")
+    result = command(*options, "cal.toml", cwd=recording)
+    assert_one_line(result, 2, "cal.toml", "mixpose did not write")
+    assert (recording / "cal.toml").read_text(encoding="utf-8") == text
+    result = command(*options, "session.toml", cwd=recording)
+    assert_one_line(result, 2, "session.toml", "is an input of this run")

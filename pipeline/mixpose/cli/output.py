@@ -154,17 +154,18 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def refuse_to_overwrite_but(
-    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
+    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
     """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
     it; standard output is.
 
-    Raises SessionError if it is one of the inputs, or holds something else; `option` named it.
+    `begins` is what the very first characters have to be. Raises SessionError if it is one of the
+    inputs, or holds something else; `option` named it.
     """
     if is_stdout(path):
         return
     beginning = _beginning(path, inputs, option)
-    if beginning and mark not in beginning:
+    if beginning and not (beginning.startswith(begins) and mark in beginning):
         raise _foreign(path, option)
 
 
