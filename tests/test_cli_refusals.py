@@ -176,3 +176,15 @@ def test_markers_go_into_no_file_that_only_speaks_of_mixpose(
     assert (recording / "cal.toml").read_text(encoding="utf-8") == text
     result = command(*options, "session.toml", cwd=recording)
     assert_one_line(result, 2, "session.toml", "is an input of this run")
+
+
+def test_a_pattern_with_two_stars_in_a_name_is_run_again(recording: Path) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    assert '"left*.png"' in text
+    session.write_text(text.replace('"left*.png"', '"left**.png"'), encoding="utf-8")
+    for _ in range(2):  # the second time over its own
+        result = command("run", session, "--stop", "1", "-o", recording / "poses.jsonl")
+        assert result.returncode == 0, result.stderr
+    result = command("run", session, "-o", recording / "left0000.png", "--format", "csv")
+    assert_one_line(result, 2, "left0000.png", "is an input of this run")
