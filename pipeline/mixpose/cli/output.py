@@ -110,7 +110,8 @@ class OutputPerBody(ExitStack):
                 "with -o: each body gets one with its own name in it"
             )
         self._outputs = {
-            label: self.enter_context(start(body_path(path, label))) for label in labels
+            label: self.enter_context(start(own))
+            for label, own in zip(labels, _body_paths(path, labels), strict=True)
         }
 
     def write(self, estimate: Estimate) -> None:
@@ -118,10 +119,18 @@ class OutputPerBody(ExitStack):
         self._outputs[estimate.label].write(estimate)
 
 
-def body_path(path: Path, label: str) -> Path:
-    """Where the poses of one of several bodies go: ``poses.tum`` → ``poses.tool.tum``."""
-    word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
-    return path.with_name(f"{path.stem}.{word}{path.suffix}")
+def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
+    """Where the poses of several bodies go: ``poses.tum`` → ``poses.tool.tum``; no two alike."""
+    words: list[str] = []
+    taken: set[str] = set()  # some file systems know no capitals
+    for label in labels:
+        plain = word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
+        number = len(words)
+        while word.casefold() in taken:
+            word, number = f"{plain}_{number}", number + 1
+        taken.add(word.casefold())
+        words.append(word)
+    return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
 def is_apart(format_name: str, labels: Sequence[str]) -> bool:
@@ -131,7 +140,7 @@ def is_apart(format_name: str, labels: Sequence[str]) -> bool:
 
 def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
     """The files that poses go to."""
-    return [body_path(path, label) for label in labels] if is_apart(format_name, labels) else [path]
+    return _body_paths(path, labels) if is_apart(format_name, labels) else [path]
 
 
 def _as_stream(file: LineFile) -> TextIO:
