@@ -106,3 +106,25 @@ def test_a_run_that_cannot_tell_how_it_went_still_writes_its_poses(tmp_path: Pat
     result = in_shell(f"{MIXPOSE} run {SESSION} --stop 2 -o {poses} 2>/dev/full")
     assert result.returncode == 0
     assert len(poses.read_text(encoding="utf-8").splitlines()) == 3
+
+
+def test_a_compiled_module_that_is_cut_is_no_interrupt(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+
+    def schema() -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "mixpose", "schema"]
+        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+    assert schema().returncode == 0
+    for name in ("poses/schema", "cli/words"):  # of the command, and of all of them
+        folder, stem = name.split("/")
+        (compiled,) = tmp_path.rglob(f"mixpose/{folder}/{stem}.*.pyc")
+        whole = compiled.read_bytes()
+        compiled.write_bytes(whole[:40])  # the header, and little more
+        result = schema()
+        assert result.returncode == 2
+        (line,) = result.stderr.splitlines()
+        assert line.startswith(f"mixpose: {compiled}: is damaged: ")
+        assert line.endswith("; remove this file, Python makes it anew")
+        compiled.write_bytes(whole)

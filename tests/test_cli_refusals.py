@@ -139,3 +139,52 @@ def test_a_truncated_image_is_told(recording: Path) -> None:
 def test_an_image_of_the_wrong_size_is_told(recording: Path) -> None:
     cv2.imwrite(str(recording / "left0001.png"), np.zeros((100, 120), dtype=np.uint8))
     assert_one_line(command("run", recording / "session.toml"), 3, "left0001.png", "120", "640")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("mydata.tum", "1 2 3\n"),
+        ("other.tum", "0.0 1 2 3 0 0 0 1\n"),  # of another program
+        ("table.csv", "1\n2\n"),
+        ("notes.yaml", "# frame grabber settings\nexposure: 3\n"),
+        ("times.tum", "# time is the frame number, as always\n1 2\n"),
+    ],
+)
+def test_files_of_others_that_begin_like_poses_are_kept(
+    name: str, text: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    truth = SYNTHETIC / "two_cameras" / "truth.jsonl"
+    assert_one_line(command("convert", truth, "-o", path), 2, name, "mixpose did not write")
+    assert path.read_text(encoding="utf-8") == text
+
+
+@pytest.mark.parametrize("format_name", ["c3d", "trc"])
+def test_markers_go_into_no_file_that_only_speaks_of_mixpose(
+    format_name: str, recording: Path
+) -> None:
+    if format_name == "c3d":
+        pytest.importorskip("ezc3d")
+    shutil.copy(SYNTHETIC / "two_cameras" / "truth.jsonl", recording)
+    text = "# Calibrated by mixpose 1.0 from session.toml\n"
+    (recording / "cal.toml").write_text(text, encoding="utf-8")
+    options = ("convert", "truth.jsonl", "--format", format_name, "-o")
+    result = command(*options, "cal.toml", cwd=recording)
+    assert_one_line(result, 2, "cal.toml", "mixpose did not write")
+    assert (recording / "cal.toml").read_text(encoding="utf-8") == text
+    result = command(*options, "session.toml", cwd=recording)
+    assert_one_line(result, 2, "session.toml", "is an input of this run")
+
+
+def test_a_pattern_with_two_stars_in_a_name_is_run_again(recording: Path) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    assert '"left*.png"' in text
+    session.write_text(text.replace('"left*.png"', '"left**.png"'), encoding="utf-8")
+    for _ in range(2):  # the second time over its own
+        result = command("run", session, "--stop", "1", "-o", recording / "poses.jsonl")
+        assert result.returncode == 0, result.stderr
+    result = command("run", session, "-o", recording / "left0000.png", "--format", "csv")
+    assert_one_line(result, 2, "left0000.png", "is an input of this run")

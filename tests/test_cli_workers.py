@@ -225,6 +225,12 @@ def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None
     assert "2 sessions" in named
 
 
+def test_several_sessions_cannot_be_paused(tmp_path: Path) -> None:
+    request = RunRequest(tmp_path, "jsonl", (), Selection(), resume=False, pause=True)
+    with pytest.raises(SessionError, match=r"^--pause: found 2 sessions, allowed with one only$"):
+        run_sessions((RANGES, BEAMS), request, workers=2)
+
+
 def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:
     result = command("run", RANGES, "--workers", "2", "--stop", "1")
     assert result.returncode == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -213,6 +214,15 @@ def test_inspect_tells_what_a_pose_meets_of_a_cloud(seven: Recording, tmp_path: 
     assert f"mocap: {found + 5} points found; the pose meets {found} of 7 features" in said
     # offsets in space of noise of three axes: 0.3 sqrt(3), less what the pose takes up
     assert 0.2 < float(said.partition(" within ")[2].split()[0]) < 0.8
+
+
+def test_a_report_tells_how_far_off_a_cloud_is_in_lengths(seven: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("jinja2")
+    run("run", seven.session, "--stop", "3", "-o", tmp_path / "poses.jsonl")
+    run("report", tmp_path / "poses.jsonl", "-o", tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (row,) = re.findall(r'<tr><th scope="row">mocap</th>.*</tr>', page)
+    assert row.endswith(" mm</td></tr>")
 
 
 def test_a_simulated_cloud_is_found_again(seven: Recording, tmp_path: Path) -> None:

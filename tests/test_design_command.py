@@ -117,6 +117,26 @@ def test_wrong_options_are_told_in_one_line(
     assert words in said
 
 
+def test_poses_of_another_unit_or_body_are_not_judged_at(tmp_path: Path) -> None:
+    truth = TWO_CAMERAS.with_name("truth.jsonl").read_text(encoding="utf-8")
+    header, first, *_ = truth.splitlines(keepends=True)
+    assert '"mm"' in header
+    assert '"tracker"' in first
+    poses, session = tmp_path / "poses.jsonl", TWO_CAMERAS
+
+    def told(text: str) -> str:
+        poses.write_text(text, encoding="utf-8")
+        done = command("design", session, "--poses", "poses.jsonl", cwd=tmp_path)
+        return done.stderr if done.returncode else done.stdout
+
+    other = first.replace('"tracker"', '"cup"')
+    assert "found the unit m; allowed: that of the session, mm" in told(
+        header.replace('"mm"', '"m"') + first
+    )
+    assert "holds no pose of 'tracker'" in told(header + other)
+    assert told(header + first + other) == told(header + first)
+
+
 def test_frames_are_simulated_where_a_system_determines_anything(tmp_path: Path) -> None:
     text = TWO_CAMERAS.read_text(encoding="utf-8")
     before, right = (

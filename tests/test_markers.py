@@ -298,10 +298,11 @@ def test_own_files_are_replaced_and_others_are_kept(
 def test_a_file_of_very_many_markers_is_known_as_own(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
     from mixpose.cli.output import refuse_to_overwrite_but
-    from mixpose.poses.trajectories import write_c3d
+    from mixpose.poses.trajectories import MARKS, write_c3d
 
     write_c3d(tmp_path / "a.c3d", trajectories(2, 250))
-    refuse_to_overwrite_but(tmp_path / "a.c3d", [], "mixpose")
+    begins, mark = MARKS["c3d"]
+    refuse_to_overwrite_but(tmp_path / "a.c3d", [], mark, begins=begins)
     assert len(c3d_points(tmp_path / "a.c3d")[0].point_labels) == 250
 
 

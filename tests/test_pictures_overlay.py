@@ -20,7 +20,7 @@ from mixpose.cli import main
 from mixpose.errors import SessionError
 from mixpose.objective import View
 from mixpose.pictures import Part, displayable, draw_pose
-from mixpose.pictures.movie import Overlay
+from mixpose.pictures.movie import Overlay, VideoSink
 from mixpose.pictures.overlay import (
     AXES,
     CHI2_95,
@@ -273,6 +273,16 @@ def test_a_video_has_every_frame_at_the_recordings_rate_and_may_be_rewritten(
     while capture.read()[0]:
         count += 1
     assert count == 4
+
+
+def test_frames_that_are_missing_at_the_beginning_do_not_slow_a_video(tmp_path: Path) -> None:
+    sink = VideoSink(tmp_path / "seen.avi")
+    for frame in (0, 4, 5, 6, 7):
+        sink.add(np.zeros((48, 64, 3), np.uint8), frame, frame / 25)
+    sink.close()
+    capture = cv2.VideoCapture(str(tmp_path / "seen.avi"))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(25, abs=0.1)
+    assert capture.get(cv2.CAP_PROP_FRAME_COUNT) == 5
 
 
 @pytest.mark.parametrize(

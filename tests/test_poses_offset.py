@@ -89,6 +89,7 @@ def test_poses_and_truth_in_the_wrong_order_are_noticed(motion: list[Floats]) ->
     [
         ("frame,time_s,object,status,unit\n0,0.0,tool,ok,mm\n", "found a .csv table of poses"),
         ("scene_id,im_id,obj_id,score,R,t,time\n", "found a .bop.csv table"),
+        ("# time tx ty tz qx qy qz qw, in s and m, by mixpose\n", "found a .tum trajectory"),
         ("0.0 1 2 3 0 0 0 1\n0.1 1 2 3 0 0 0 1\n", "found a .tum trajectory"),
         ("hello\n1\n", "not JSON"),
     ],

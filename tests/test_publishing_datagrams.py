@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -61,3 +62,24 @@ def test_poses_go_on_without_a_header_that_is_too_large() -> None:
     assert len(told) == 2
     assert "the header has " in told[0]
     assert "publish to tcp:// or ws://, which carry any size" in told[0]
+
+
+def test_frame_numbers_beyond_32_bits_are_sent_in_64() -> None:
+    pytest.importorskip("pythonosc")
+    stamp = 1_403_636_579_763_555_584  # ns, the name of a file of images
+    estimates = [replace(ESTIMATE, frame=frame) for frame in (2**31 - 1, 2**31, stamp)]
+    arrived, (end,) = published("osc", HEADER, estimates)
+    assert end == "published to URL: 3 poses"
+    kinds = [data.partition(b",")[2][:3].decode() for data in arrived]
+    assert kinds == ["ids", "hds", "hds"]
+    assert struct.pack(">q", stamp) in arrived[2]
+
+
+def test_poses_go_on_after_one_that_cannot_be_put_in_a_message() -> None:
+    pytest.importorskip("pythonosc")
+    beyond = replace(ESTIMATE, frame=2**63)
+    arrived, (warning, end) = published("osc", HEADER, [beyond, beyond, ESTIMATE])
+    assert len(arrived) == 1
+    assert f"warning: --publish URL: frame {2**63} cannot be sent: " in warning
+    assert warning.endswith("; the run goes on")
+    assert end == "published to URL: 1 pose, 2 dropped: they could not be sent"

@@ -142,7 +142,7 @@ def limited(size: int, *arguments: str | Path) -> subprocess.CompletedProcess[st
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
     return subprocess.run(
-        [sys.executable, "-m", "mixpose", *map(str, arguments)],
+        [sys.executable, "-B", "-m", "mixpose", *map(str, arguments)],  # no module compiled in half
         capture_output=True, text=True, check=False, preexec_fn=limit,
     )  # fmt: skip
 

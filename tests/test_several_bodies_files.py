@@ -146,7 +146,7 @@ def test_a_trajectory_of_each_body_goes_to_a_file_of_its_own(tmp_path: Path) -> 
     last = (tmp_path / "out.rod-1.tum").read_text().splitlines()[-1]
     assert last == "1.0 0.2 0.0 0.0 0.0 0.0 0.0 1.0"
     convert_poses(ConvertRequest(file.path, tmp_path / "one.tum", object="rod-0"))
-    assert (tmp_path / "one.tum").read_text().splitlines()[1].startswith("0.0 0.1 ")
+    assert (tmp_path / "one.tum").read_text().splitlines()[2].startswith("0.0 0.1 ")
 
 
 def test_a_file_per_body_is_needed_from_two_bodies_on() -> None:
@@ -155,6 +155,18 @@ def test_a_file_per_body_is_needed_from_two_bodies_on() -> None:
     names = [each.name for each in written_paths(path, "tum", ["tool", "cup/1"])]
     assert names == ["poses.tool.tum", "poses.cup_1.tum"]
     assert written_paths(path, "jsonl", ["tool", "cup"]) == [path]
+
+
+def test_names_that_files_take_alike_are_told_apart(tmp_path: Path) -> None:
+    labels = ("a.b", "a_b", "A_B", "a_b_1")
+    names = [each.name for each in written_paths(Path("t.tum"), "tum", labels)]
+    assert names == ["t.a_b.tum", "t.a_b_1.tum", "t.A_B_2.tum", "t.a_b_1_3.tum"]
+    estimates = [replace(each, instance=None) for each in three_bodies(1)[:2]]
+    alike = [replace(one, object=name) for one, name in zip(estimates, labels, strict=False)]
+    file = file_of(tmp_path, "poses.jsonl", alike)
+    for _ in range(2):  # the second time over its own
+        convert_poses(ConvertRequest(file.path, tmp_path / "t.tum"))
+    assert {path.name for path in tmp_path.glob("*.tum")} == set(names[:2])
 
 
 def test_numbers_of_identical_bodies_are_assigned_once(tmp_path: Path) -> None:

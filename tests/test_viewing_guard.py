@@ -67,6 +67,12 @@ def test_what_is_no_port_is_refused_with_what_is_allowed(text: str) -> None:
         listen(text)
 
 
+@pytest.mark.parametrize("text", ["a..b:80", ".a:80", f"{'a' * 64}:80"])
+def test_what_can_be_no_host_is_refused_with_what_is_allowed(text: str) -> None:
+    with pytest.raises(SessionError, match=r"found no host '.*'; allowed are a port \(8080;"):
+        listen(text)
+
+
 def test_a_port_that_is_taken_is_refused_not_replaced(taken: int) -> None:
     with pytest.raises(SessionError, match=r"cannot listen there: .*name another port"):
         listen(str(taken))

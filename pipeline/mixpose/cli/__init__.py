@@ -31,6 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             status = _status(list(sys.argv[1:] if arguments is None else arguments))
     except KeyboardInterrupt:  # while the commands were being imported
         status = _interrupted()
+    except EOFError as error:  # likewise
+        from mixpose.cli.cut import cut_message  # noqa: PLC0415
+
+        status = _fail(cut_message(error), WRONG_USAGE)
     sys.exit(status)
 
 

@@ -106,13 +106,33 @@ def _poses(session: Session, asked: DesignRequest) -> Floats:
         return spread_poses(
             session, asked.count, volume=volume, turn_deg=asked.turn, seed=asked.seed
         )
-    read = read_poses(asked.poses)
-    poses = [pose.T_world_object for pose in read.poses if pose.T_world_object is not None]
-    if not poses:
-        raise SessionError(f"--poses {asked.poses}: holds no pose")
+    poses = _read(asked.poses, session)
     if len(poses) > _MOST_POSES:
         poses = [poses[int(k)] for k in np.linspace(0, len(poses) - 1, _MOST_POSES)]
     return np.array(poses)
+
+
+def _read(path: Path, session: Session) -> list[Floats]:
+    """Poses of the session's body from a file; a SessionError if it has none of its unit."""
+    read = read_poses(path)
+    if read.unit not in (None, session.unit):
+        raise SessionError(
+            f"--poses {path}: found the unit {read.unit}; allowed: that of the session, "
+            f"{session.unit}"
+        )
+    name = session.body.name
+    poses = [
+        pose.T_world_object
+        for pose in read.poses
+        if pose.T_world_object is not None and pose.object == name
+    ]
+    if not poses:
+        others = ", ".join(dict.fromkeys(pose.object for pose in read.poses)) or "none"
+        raise SessionError(
+            f"--poses {path}: holds no pose of {name!r}, the body of {session.path}; found lines "
+            f"of {others}"
+        )
+    return poses
 
 
 def _three(option: str, text: str) -> Floats:

@@ -6,6 +6,9 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
+from mixpose.cli.cut import cut_message
+from mixpose.errors import SessionError
+
 GROUPS = {
     "Before poses": ("import", "calibrate", "learn", "check", "design"),
     "Poses": ("run", "inspect"),
@@ -93,6 +96,13 @@ class Command(TyperCommand):
 
 class Commands(TyperGroup):
     """All commands, in groups, each with its whole sentence."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; an EOFError is no interrupt, which typer takes it for."""
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise SessionError(cut_message(error)) from error
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write commands by group."""

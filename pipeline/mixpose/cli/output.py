@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -12,17 +13,21 @@ from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
+from mixpose.poses.benchmarks import BOP_COLUMNS, TUM_COLUMNS
+from mixpose.poses.csvtable import FRAME_COLUMNS
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
-from mixpose.poses.writing import PoseWriter
+from mixpose.poses.writing import NO_TIMES, PoseWriter
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
-_FIRST_WORDS = (
-    *('{"type": "header"', "frame,time_s,object", "scene_id,im_id"),
-    *("# time is the frame number", "# frame "),
+_HEADER = '{"type": "header"'
+_FIRST_LINES = re.compile(
+    rf"{re.escape(_HEADER)}.*|{','.join(FRAME_COLUMNS[:3])},.*|{re.escape(BOP_COLUMNS)}"
+    rf"|{re.escape(TUM_COLUMNS)}|{re.escape(NO_TIMES)}|# frame -?\d+, (ok|ambiguous)"
 )
+"""Of files of poses, whole as they are written."""
 
 
 class Output:
@@ -105,7 +110,8 @@ class OutputPerBody(ExitStack):
                 "with -o: each body gets one with its own name in it"
             )
         self._outputs = {
-            label: self.enter_context(start(body_path(path, label))) for label in labels
+            label: self.enter_context(start(own))
+            for label, own in zip(labels, _body_paths(path, labels), strict=True)
         }
 
     def write(self, estimate: Estimate) -> None:
@@ -113,10 +119,18 @@ class OutputPerBody(ExitStack):
         self._outputs[estimate.label].write(estimate)
 
 
-def body_path(path: Path, label: str) -> Path:
-    """Where the poses of one of several bodies go: ``poses.tum`` → ``poses.tool.tum``."""
-    word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
-    return path.with_name(f"{path.stem}.{word}{path.suffix}")
+def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
+    """Where the poses of several bodies go: ``poses.tum`` → ``poses.tool.tum``; no two alike."""
+    words: list[str] = []
+    taken: set[str] = set()  # some file systems know no capitals
+    for label in labels:
+        plain = word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
+        number = len(words)
+        while word.casefold() in taken:
+            word, number = f"{plain}_{number}", number + 1
+        taken.add(word.casefold())
+        words.append(word)
+    return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
 def is_apart(format_name: str, labels: Sequence[str]) -> bool:
@@ -126,7 +140,7 @@ def is_apart(format_name: str, labels: Sequence[str]) -> bool:
 
 def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
     """The files that poses go to."""
-    return [body_path(path, label) for label in labels] if is_apart(format_name, labels) else [path]
+    return _body_paths(path, labels) if is_apart(format_name, labels) else [path]
 
 
 def _as_stream(file: LineFile) -> TextIO:
@@ -140,27 +154,27 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     Raises SessionError if it is an input of the run, or holds something else.
     """
     beginning = _beginning(path, inputs)
-    first = beginning.partition("\n")[0]
-    numbers_only = first and all(_is_number(word) for word in first.split())
+    first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
-    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
+    if beginning and not (_FIRST_LINES.fullmatch(first) or is_rerun):
         raise _foreign(path)
-    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
+    if first.startswith(_HEADER) and '"mixpose": ' not in first:
         raise SessionError(f"-o {path}: holds poses of another origin; name another file")
 
 
 def refuse_to_overwrite_but(
-    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
+    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
     """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
     it; standard output is.
 
-    Raises SessionError if it is one of the inputs, or holds something else; `option` named it.
+    `begins` is what the very first characters have to be. Raises SessionError if it is one of the
+    inputs, or holds something else; `option` named it.
     """
     if is_stdout(path):
         return
     beginning = _beginning(path, inputs, option)
-    if beginning and mark not in beginning:
+    if beginning and not (beginning.startswith(begins) and mark in beginning):
         raise _foreign(path, option)
 
 
@@ -182,14 +196,6 @@ def _foreign(path: Path, option: str = "-o") -> SessionError:
     return SessionError(
         f"{option} {path}: holds something that mixpose did not write; name another file"
     )
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def is_stdout(named: Path | None) -> bool:

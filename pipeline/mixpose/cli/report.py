@@ -30,5 +30,5 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
             f"name it {output.with_suffix('.html').name}, and print that for a PDF"
         )
     write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
-    count = len(poses.poses)
+    count = len({line.frame for line in poses.poses})
     say(f"{count} frame{'s' * (count != 1)} -> {shown(output)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -216,7 +217,9 @@ def _inputs(session: Session) -> Iterator[Path]:
         for name in names:
             yield session.folder / name
             if isinstance(setup.source, str) and "://" not in name:
-                yield from session.folder.glob(name) if not Path(name).is_absolute() else ()
+                # as its frames are found: Path.glob takes other patterns
+                found = glob.glob(name, root_dir=session.folder, recursive=True)  # noqa: PTH207
+                yield from (session.folder / each for each in found)
         if setup.times is not None:
             yield setup.times
 

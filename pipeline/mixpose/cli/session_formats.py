@@ -20,7 +20,14 @@ from mixpose.errors import SessionError
 from mixpose.frames import Source
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, numbers_of, rate_of, write_c3d, write_trc
+from mixpose.poses.trajectories import (
+    MARKS,
+    Trajectories,
+    numbers_of,
+    rate_of,
+    write_c3d,
+    write_trc,
+)
 from mixpose.rigid import transform
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
@@ -48,7 +55,8 @@ def write_markers(
     if format_name == "c3d":
         _require_c3d(output)
     if output is not None:
-        refuse_to_overwrite_but(output, [poses.path], "mixpose")
+        begins, mark = MARKS[format_name]
+        refuse_to_overwrite_but(output, [poses.path, session.path], mark, begins=begins)
     if not any(line.points for line in lines):
         without = f"{poses.path}: no frame has a marker that was measured"
         hint = "run again with --labels, and two sensors or more that see a marker"

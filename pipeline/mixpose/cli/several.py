@@ -100,8 +100,9 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     Raises SessionError if there is no folder for the poses, or an option serves a single recording.
     """
     alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
+    alone["--pause"] = "" if request.pause else None
     for option, value in alone.items():
-        if value or value == "":  # the usual port
+        if value or value == "":  # the usual port, or an option without a value
             shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
             raise SessionError(
                 f"{option}{shown}: found {len(sessions)} sessions, allowed with one only"

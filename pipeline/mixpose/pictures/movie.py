@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import cv2
 
@@ -22,6 +24,7 @@ CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 _DEFAULT_FPS = 25.0
 _SLOWEST, _FASTEST = 0.5, 120.0
+_WAITING = 9  # frames, whose gaps tell the rate where a few of them are missing
 
 
 class Overlay:
@@ -108,24 +111,24 @@ class VideoSink:
     def __init__(self, path: Path) -> None:
         refuse_foreign(path, "--overlay")
         self._path, self._part = path, partial_of(path)
-        self._first: tuple[Picture, float | None] | None = None
+        self._waiting: list[tuple[Picture, float | None]] = []
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
         self._count = 0
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
-        """Write the picture of a frame; the first waits for the second, which tells the rate."""
-        if self._writer is None and self._first is None:
-            self._first = picture, time_s
+        """Write the picture of a frame; the first ones wait for others, which tell the rate."""
+        if self._writer is not None:
+            self._write(picture)
             return
-        if self._first is not None:
-            self._open(_rate(self._first[1], time_s))
-        self._write(picture)
+        self._waiting.append((picture, time_s))
+        if len(self._waiting) == _WAITING:
+            self._open()
 
     def close(self) -> None:
         """Finish the file, sign it and put it in its place: until then it has another name."""
-        if self._first is not None:
-            self._open(_DEFAULT_FPS)
+        if self._waiting:
+            self._open()
         if self._writer is None:
             return
         self._writer.release()
@@ -146,10 +149,10 @@ class VideoSink:
         finally:
             self._part.unlink(missing_ok=True)
 
-    def _open(self, fps: float) -> None:
-        if self._first is None:
-            return
-        picture, self._first = self._first[0], None
+    def _open(self) -> None:
+        """Begin with the pictures that wait."""
+        waiting, self._waiting = self._waiting, []
+        picture, fps = waiting[0][0], _rate([time_s for _, time_s in waiting])
         # codecs want even sides
         self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
         codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
@@ -159,7 +162,8 @@ class VideoSink:
             raise SessionError(
                 f"--overlay {self._path}: cannot be written as a video; name an .avi, or a folder"
             )
-        self._write(picture)
+        for picture, _ in waiting:
+            self._write(picture)
 
     def _write(self, picture: Picture) -> None:
         if self._writer is not None:
@@ -167,8 +171,11 @@ class VideoSink:
             self._count += 1
 
 
-def _rate(first: float | None, second: float | None) -> float:
-    """Frames per second from the times of two frames."""
-    if first is None or second is None or second <= first:
-        return _DEFAULT_FPS
-    return min(max(1 / (second - first), _SLOWEST), _FASTEST)
+def _rate(times: Sequence[float | None]) -> float:
+    """Frames per second from the times of the first frames."""
+    gaps = [
+        later - earlier
+        for earlier, later in pairwise(times)
+        if earlier is not None and later is not None and later > earlier
+    ]
+    return min(max(1 / median(gaps), _SLOWEST), _FASTEST) if gaps else _DEFAULT_FPS

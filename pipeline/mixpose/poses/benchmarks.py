@@ -15,14 +15,20 @@ from mixpose.poses.header import UNITS_PER_METRE, Header
 from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate
 
+TUM_COLUMNS = "# time tx ty tz qx qy qz qw, in s and m, by mixpose"
 BOP_COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 
 class TumWriter(PoseWriter):
-    """Writes one line per frame that has a pose; lost frames are left out."""
+    """Writes one line per frame that has a pose; lost frames are left out.
+
+    The first line is a comment, which tells own files from those of others.
+    """
 
     def __init__(self, stream: TextIO, header: Header) -> None:
         super().__init__(stream, header)
+        self._stream.write(TUM_COLUMNS + "\n")
+        self._stream.flush()
         self._stamps = Stamps(stream, "tum")
 
     def _write(self, estimate: Estimate) -> None:

@@ -327,13 +327,14 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
 
 def _kind_of(line: str) -> str:
     """What a line is that is no JSON: one of another format that poses are written in."""
+    trajectory = "found a .tum trajectory, which is not read back"
     others = {
         "frame,time_s,": "found a .csv table of poses, which is not read back",
         "scene_id,im_id,": "found a .bop.csv table, which is not read back",
-        "# time is the frame number": "found a .tum trajectory, which is not read back",
+        "# time ": trajectory,
     }
     if _NUMBERS.fullmatch(line.strip()):
-        return others["# time is the frame number"]
+        return trajectory
     return next((each for start, each in others.items() if line.startswith(start)), "not JSON")
 
 

@@ -27,6 +27,9 @@ from mixpose.records import Floats, Mask
 TRC_MARK = "by mixpose"
 """In the first line of files that mixpose wrote."""
 
+MARKS = {"trc": ("PathFileType\t", TRC_MARK), "c3d": ("\x02P", "mixpose")}
+"""How files of a format begin, and what stands further on in those that mixpose wrote."""
+
 LAST_FRAME = 2**16 - 2
 """Frames are numbered from 1, in 16 bits; some readers count one beyond the last."""
 

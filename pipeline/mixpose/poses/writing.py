@@ -82,6 +82,9 @@ def _is_finite(value: Floats | float) -> bool:
     return bool(np.isfinite(value).all())
 
 
+NO_TIMES = "# time is the frame number: the recording has no times"
+
+
 class Stamps:
     """The time of each pose; where the recording has none the frame number, as a comment says."""
 
@@ -98,7 +101,7 @@ class Stamps:
         if self._has_times is None:
             self._has_times = has_time
             if not has_time:
-                self._stream.write("# time is the frame number: the recording has no times\n")
+                self._stream.write(f"{NO_TIMES}\n")
         if has_time != self._has_times:
             found = "a time" if has_time else "no time"
             raise RecordingError(

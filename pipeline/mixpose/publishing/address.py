@@ -34,7 +34,17 @@ class Address:
         found = self.port or port
         if not self.host or found is None:
             raise self.error(f"found no host and port; allowed: {example}")
+        self.require_host(self.host)
         return self.host, found
+
+    def require_host(self, host: str) -> None:
+        """Raise an error for what can be no name of a host, as one with two dots in a row."""
+        try:
+            host.encode("idna")  # as systems look it up
+        except UnicodeError:
+            raise self.error(
+                f"host: found {host!r}; allowed: a number, or words with a dot between them"
+            ) from None
 
     def allow(self, *names: str) -> None:
         """Raise an error for options other than these, and those that all addresses have."""

@@ -106,7 +106,7 @@ class Channel:
         self._backlog = Backlog(rules.waiting)
         self._latencies = deque[float](maxlen=_REMEMBERED)
         self._stamped_by: str | None = None
-        self._sent = self._unheard = self._too_large = 0
+        self._sent = self._unheard = self._too_large = self._failed = 0
         self._is_away = False
         self._began: float | None = None  # when the send began that goes on
         self._thread = threading.Thread(target=self._work, name="mixpose-publish", daemon=True)
@@ -140,6 +140,7 @@ class Channel:
         text += f", {self._unheard} more while nobody listened" if self._unheard else ""
         text += f", {dropped} dropped: the receiver was away or too slow" if dropped else ""
         text += f", {self._too_large} dropped: too large" if self._too_large else ""
+        text += f", {self._failed} dropped: they could not be sent" if self._failed else ""
         if self._latencies:
             median, most = 1e3 * np.quantile(self._latencies, [0.5, 0.99])
             text += f"; {median:.1f} ms after {self._stamped_by}, 99 % within {most:.1f} ms"
@@ -155,12 +156,6 @@ class Channel:
                 self._began = time.monotonic()
                 heard = self._sender.send(message)
                 self._began = None
-            except TooLargeError as error:
-                self._began = None
-                self._too_large += 1
-                if self._too_large == 1:
-                    self._tell(f"warning: --publish {self._address.text}: {error}; not sent")
-                continue
             except OSError as error:
                 self._began = None
                 self._backlog.put_back(message)
@@ -176,6 +171,10 @@ class Channel:
                 if self._backlog.waits_for_end(self._rules.retry_s):
                     self._backlog.give_up()
                 continue
+            except Exception as error:  # of this message alone: the next may go
+                self._began = None
+                self._count_unsent(message, error)
+                continue
             if self._is_away:
                 self._is_away = False
                 self._tell(f"--publish {self._address.text}: the receiver is there")
@@ -184,6 +183,20 @@ class Channel:
             if message.moment is not None:
                 self._latencies.append(message.late_s)
                 self._stamped_by = message.moment.of
+
+    def _count_unsent(self, message: Message, error: Exception) -> None:
+        """Count a message that no receiver can get, and tell the first of its kind."""
+        is_large = isinstance(error, TooLargeError)
+        self._too_large += is_large
+        self._failed += not is_large
+        if is_large and self._too_large == 1:
+            self._tell(f"warning: --publish {self._address.text}: {error}; not sent")
+        elif not is_large and self._failed == 1:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            self._tell(
+                f"warning: --publish {self._address.text}: frame {message.estimate.frame} cannot "
+                f"be sent: {reason}; the run goes on"
+            )
 
 
 class Publishing:

@@ -154,6 +154,7 @@ class RosbridgeSender(Sender):
         if not (host and port.isdigit() and 0 < int(port) < 2**16):
             raise address.error(f"bridge: found {self._bridge}; allowed: host:port")
         self._place = host.strip("[]"), int(port)
+        address.require_host(self._place[0])
         self._topics = topics(address, header)
         self._connection: ClientConnection | None = None
         self._is_sending = False

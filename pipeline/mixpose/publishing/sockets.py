@@ -130,9 +130,9 @@ def _is_labelled(estimate: Estimate) -> bool:
 class OscSender(Datagrams):
     """Sends to ``osc://host:port/prefix``, whether anybody listens there or not.
 
-    A message ``/prefix/<body>`` has the frame number (i), the time of the frame in seconds (d;
-    of a live source those since 1970), the status (s), and but for a lost frame x y z in the unit
-    of the session and the quaternion x y z w (7 f).
+    A message ``/prefix/<body>`` has the frame number (i; h beyond 32 bits), the time of the frame
+    in seconds (d; of a live source those since 1970), the status (s), and but for a lost frame
+    x y z in the unit of the session and the quaternion x y z w (7 f).
     """
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -147,7 +147,8 @@ class OscSender(Datagrams):
 
         estimate = message.estimate
         built = OscMessageBuilder(f"{self._prefix}/{path_word(estimate.label)}")
-        built.add_arg(int(estimate.frame), "i")
+        frame = int(estimate.frame)
+        built.add_arg(frame, "i" if -(2**31) <= frame < 2**31 else "h")
         time_s = estimate.time_s if message.unix_s is None else message.unix_s
         built.add_arg(float(estimate.frame if time_s is None else time_s), "d")
         built.add_arg(estimate.status, "s")

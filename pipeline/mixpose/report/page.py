@@ -255,7 +255,7 @@ def _sensor_rows(
 def _unit_of(origin: Origin, series: Series) -> Callable[[str], str]:
     """Unit of the residuals of a sensor, as far as the session can tell."""
     setups = () if origin.session is None else origin.session.sensors
-    units = {s.name: series.unit if s.model == "lateration" else "px" for s in setups}
+    units = {s.name: "px" if s.sensor.unit == "px" else series.unit for s in setups}
     return lambda name: units.get(name, "sensor units")
 
 

@@ -70,6 +70,8 @@ def listen(text: str) -> Place:
     host, port = (found["host"] or LOOPBACK).strip("[]"), int(found["port"])
     try:
         return _listen(host, port)
+    except UnicodeError as error:  # of names that can be no host, as one with two dots in a row
+        raise SessionError(f"--view {text}: found no host {host!r}; {_ALLOWED}") from error
     except OSError as error:
         reason = error.strerror or str(error)
         raise SessionError(
