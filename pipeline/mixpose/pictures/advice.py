@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.extraction.blobs import find_blobs
 from mixpose.extraction.options import ExtractOptions
 from mixpose.pictures.finding import Expectation, Finding
 from mixpose.pictures.light import Light
@@ -213,13 +212,14 @@ def _sorted_out(
 
 def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[str]:
     """What tells found things that belong to no feature from those that do."""
-    if finding.points is None or not expected.unexplained.any():
+    pattern = None if finding.view is None else finding.view.observation.pattern
+    if not isinstance(pattern, PointPattern) or not expected.unexplained.any():
         return []
-    sizes, peaks = [], []
-    for blob in find_blobs([(light.scene, light.options)])[0]:
-        place, radius = np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi)
-        sizes.append(blob.area)
-        peaks.append(float(light.raw[_around(place, radius, light.raw.shape)].max()))
+    # of several bodies these are what the others leave, and not all blobs of the image
+    peaks = [
+        float(light.raw[_around(place, radius, light.raw.shape)].max())
+        for place, radius in zip(pattern.points, pattern.radii.tolist(), strict=True)
+    ]
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
     unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
@@ -227,7 +227,7 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
         # what looks like clutter may be the markers
         where = "shows more of the body" if expected.sure else "is ok"
         return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
-    size, peak = np.array(sizes), np.array(peaks)
+    size, peak = np.pi * pattern.radii**2, np.array(peaks)
     own = ~extra
     if size[extra].max() < 0.8 * size[own].min():
         middle = np.sqrt(size[extra].max() * size[own].min())

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import Observation
 from mixpose.judgement import JudgementRules
 from mixpose.matching import AssociationRules, Matches, associate
 from mixpose.objective import View, matched_objective
@@ -97,9 +96,7 @@ def _unexplained(view: View, others: Sequence[Sequence[Finding]]) -> View:
     for finding in (one for each in others for one in each):
         if finding.name == view.name and finding.expectation is not None:
             left &= finding.expectation.unexplained
-    rest = PointPattern(pattern.points[left], pattern.weights[left])
-    seen = view.observation
-    return replace(view, observation=Observation(rest, seen.sigma, seen.intrinsic))
+    return replace(view, observation=view.observation.only(left))
 
 
 def _finding(
