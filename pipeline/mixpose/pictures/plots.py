@@ -209,12 +209,12 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
 
 def _span(finding: Finding) -> tuple[float, float]:
     """The ranges worth showing: around what is expected, else all that was measured."""
-    if finding.view is None or (finding.expectation is None and finding.view.observation.is_empty):
-        return 0.0, 1.0
     shown = np.zeros(0)
     if finding.expectation is not None:
         shown = finding.expectation.y[finding.expectation.seen, 0]
     if not len(shown):
+        if finding.view is None or finding.view.observation.is_empty:
+            return 0.0, 1.0
         shown = np.concatenate(finding.view.observation.extent)
     margin = max(_AROUND * float(np.ptp(shown)), _LEAST_AROUND * finding.sigma)
     return float(shown.min()) - margin, float(shown.max()) + margin
