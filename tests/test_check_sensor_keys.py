@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from inspected import copied, left_image, write_left
 
+from mixpose import runner
 from mixpose.checking import key_warnings
 from mixpose.cli.check import check_session
 from mixpose.sensors import PinholeCamera
@@ -80,3 +82,19 @@ source = "anchor{k}.csv"
     path.write_text(text + '\n[estimator]\nfree = ["x", "y", "rz"]\n', encoding="utf-8")
     check_session(path)
     assert "do not determine" not in capsys.readouterr().out
+
+
+def test_a_flood_of_features_of_which_none_is_used_is_too_many_and_not_too_few(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "MOST_DETECTIONS", 40)
+    recording = copied(tmp_path / "recording")
+    image = left_image(recording)
+    for u in range(20, 620, 10):
+        image[10:13, u : u + 3] = 160
+    write_left(recording, image)
+    check_session(recording / "session.toml")
+    report = capsys.readouterr().out
+    assert "features per frame: 67 / 67 / 67" in report
+    assert "sensor 'left': too many features, 67 in frame" in report
+    assert "with min_area = 10 in its own [sensor.extract] it would be 7" in report

@@ -124,7 +124,8 @@ class _Recording:
         for setup in self.session.sensors:
             found = self.surveys[setup.name]
             counts = found.counts or [1] * len(found.counted)
-            most, empty = expected_count(setup, self.session), {*found.empty}
+            most = expected_count(setup, self.session)
+            empty = {*found.empty, *(n for n, each in found.found.items() if not each.data.size)}
             pairs = zip(found.counted, counts, strict=True)
             shown.append({n: 0.0 if n in empty else float(min(k, most)) for n, k in pairs})
         return shown

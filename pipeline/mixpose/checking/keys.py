@@ -19,7 +19,7 @@ from mixpose.extraction import METHODS, ExtractOptions
 from mixpose.fit import free_mask
 from mixpose.frames import files_of
 from mixpose.objective import View
-from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame
+from mixpose.records import FrameSet, Image, RawFrame
 from mixpose.runner import begin, observe, source_spec
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
@@ -56,11 +56,11 @@ def advice(
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
     frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
-    before = len(_points(_found(session, setup, frame, {})))
+    before = _count(_found(session, setup, frame, {}))
     trials = []
     for key, value in _trials(options, image):
         views = _found(session, setup, frame, {key: value})
-        count = len(_points(views))
+        count = _count(views)
         if count >= 0.9 * expected and judge(count, expected) is None:
             trials.append(_Trial(key, value, count, views))
     # the rule that goes by each image comes first, as a number may suit this image alone
@@ -151,11 +151,10 @@ def _found(
         return []
 
 
-def _points(views: Sequence[View]) -> Floats:
-    """The features found, where they are points."""
-    patterns = [view.observation.pattern for view in views]
-    found = [each.points for each in patterns if isinstance(each, PointPattern)]
-    return np.concatenate(found) if found else np.zeros((0, 2))
+def _count(views: Sequence[View]) -> int:
+    """How many features were found, where they are points."""
+    seen = [view.observation for view in views]
+    return sum(each.found for each in seen if each.points is not None)
 
 
 def key_warnings(session: Session) -> list[str]:

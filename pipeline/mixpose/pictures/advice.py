@@ -62,7 +62,8 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
         if finding.setup.sensor.dimension == 1:
             found = f"echoes as of {finding.count:.1f} points"
     else:
-        found = f"{len(finding.points)} feature{'s' * (len(finding.points) != 1)} found"
+        found = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
+        found += ", which are too many to use any" * (finding.passed_over > 0)
     expected = finding.expectation
     if expected is None:
         return f"{found}; without a pose up to {len(body)} are expected"
@@ -102,11 +103,7 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
     """Advice for blobs and intensity."""
     options = light.options
     lines = []
-    if (
-        light.share > _FLOODED
-        and finding.points is not None
-        and len(finding.points) > 3 * len(body)
-    ):
+    if light.share > _FLOODED and finding.points is not None and finding.count > 3 * len(body):
         stricter = _direction(options, lower=False, level=light.level)
         if options.method == "blobs":
             stricter += f", raise min_area = {options.min_area:g} or set max_area"
@@ -115,7 +112,7 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
             'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
-    if expected is None:
+    if expected is None or finding.passed_over:
         return lines + _about_number(finding, body, light)
     lines += _about_missing(finding, expected, light, body)
     if options.method == "blobs":
@@ -294,7 +291,7 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
     """Advice for corners, unsharp spots and the user's own method."""
     options = finding.setup.extract
     expected = finding.expectation
-    if expected is None:
+    if expected is None or finding.passed_over:
         few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
