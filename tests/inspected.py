@@ -36,7 +36,7 @@ def left_image(recording: Path) -> NDArray[np.uint8]:
     return np.asarray(image, dtype=np.uint8)
 
 
-def write_left(recording: Path, image: NDArray[np.generic]) -> None:
+def write_left(recording: Path, image: NDArray[np.uint8] | NDArray[np.float32]) -> None:
     cv2.imwrite(str(recording / f"left{FRAME:04d}.png"), image)
 
 

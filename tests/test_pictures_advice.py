@@ -25,7 +25,7 @@ from mixpose.cli import main
 from mixpose.selection import Selection
 
 
-def command(*arguments: str | Path | int) -> int:
+def command(*arguments: str | Path | float) -> int:
     with pytest.raises(SystemExit) as leaving:
         main([str(argument) for argument in arguments])
     return int(str(leaving.value.code))

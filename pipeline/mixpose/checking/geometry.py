@@ -242,8 +242,12 @@ def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Chan
     polarity: Literal["bright", "dark"] = "dark" if is_bright else "bright"
     setups = [replace(s, extract=replace(s.extract, polarity=polarity)) for s in session.sensors]
     changed = replace(session, sensors=tuple(setups))
+    own = [setup.name for setup in session.sensors if "polarity" in setup.own]
+    tables = ["[extract]"] if len(own) < len(setups) else []
+    tables += [f"[sensor.extract] of {called(own)}"] if own else []
     change = Change(
-        f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
+        f"features {{are}} {polarity} in the images",
+        f'with polarity = "{polarity}" in {" and in ".join(tables)}',
     )
     anew = replace(recording, surveys={}).read(numbers)
     return [(change, [(each.number, observe(changed, each)) for each in anew])]

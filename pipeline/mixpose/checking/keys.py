@@ -73,7 +73,8 @@ def advice(
     if chosen is not None:
         value = chosen.value
         written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
-        return f"with {chosen.key} = {written} {_SHARED} it would be {chosen.found}"
+        where = setup.table_of(chosen.key)
+        return f"with {chosen.key} = {written} in {where} it would be {chosen.found}"
     if before > expected:
         left = [trial.found for trial in trials if trial.value == "auto"]
         rule = f', nor with threshold = "auto", which leaves {left[0]}' if left else ""
@@ -83,7 +84,10 @@ def advice(
         )
     keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
     usual = "polarity, threshold, min_area and max_area"
-    return f"change {keys.get(options.method, usual)} in [extract]"
+    change = keys.get(options.method, usual)
+    own = [key for key in re.findall(r"\w+", change) if key in setup.own]
+    beside = f", {' and '.join(own)} {_OWN}" if own else ""
+    return f"change {change} {_SHARED}{beside}"
 
 
 def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
@@ -182,17 +186,18 @@ def _off_centre(session: Session) -> list[str]:
 
 def _too_wide(session: Session) -> list[str]:
     """Ranges given a width in which the whole body disappears, as by the default for pixels."""
-    names = [
-        f"{setup.name!r}"
+    wide = [
+        setup
         for setup in session.sensors
         if isinstance(setup.sensor, RangeSensor) and setup.extract.sigma > session.body.radius
     ]
-    if not names:
+    if not wide:
         return []
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    sigma = max(s.extract.sigma for s in session.sensors if isinstance(s.sensor, RangeSensor))
+    more = f" and {len(wide) - 1} more" if len(wide) > 1 else ""
+    widest = max(wide, key=lambda setup: setup.extract.sigma)
+    sigma, where = widest.extract.sigma, widest.table_of("sigma")
     return [
-        f"sensor {names[0]}{more}: sigma = {sigma:g} {session.unit} in [extract] is wider than "
+        f"sensor {wide[0].name!r}{more}: sigma = {sigma:g} {session.unit} in {where} is wider than "
         f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
         "about what ranges err by"
     ]

@@ -318,7 +318,7 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
             return []
         return [
             "far more echoes than features: noise fills the profile; take its floor off, or raise "
-            "sigma in [extract]"
+            f"sigma in {finding.setup.table_of('sigma')}"
         ]
     if expected is None:
         return []
@@ -337,8 +337,8 @@ def _about_sigma(finding: Finding) -> list[str]:
         return []
     return [
         f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
-        f"sigma in [extract] to about {expected.rms:.2g}, where markers give way on the body set "
-        "sigma in [object], or check calibration and markers"
+        f"sigma in {finding.setup.table_of('sigma')} to about {expected.rms:.2g}, where markers "
+        "give way on the body set sigma in [object], or check calibration and markers"
     ]
 
 
