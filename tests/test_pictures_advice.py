@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from inspected import (
@@ -22,6 +24,8 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose import runner
 from mixpose.cli import main
+from mixpose.extraction import ExtractOptions, extract
+from mixpose.rigid import transform
 from mixpose.selection import Selection
 
 
@@ -74,3 +78,93 @@ def test_a_flood_of_features_of_which_none_is_used_is_too_many_and_not_too_few(
         assert "far more than the object has" in text or "too many: look which" in text
         assert "too few" not in text
         assert "not met" not in text
+
+
+def as_floats(recording: Path, image: NDArray[np.float64]) -> None:
+    """Grey values of the left image, in parts of 255."""
+    (recording / f"left{FRAME:04d}.png").unlink()
+    cv2.imwrite(str(recording / f"left{FRAME:04d}.tif"), (image / 255).astype(np.float32))
+    session = recording / "session.toml"
+    session.write_text(session.read_text().replace("left*.png", "left*.tif"))
+
+
+def with_clutter(image: NDArray[Any], grey: int) -> NDArray[np.float64]:
+    """Things as large as markers along the upper edge."""
+    spoilt = image.astype(np.float64)
+    for u in range(200, 600, 100):
+        cv2.circle(spoilt, (u, 20), 4, grey, -1)
+    return spoilt
+
+
+def beside_a_wall(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """With a wall at the left that is lit, smooth and as bright as clutter, but no feature."""
+    u, rng = np.arange(image.shape[1]), np.random.default_rng(0)
+    wall = 150 * np.exp(-(((u - 20) / 70.0) ** 2)) * np.ones(image.shape)
+    lit = image + wall + rng.normal(0, 4, image.shape) * (wall > 2)
+    return np.asarray(np.clip(lit, 0, 255), dtype=np.uint8)
+
+
+def followed(session: Path, method: str, number: str) -> int:
+    """How many points are found at a threshold that was told."""
+    image = left_image(session.parent)
+    options = ExtractOptions(method, threshold=float(number))
+    return extract(image, options).size
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_faint_clutter_is_left_out_by_a_threshold_only_where_the_light_is_even(
+    lit: bool, recording: Path, pose: NDArray[np.float64]
+) -> None:
+    image = with_clutter(left_image(recording), 100)
+    write_left(recording, beside_a_wall(image) if lit else image.astype(np.uint8))
+    text = advice_for(recording / "session.toml", FRAME, pose)
+    assert "4 found belong to no feature, all fainter than those that do; they do no harm" in text
+    told = re.search(r"threshold = (\S+) would leave them out", text)
+    assert (told is None) == lit
+    if told is not None:
+        assert followed(recording / "session.toml", "blobs", told[1]) == 7
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_a_marker_before_something_bright_is_parted_by_a_threshold_only_in_even_light(
+    lit: bool, recording: Path, pose: NDArray[np.float64]
+) -> None:
+    session = mixpose.load_session(recording / "session.toml")
+    y, _ = session.sensors[0].sensor.project(transform(pose, session.body.means))
+    image = left_image(recording)
+    hand = np.zeros_like(image)
+    cv2.circle(hand, np.rint(y[0]).astype(int).tolist(), 40, 90, -1)
+    image = np.maximum(image, hand)
+    write_left(recording, beside_a_wall(image) if lit else image)
+    text = advice_for(recording / "session.toml", FRAME, pose)
+    assert "not met though bright there: feature" in text
+    assert ("no threshold parts them" in text) == lit
+    assert (re.search(r"threshold = \d+ parts them", text) is None) == lit
+
+
+def test_thresholds_of_images_of_parts_are_told_to_three_digits(
+    recording: Path, pose: NDArray[np.float64]
+) -> None:
+    as_floats(recording, with_clutter(left_image(recording), 100))
+    text = advice_for(recording / "session.toml", FRAME, pose)
+    assert re.search(r"threshold = 0\.\d\d\d would leave them out", text)
+    assert re.search(r": 0\.\d\d\d grey levels above the background, whose noise is 0\.00\d", text)
+
+
+@pytest.mark.parametrize(
+    ("lines", "known", "words"),
+    [
+        ("min_area = 60", True, r"a grey level below 0\.\d\d\d, that of"),
+        ("threshold = 0.6", True, r"lower it: threshold = 0\.28\d"),
+        ('threshold = "otsu"', False, r"threshold = 0\.\d\d finds 8 in this frame"),
+    ],
+)
+def test_thresholds_that_find_more_in_images_of_parts_are_no_whole_numbers(
+    lines: str, known: bool, words: str, recording: Path, pose: NDArray[np.float64]
+) -> None:
+    image = left_image(recording).astype(np.float64)
+    if not known:  # a lamp, beside which markers are faint
+        cv2.circle(image, (80, 40), 20, 2000, -1)
+    as_floats(recording, image)
+    session = with_options(recording, f'method = "blobs"\n{lines}')
+    assert re.search(words, advice_for(session, FRAME, pose if known else None))
