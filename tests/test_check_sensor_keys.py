@@ -160,3 +160,17 @@ def test_a_width_of_ranges_is_said_to_stand_where_it_does() -> None:
     front = replace(front, extract=wide, own=frozenset(["sigma"]))
     (warning,) = key_warnings(replace(ranges, sensors=(front, *others)))
     assert "sigma = 500 mm in its own [sensor.extract] is wider" in warning
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_recording_without_a_frame_is_told(
+    quick: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = copied(tmp_path / "recording")
+    path = recording / "session.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("left*.png", "left.csv"))
+    (recording / "left.csv").write_text("frame,u,v\n", encoding="utf-8")
+    check_session(path, quick=quick)
+    printed = capsys.readouterr().out
+    assert "warning   sensor 'left': its recording has no frame" in printed
+    assert "sensor 'right': its recording" not in printed

@@ -168,3 +168,22 @@ def test_thresholds_that_find_more_in_images_of_parts_are_no_whole_numbers(
     as_floats(recording, image)
     session = with_options(recording, f'method = "blobs"\n{lines}')
     assert re.search(words, advice_for(session, FRAME, pose if known else None))
+
+
+def test_light_of_lines_is_not_compared_with_their_number(
+    recording: Path,
+) -> None:
+    session = with_options(recording, 'method = "intensity"')
+    text = session.read_text(encoding="utf-8")
+    points, rest = text.index("points = ["), text.index("# Near")
+    lines = (
+        "segments = [[[0, 0, 0], [90, 0, 0]], [[0, 0, 0], [0, 60, 0]], [[0, 0, 0], [0, 0, 40]]]\n\n"
+    )
+    session.write_text(text[:points] + lines + text[rest:], encoding="utf-8")
+    image = np.zeros_like(left_image(recording))
+    cv2.line(image, (200, 200), (400, 200), 200, 3)
+    cv2.line(image, (200, 200), (200, 330), 200, 3)
+    write_left(recording, image)
+    said = advice_for(session, FRAME, None)
+    assert re.search(r"left: light as of \d\d\.\d points; there is no pose", said)
+    assert "too many" not in said

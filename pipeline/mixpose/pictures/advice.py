@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.body import Body
+from mixpose.body import Body, PointFeature
 from mixpose.pictures.finding import Expectation, Finding
 from mixpose.pictures.levels import (
     FLOODED,
@@ -67,7 +67,8 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
         found += ", which are too many to use any" * (finding.passed_over > 0)
     expected = finding.expectation
     if expected is None:
-        return f"{found}; without a pose up to {len(body)} are expected"
+        expects = f"without a pose up to {len(body)} are expected"
+        return f"{found}; {expects if _can_be_counted(finding, body) else 'there is no pose'}"
     text = f"{found}; the pose has {int(expected.seen.sum())} of {len(body)} in view"
     text += f", {int(expected.met.sum())} of them met"
     if expected.rms is not None:
@@ -217,9 +218,17 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 
 
+def _can_be_counted(finding: Finding, body: Body) -> bool:
+    """Whether what was found is to be as much as the body has features: lines make more light."""
+    are_points = all(isinstance(feature, PointFeature) for feature in body.features)
+    return finding.points is not None or are_points
+
+
 def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
     """Advice without a pose: only the number of features is known."""
     options = light.options
+    if not _can_be_counted(finding, body):
+        return []
     if finding.count < 0.8 * len(body):
         lines = []
         areas = light.pieces[1] if options.method == "blobs" else np.zeros(0, np.int32)
@@ -250,6 +259,8 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
     options = finding.setup.extract
     expected = finding.expectation
     if expected is None or finding.passed_over:
+        if not _can_be_counted(finding, body):
+            return []
         few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
@@ -272,7 +283,7 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
     """Advice for tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
     if finding.points is None:
-        if finding.count <= 2 * len(body):
+        if finding.count <= 2 * len(body) or not _can_be_counted(finding, body):
             return []
         return [
             "far more echoes than features: noise fills the profile; take its floor off, or raise "
