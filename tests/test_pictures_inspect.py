@@ -143,6 +143,33 @@ def test_a_frame_that_is_not_there_names_those_that_are(
     assert not (tmp_path / "seen").exists()
 
 
+def test_frames_before_that_of_number_0_are_shown_as_they_are_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "session.toml").write_bytes(TWO_CAMERAS.read_bytes())
+    session = tmp_path / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    T = np.eye(4)
+    T[:3, 3] = 12.0, -8.0, 5.0
+    for setup in mixpose.load_session(TWO_CAMERAS).sensors:
+        text = text.replace(f"{setup.name}*.png", f"{setup.name}.csv")
+        y, _ = setup.sensor.project(transform(T, mixpose.load_session(TWO_CAMERAS).body.means))
+        rows = "".join(f"-3,{u},{v}\n" for u, v in y)
+        (tmp_path / f"{setup.name}.csv").write_text(f"frame,u,v\n{rows}", encoding="utf-8")
+    session.write_text(text, encoding="utf-8")
+    assert command("inspect", session, "--frame=-3", "-o", tmp_path / "seen") == 0
+    assert "session.toml, frame -3: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["one_camera_video", "range_profiles", "parallel_beams"])
+def test_a_number_before_the_first_frame_is_none_of_those_from_the_end(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = SYNTHETIC / name / "session.toml"
+    assert command("inspect", session, "--frame=-1", "-o", tmp_path / "seen") == 2
+    assert "--frame -1: the recording has no such frame; it has " in capsys.readouterr().err
+
+
 def test_other_peoples_files_are_not_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
