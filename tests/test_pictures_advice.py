@@ -148,7 +148,7 @@ def test_thresholds_of_images_of_parts_are_told_to_three_digits(
     as_floats(recording, with_clutter(left_image(recording), 100))
     text = advice_for(recording / "session.toml", FRAME, pose)
     assert re.search(r"threshold = 0\.\d\d\d would leave them out", text)
-    assert re.search(r": 0\.\d\d\d grey levels above the background, whose noise is 0\.00\d", text)
+    assert re.search(r": 0\.05\d+ grey levels above the background", text)
 
 
 @pytest.mark.parametrize(
@@ -187,3 +187,20 @@ def test_light_of_lines_is_not_compared_with_their_number(
     said = advice_for(session, FRAME, None)
     assert re.search(r"left: light as of \d\d\.\d points; there is no pose", said)
     assert "too many" not in said
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_sigma_is_said_to_stand_where_it_does(
+    own: bool, recording: Path, pose: NDArray[np.float64]
+) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8").replace("sigma = 1.5", "sigma = 0.03")
+    if own:
+        before, left, right = text.split("[[sensor]]")
+        left += "\n[sensor.extract]\nsigma = 0.03\n\n"
+        text = "[[sensor]]".join([before, left, right])
+    session.write_text(text, encoding="utf-8")
+    where = "its own [sensor.extract]" if own else "[extract]"
+    off = pose.copy()
+    off[0, 3] += 0.06  # mm, about as many px
+    assert f"raise sigma in {where} to about 0.0" in advice_for(session, FRAME, off)

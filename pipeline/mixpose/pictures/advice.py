@@ -92,7 +92,8 @@ def _threshold(light: Light) -> str:
     side = "above" if options.polarity == "bright" else "below"
     if scene.judged:
         levels = scene.level, scene.noise, scene.least_peak
-        level, noise, peak = (light.written(each, 1) for each in levels)
+        digits = ".3g" if light.image.dtype == np.float32 else ".1f"
+        level, noise, peak = (f"{each:{digits}}" for each in levels)
         text = (
             f'  threshold "{options.threshold}": {level} grey levels {side} the background, whose '
             f"noise is {noise}; peaks of at least {peak}"

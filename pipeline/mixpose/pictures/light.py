@@ -52,11 +52,11 @@ class Light:
             return float(self.image.max()) - level
         return (255.0 if self.image.dtype == np.uint8 else 65535.0) - level
 
-    def written(self, level: float, digits: int = 0) -> str:
+    def written(self, level: float) -> str:
         """A grey level as a session file has it; of floats, to three digits of their range."""
-        if self.image.dtype == np.float32:
-            span = float(np.ptp(self.image))
-            digits = max(2 - math.floor(math.log10(span)), 0) if span > 0 else 3
+        digits, span = 0, float(np.ptp(self.image))
+        if self.image.dtype == np.float32 and span > 0:
+            digits = max(2 - math.floor(math.log10(span)), 0)
         return f"{level:.{digits}f}"
 
     @cached_property
