@@ -94,6 +94,11 @@ def test_residuals_of_frames_and_features_on_the_page_are_root_mean_squares(
         assert f"worst: {word} {worst}, {means[worst]:.3g}" in page
 
 
+def test_a_feature_on_the_page_may_be_called_by_what_would_be_a_formula(late: Calibration) -> None:
+    named = replace(late.after, labels=(r"$\q$", *late.after.labels[1:]))
+    assert r">$\q$<" in render_calibration(replace(late, after=named), "two", "mm", "0")
+
+
 def test_places_of_range_sensors_are_told_in_the_unit_of_the_session() -> None:
     sensors = [RangeSensor(PLACES[0])]
     frames = recording(sensors, 40, 0.1)

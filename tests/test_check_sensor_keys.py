@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from inspected import copied, left_image, write_left
 
-from mixpose.checking import key_warnings
+from mixpose import runner
+from mixpose.checking import advice, key_warnings
 from mixpose.cli.check import check_session
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
@@ -80,3 +83,94 @@ source = "anchor{k}.csv"
     path.write_text(text + '\n[estimator]\nfree = ["x", "y", "rz"]\n', encoding="utf-8")
     check_session(path)
     assert "do not determine" not in capsys.readouterr().out
+
+
+def test_a_flood_of_features_of_which_none_is_used_is_too_many_and_not_too_few(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "MOST_DETECTIONS", 40)
+    recording = copied(tmp_path / "recording")
+    image = left_image(recording)
+    for u in range(20, 620, 10):
+        image[10:13, u : u + 3] = 160
+    write_left(recording, image)
+    check_session(recording / "session.toml")
+    report = capsys.readouterr().out
+    assert "features per frame: 67 / 67 / 67" in report
+    assert "sensor 'left': too many features, 67 in frame" in report
+    assert "with min_area = 10 in its own [sensor.extract] it would be 7" in report
+
+
+def with_own(recording: Path, *lines: str) -> Path:
+    """The session with extraction keys of the left camera, and of the right."""
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    before, left, right = text.split("[[sensor]]")
+    parts = [f"{part}\n[sensor.extract]\n{own}\n\n" for part, own in zip((left, right), lines)]
+    session.write_text("[[sensor]]".join([before, *parts]), encoding="utf-8")
+    return session
+
+
+def test_a_key_is_said_to_stand_where_it_overrides_that_of_all_sensors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = copied(tmp_path / "recording")
+    check_session(with_own(recording, "min_area = 60", "min_area = 60"))
+    report = capsys.readouterr().out
+    for side in ("left", "right"):
+        assert re.search(
+            rf"sensor '{side}': too few features, .* with min_area = \S+ in its own "
+            r"\[sensor.extract\] it would be 7",
+            report,
+        )
+
+
+def test_keys_that_may_be_changed_are_said_to_stand_where_they_do(session: Session) -> None:
+    left = session.sensors[0]
+    own = replace(left, own=frozenset(["threshold"]))
+    dark = np.zeros((8, 8), np.uint8)
+    change = "change polarity, threshold, min_area and max_area in [extract]"
+    assert advice(session, left, 0, dark, 7) == change
+    told = advice(session, own, 0, dark, 7)
+    assert told == f"{change}, threshold in its own [sensor.extract]"
+
+
+@pytest.mark.parametrize(
+    ("right", "where"),
+    [
+        ('polarity = "dark"', "in [sensor.extract] of 'left' and 'right'"),
+        ("min_area = 3", "in [extract] and in [sensor.extract] of 'left'"),
+    ],
+)
+def test_a_polarity_that_sensors_have_of_their_own_is_said_to_stand_there(
+    right: str, where: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = copied(tmp_path / "recording")
+    path = with_own(recording, 'polarity = "dark"', right)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('method = "blobs"', 'method = "blobs"\npolarity = "dark"', 1))
+    check_session(path)
+    assert f'with polarity = "bright" {where}, 1 of 1' in capsys.readouterr().out
+
+
+def test_a_width_of_ranges_is_said_to_stand_where_it_does() -> None:
+    ranges = load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    front, *others = ranges.sensors
+    wide = replace(front.extract, sigma=500.0)
+    front = replace(front, extract=wide, own=frozenset(["sigma"]))
+    (warning,) = key_warnings(replace(ranges, sensors=(front, *others)))
+    assert "sigma = 500 mm in its own [sensor.extract] is wider" in warning
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_recording_without_a_frame_is_told(
+    quick: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = copied(tmp_path / "recording")
+    path = recording / "session.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("left*.png", "left.csv"))
+    (recording / "left.csv").write_text("frame,u,v\n", encoding="utf-8")
+    check_session(path, quick=quick)
+    printed = capsys.readouterr().out
+    assert "warning   sensor 'left': its recording has no frame" in printed
+    assert "sensor 'right': its recording" not in printed

@@ -74,6 +74,15 @@ def test_nothing_is_overwritten_but_what_mixpose_wrote(
     assert path.stat().st_size > 1000
 
 
+def test_a_system_may_be_called_by_what_would_be_a_formula(tmp_path: Path) -> None:
+    session, picture = tmp_path / r"$\q$.toml", tmp_path / "study.png"
+    session.write_bytes(TWO_CAMERAS.read_bytes())
+    with pytest.raises(SystemExit) as leaving:
+        main(["design", str(session), "--count", "2", "--plot", str(picture)])
+    assert leaving.value.code == 0
+    assert picture.stat().st_size > 1000
+
+
 def test_an_input_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     session = tmp_path / "session.toml"
     session.write_bytes(TWO_CAMERAS.read_bytes())

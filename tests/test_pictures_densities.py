@@ -13,16 +13,18 @@ import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
+from mixpose.frames import pair
 from mixpose.objective import ObjectiveName, View
+from mixpose.pictures.finding import find
 from mixpose.pictures.overlay import Part
-from mixpose.pictures.plots import objective_around
+from mixpose.pictures.plots import objective_around, ranges_picture
 from mixpose.pictures.sheet import fitted_blurs
 from mixpose.pictures.stages import densities_picture, panels_of, shown_box
-from mixpose.records import Estimate, PointPattern
+from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame
 from mixpose.rigid import transform
-from mixpose.runner import run
+from mixpose.runner import observe, open_sources, run
 from mixpose.selection import Selection
-from mixpose.sensors import ParallelBeam
+from mixpose.sensors import ParallelBeam, RangeSensor
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 TWO_CAMERAS = SYNTHETIC / "two_cameras" / "session.toml"
@@ -174,3 +176,34 @@ def test_directions_that_are_held_have_no_slice(
     slices, maps = objective_around([view], paper_body, np.eye(4), None, options, [(1.5,)])
     assert [one.direction for one in slices] == [0, 5]
     assert [surface.directions for surface in maps] == [(0, 5)]
+
+
+def test_ranges_and_features_may_be_called_by_what_would_be_a_formula() -> None:
+    session = mixpose.load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    setup, *_ = (replace(each, name=r"$\q$") for each in session.sensors)
+    session = replace(session, sensors=(setup,))
+    body = replace(session.body, names=(r"$\q$",))
+    frames = next(pair(open_sources(session, {}), 0, 1))
+    assert session.start is not None
+    T = session.start.T_world_object
+    estimate = Estimate(0, None, "six-points", "ok", T, None, 1.0, {})
+    found = find(session.sensors, frames.frames, observe(session, frames), body, estimate)
+    picture = ranges_picture(found, [[5.0]], body, estimate, "mm", 700, 300)
+    assert picture.std() > 3  # something is on it
+
+
+def test_a_range_sensor_that_found_nothing_and_faces_nothing_has_empty_axes() -> None:
+    session = mixpose.load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    setup = session.sensors[0]
+    assert isinstance(setup.sensor, RangeSensor)
+    away = session.body.means - setup.sensor.position
+    body = replace(session.body, normals=away / np.linalg.norm(away, axis=1)[:, None])
+    frame = RawFrame(0, None, PointPattern(np.zeros((0, 1)), np.zeros(0)))
+    session = replace(session, sensors=(setup,))
+    views = observe(session, FrameSet(0, None, {setup.name: frame}))
+    estimate = Estimate(0, None, "six-points", "ok", np.eye(4), None, 1.0, {})
+    found = find(session.sensors, {setup.name: frame}, views, body, estimate)
+    assert found[0].expectation is not None
+    assert not found[0].expectation.seen.any()
+    picture = ranges_picture(found, [[5.0]], body, estimate, "mm", 700, 300)
+    assert picture.shape == (300, 700, 3)

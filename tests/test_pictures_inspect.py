@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from inspected import SYNTHETIC, TWO_CAMERAS, advice_for, copied, with_options
 from numpy.typing import NDArray
 
 import mixpose
@@ -27,9 +27,6 @@ from mixpose.rigid import transform
 from mixpose.runner import begin, observe, open_sources, run
 from mixpose.selection import Selection
 
-SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
-TWO_CAMERAS = SYNTHETIC / "two_cameras" / "session.toml"
-
 
 def command(*arguments: str | Path | int) -> int:
     with pytest.raises(SystemExit) as leaving:
@@ -40,33 +37,7 @@ def command(*arguments: str | Path | int) -> int:
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """One frame of two cameras, free to be spoilt."""
-    folder = tmp_path / "recording"
-    folder.mkdir()
-    shutil.copy(TWO_CAMERAS, folder)
-    for side in ("left", "right"):
-        shutil.copy(SYNTHETIC / "two_cameras" / f"{side}0006.png", folder)
-    return folder
-
-
-def with_options(recording: Path, lines: str) -> Path:
-    session = recording / "session.toml"
-    text = session.read_text(encoding="utf-8")
-    assert 'method = "blobs"\n' in text
-    session.write_text(text.replace('method = "blobs"\n', lines + "\n"), encoding="utf-8")
-    return session
-
-
-def advice_for(
-    session_file: Path, frame: int, truth: NDArray[np.float64] | None, status: Status = "ok"
-) -> str:
-    """What is said about the first sensor of a frame with a known pose, or a lost one."""
-    session = mixpose.load_session(session_file)
-    frame_set = next(pair(open_sources(session, {}), frame, frame + 1))
-    status = "lost" if truth is None else status
-    estimate = Estimate(frame, None, "tracker", status, truth, None, 1.0, {})
-    views = observe(session, frame_set)
-    findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
-    return "\n".join(describe(findings[0], session.body, session.unit))
+    return copied(tmp_path / "recording")
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +141,33 @@ def test_a_frame_that_is_not_there_names_those_that_are(
     assert f"--frame {frame}: the recording has no such frame" in error
     assert "frames 0-39" in error
     assert not (tmp_path / "seen").exists()
+
+
+def test_frames_before_that_of_number_0_are_shown_as_they_are_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "session.toml").write_bytes(TWO_CAMERAS.read_bytes())
+    session = tmp_path / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    T = np.eye(4)
+    T[:3, 3] = 12.0, -8.0, 5.0
+    for setup in mixpose.load_session(TWO_CAMERAS).sensors:
+        text = text.replace(f"{setup.name}*.png", f"{setup.name}.csv")
+        y, _ = setup.sensor.project(transform(T, mixpose.load_session(TWO_CAMERAS).body.means))
+        rows = "".join(f"-3,{u},{v}\n" for u, v in y)
+        (tmp_path / f"{setup.name}.csv").write_text(f"frame,u,v\n{rows}", encoding="utf-8")
+    session.write_text(text, encoding="utf-8")
+    assert command("inspect", session, "--frame=-3", "-o", tmp_path / "seen") == 0
+    assert "session.toml, frame -3: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["one_camera_video", "range_profiles", "parallel_beams"])
+def test_a_number_before_the_first_frame_is_none_of_those_from_the_end(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = SYNTHETIC / name / "session.toml"
+    assert command("inspect", session, "--frame=-1", "-o", tmp_path / "seen") == 2
+    assert "--frame -1: the recording has no such frame; it has " in capsys.readouterr().err
 
 
 def test_other_peoples_files_are_not_overwritten(

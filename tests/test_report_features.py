@@ -50,3 +50,13 @@ def test_a_report_shows_each_sensors_features_over_time(poses: Path, tmp_path: P
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     for name in ("left", "right"):
         assert f"{name}: how far off each feature is met over time" in page
+
+
+def test_a_feature_may_be_called_by_what_would_be_a_formula(poses: Path, tmp_path: Path) -> None:
+    pytest.importorskip("jinja2")
+    text = poses.read_text(encoding="utf-8").replace('"1": ', r'"$\\q$": ')
+    (tmp_path / "poses.jsonl").write_text(text, encoding="utf-8")
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(tmp_path / "poses.jsonl"), "-o", str(tmp_path / "report.html")])
+    assert not ended.value.code
+    assert r">$\q$<" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -124,7 +124,8 @@ class _Recording:
         for setup in self.session.sensors:
             found = self.surveys[setup.name]
             counts = found.counts or [1] * len(found.counted)
-            most, empty = expected_count(setup, self.session), {*found.empty}
+            most = expected_count(setup, self.session)
+            empty = {*found.empty, *(n for n, each in found.found.items() if not each.data.size)}
             pairs = zip(found.counted, counts, strict=True)
             shown.append({n: 0.0 if n in empty else float(min(k, most)) for n, k in pairs})
         return shown
@@ -241,8 +242,12 @@ def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Chan
     polarity: Literal["bright", "dark"] = "dark" if is_bright else "bright"
     setups = [replace(s, extract=replace(s.extract, polarity=polarity)) for s in session.sensors]
     changed = replace(session, sensors=tuple(setups))
+    own = [setup.name for setup in session.sensors if "polarity" in setup.own]
+    tables = ["[extract]"] if len(own) < len(setups) else []
+    tables += [f"[sensor.extract] of {called(own)}"] if own else []
     change = Change(
-        f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
+        f"features {{are}} {polarity} in the images",
+        f'with polarity = "{polarity}" in {" and in ".join(tables)}',
     )
     anew = replace(recording, surveys={}).read(numbers)
     return [(change, [(each.number, observe(changed, each)) for each in anew])]

@@ -19,7 +19,7 @@ from mixpose.extraction import METHODS, ExtractOptions
 from mixpose.fit import free_mask
 from mixpose.frames import files_of
 from mixpose.objective import View
-from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame
+from mixpose.records import FrameSet, Image, RawFrame
 from mixpose.runner import begin, observe, source_spec
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
@@ -56,11 +56,11 @@ def advice(
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
     frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
-    before = len(_points(_found(session, setup, frame, {})))
+    before = _count(_found(session, setup, frame, {}))
     trials = []
     for key, value in _trials(options, image):
         views = _found(session, setup, frame, {key: value})
-        count = len(_points(views))
+        count = _count(views)
         if count >= 0.9 * expected and judge(count, expected) is None:
             trials.append(_Trial(key, value, count, views))
     # the rule that goes by each image comes first, as a number may suit this image alone
@@ -73,7 +73,8 @@ def advice(
     if chosen is not None:
         value = chosen.value
         written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
-        return f"with {chosen.key} = {written} {_SHARED} it would be {chosen.found}"
+        where = setup.table_of(chosen.key)
+        return f"with {chosen.key} = {written} in {where} it would be {chosen.found}"
     if before > expected:
         left = [trial.found for trial in trials if trial.value == "auto"]
         rule = f', nor with threshold = "auto", which leaves {left[0]}' if left else ""
@@ -83,7 +84,10 @@ def advice(
         )
     keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
     usual = "polarity, threshold, min_area and max_area"
-    return f"change {keys.get(options.method, usual)} in [extract]"
+    change = keys.get(options.method, usual)
+    own = [key for key in re.findall(r"\w+", change) if key in setup.own]
+    beside = f", {' and '.join(own)} {_OWN}" if own else ""
+    return f"change {change} {_SHARED}{beside}"
 
 
 def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
@@ -151,11 +155,10 @@ def _found(
         return []
 
 
-def _points(views: Sequence[View]) -> Floats:
-    """The features found, where they are points."""
-    patterns = [view.observation.pattern for view in views]
-    found = [each.points for each in patterns if isinstance(each, PointPattern)]
-    return np.concatenate(found) if found else np.zeros((0, 2))
+def _count(views: Sequence[View]) -> int:
+    """How many features were found, where they are points."""
+    seen = [view.observation for view in views]
+    return sum(each.found for each in seen if each.points is not None)
 
 
 def key_warnings(session: Session) -> list[str]:
@@ -183,17 +186,18 @@ def _off_centre(session: Session) -> list[str]:
 
 def _too_wide(session: Session) -> list[str]:
     """Ranges given a width in which the whole body disappears, as by the default for pixels."""
-    names = [
-        f"{setup.name!r}"
+    wide = [
+        setup
         for setup in session.sensors
         if isinstance(setup.sensor, RangeSensor) and setup.extract.sigma > session.body.radius
     ]
-    if not names:
+    if not wide:
         return []
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    sigma = max(s.extract.sigma for s in session.sensors if isinstance(s.sensor, RangeSensor))
+    more = f" and {len(wide) - 1} more" if len(wide) > 1 else ""
+    widest = max(wide, key=lambda setup: setup.extract.sigma)
+    sigma, where = widest.extract.sigma, widest.table_of("sigma")
     return [
-        f"sensor {names[0]}{more}: sigma = {sigma:g} {session.unit} in [extract] is wider than "
+        f"sensor {wide[0].name!r}{more}: sigma = {sigma:g} {session.unit} in {where} is wider than "
         f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
         "about what ranges err by"
     ]

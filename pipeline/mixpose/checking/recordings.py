@@ -38,7 +38,7 @@ class Survey:
     damage: tuple[str, ...] = ()  # why a frame could not be read, a line each
     damaged: tuple[int, ...] = ()  # their numbers, as far as known
     is_whole: bool = True  # whether all frames were looked at
-    # frames that were counted, with the points found in place of an image
+    # frames that were counted, with the points found in place of an image; none where too many
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
     @property
@@ -78,11 +78,12 @@ def survey(
                 if looked_at is not None and frame.number not in looked_at:
                     done()
                     continue
-            pattern = observation_of(session, setup, frame).pattern
+            observation = observation_of(session, setup, frame)
+            pattern = observation.pattern
             if isinstance(pattern, PointPattern):
-                counts[frame.number] = len(pattern.points)
+                counts[frame.number] = observation.found
                 found[frame.number] = replace(frame, data=pattern)
-                is_empty = not len(pattern.points)
+                is_empty = not observation.found
             else:
                 counts[frame.number] = None
                 is_empty = bool(np.ptp(pattern.values) == 0)

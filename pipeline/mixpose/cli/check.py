@@ -221,6 +221,8 @@ def _say_features(
     where = f"sensor {setup.name!r}"
     each = [(expected_count(setup, session.alone(o.body.name)), o.count) for o in session.objects]
     expected = sum(seen * count for seen, count in each)
+    if not (found.numbers or found.damage):
+        report.warnings.append(f"{where}: its recording has no frame")
     if found.counts is None:
         if found.numbers and found.empty:
             report.warnings.append(

@@ -161,7 +161,7 @@ class Findings:
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
         """How many features sensors found that found far more than there are."""
         counts = {
-            view.name: len(view.observation.points) + view.observation.passed_over
+            view.name: view.observation.found
             for view in views
             if view.name in self._flooded and view.observation.points is not None
         }

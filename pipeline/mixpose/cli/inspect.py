@@ -90,11 +90,10 @@ def _check_folder(folder: Path, session: Session) -> None:
 
 def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
     """The frames of one number, or of the first."""
-    if number is None or number >= 0:
-        with closing(pair(opened, number, None if number is None else number + 1)) as frames:
-            found = next(frames, None)
-        if found is not None:
-            return found
+    with closing(pair(opened, number, None if number is None else number + 1)) as frames:
+        found = next(frames, None)
+    if found is not None:
+        return found
     recordings = "; ".join(f"{name}: {source.describe()}" for name, source in opened.items())
     if number is None:
         raise RecordingError(f"the recording has no frame; it has {recordings}")

@@ -119,6 +119,11 @@ class Observation:
         return self.pattern.size
 
     @property
+    def found(self) -> int:
+        """Number of detections, with those that are not in the pattern."""
+        return self.pattern.size + self.passed_over
+
+    @property
     def weight(self) -> float:
         """Sum of all weights or values."""
         return self.pattern.total

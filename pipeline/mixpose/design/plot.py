@@ -48,7 +48,7 @@ def draw_study(study: Study, path: Path) -> None:
         default=1.0,
     )
     for row, system in zip(rows[1:], study.systems, strict=True):
-        row.suptitle(f"{system.name}: error of the tip over the volume")
+        row.suptitle(f"{system.name}: error of the tip over the volume", parse_math=False)
         axes = list(row.subplots(1, 3))
         _maps(axes, study, system.summary.tip, largest)
     figure.savefig(path)
@@ -72,7 +72,8 @@ def _bars(axes: list[Axes], study: Study) -> None:
             axis.plot(places, worst, "_", color="black", markersize=12)
         axis.set_xticks(range(3), [TWIST_NAMES[d] for d in directions])
         axis.set_ylabel(f"deviation, {unit}: median, worst")
-    axes[0].legend()
+    for name in axes[0].legend().get_texts():
+        name.set_parse_math(False)
 
 
 def _maps(axes: list[Axes], study: Study, errors: Floats, largest: float) -> None:

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
-import cv2
 import numpy as np
 
-from mixpose.body import Body
-from mixpose.extraction.blobs import find_blobs
-from mixpose.extraction.options import ExtractOptions
+from mixpose.body import Body, PointFeature
 from mixpose.pictures.finding import Expectation, Finding
+from mixpose.pictures.levels import (
+    FLOODED,
+    NEAR_SIGMAS,
+    apart,
+    around,
+    direction,
+    leaving_out,
+    looser,
+    more,
+    some,
+)
 from mixpose.pictures.light import Light
-from mixpose.records import Floats, GridPattern, PointPattern
+from mixpose.records import GridPattern, PointPattern
 
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
-_NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
-_FLOODED = 0.02  # share of an image above a threshold that would find everything
-_REVERSED = 0.5  # share from which it is the background that counts as feature
 _LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
 _SPECK_PX = 2  # pieces up to this area are noise
 _MOST = 0.8  # of the features in view that must be met to tell what markers look like
-_AS_LARGE = 3.0  # times the usual area: a marker by itself, and no part of something else
-_LOWER = (0.8, 0.6, 0.45, 0.3)  # of the height of a threshold above the background
-_LISTED = 6  # features that are named one by one
 
 
 def describe(finding: Finding, body: Body, unit: str) -> list[str]:
@@ -63,10 +63,12 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
         if finding.setup.sensor.dimension == 1:
             found = f"echoes as of {finding.count:.1f} points"
     else:
-        found = f"{len(finding.points)} feature{'s' * (len(finding.points) != 1)} found"
+        found = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
+        found += ", which are too many to use any" * (finding.passed_over > 0)
     expected = finding.expectation
     if expected is None:
-        return f"{found}; without a pose up to {len(body)} are expected"
+        expects = f"without a pose up to {len(body)} are expected"
+        return f"{found}; {expects if _can_be_counted(finding, body) else 'there is no pose'}"
     text = f"{found}; the pose has {int(expected.seen.sum())} of {len(body)} in view"
     text += f", {int(expected.met.sum())} of them met"
     if expected.rms is not None:
@@ -89,10 +91,12 @@ def _threshold(light: Light) -> str:
     scene = light.scene
     side = "above" if options.polarity == "bright" else "below"
     if scene.judged:
+        levels = scene.level, scene.noise, scene.least_peak
+        digits = ".3g" if light.image.dtype == np.float32 else ".1f"
+        level, noise, peak = (f"{each:{digits}}" for each in levels)
         text = (
-            f'  threshold "{options.threshold}": {scene.level:.1f} grey levels {side} the '
-            f"background, whose noise is {scene.noise:.1f}; peaks of at least "
-            f"{scene.least_peak:.1f}"
+            f'  threshold "{options.threshold}": {level} grey levels {side} the background, whose '
+            f"noise is {noise}; peaks of at least {peak}"
         )
     else:
         text = f"  threshold {light.in_image(scene.level):g}, {side} which is feature"
@@ -103,12 +107,8 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
     """Advice for blobs and intensity."""
     options = light.options
     lines = []
-    if (
-        light.share > _FLOODED
-        and finding.points is not None
-        and len(finding.points) > 3 * len(body)
-    ):
-        stricter = _direction(options, lower=False, level=light.level)
+    if light.share > FLOODED and finding.points is not None and finding.count > 3 * len(body):
+        stricter = direction(options, lower=False, level=light.written(light.level))
         if options.method == "blobs":
             stricter += f", raise min_area = {options.min_area:g} or set max_area"
         lines.append(
@@ -116,7 +116,7 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
             'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
-    if expected is None:
+    if expected is None or finding.passed_over:
         return lines + _about_number(finding, body, light)
     lines += _about_missing(finding, expected, light, body)
     if options.method == "blobs":
@@ -131,58 +131,32 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
     lines = []
     if found := missing["nothing"]:
         lines.append(
-            f"not met and dark there: {_some(found, body)}; hidden, out of light, or the pose is "
+            f"not met and dark there: {some(found, body)}; hidden, out of light, or the pose is "
             "wrong"
         )
     if found := missing["faint"]:
         level = (min(found.values()) + float(np.median(light.raw))) / 2  # and the background
         lines.append(
-            f"not met, fainter than the threshold: {_some(found, body)}; {_looser(light, level)}"
+            f"not met, fainter than the threshold: {some(found, body)}; {looser(light, level)}"
         )
     if found := missing["small"]:
+        lower = direction(options, lower=True, level=light.written(light.level))
         lines.append(
-            f"not met, too small: {_some(found, body)}; lower min_area = {options.min_area:g} to "
-            f"{min(found.values()):g}, or {_direction(options, lower=True, level=light.level)}"
+            f"not met, too small: {some(found, body)}; lower min_area = {options.min_area:g} to "
+            f"{min(found.values()):g}, or {lower}"
         )
     if found := missing["large"]:
         lines.append(
-            f"not met, too large: {_some(found, body)}; raise max_area = {options.max_area:g} to "
+            f"not met, too large: {some(found, body)}; raise max_area = {options.max_area:g} to "
             f"{max(found.values()):g}"
         )
     if found := missing["other"]:
         lines.append(
-            f"not met though bright there: {_some(found, body)}; they run into something else, are "
+            f"not met though bright there: {some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
-            f"{_apart(finding, expected, light, body, list(found))}"
+            f"{apart(finding, expected, light, body, list(found))}"
         )
     return lines
-
-
-def _apart(
-    finding: Finding, expected: Expectation, light: Light, body: Body, features: Sequence[int]
-) -> str:
-    """The threshold at which features stand apart from what is about them, where there is one."""
-    options, met = light.options, np.flatnonzero(expected.seen & expected.met)
-    if not isinstance(options.threshold, str):
-        return _direction(options, lower=False)
-    labels, areas = light.pieces
-    boxes = {
-        i: _around(expected.y[i], _NEAR_SIGMAS * finding.sigma, light.raw.shape)
-        for i in [*met.tolist(), *features]
-    }
-    largest = {i: int(labels[box].flat[areas[labels[box]].argmax()]) for i, box in boxes.items()}
-    peak = min([float(light.raw[boxes[i]].max()) for i in met.tolist()], default=np.inf)
-    usual = float(np.median([areas[largest[i]] for i in met.tolist()] or [np.inf]))
-    ground = np.median(light.raw[np.isin(labels, [largest[i] for i in features])])
-    level = (peak + float(ground)) / 2
-    _, pieces, there, _ = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))
-    sizes = np.append(0, there[1:, cv2.CC_STAT_AREA])
-    own = {i: int(sizes[pieces[boxes[i]]].max()) for i in features}
-    parted = [i for i in features if options.min_area <= own[i] <= _AS_LARGE * usual]
-    if not parted:
-        return "no threshold parts them"
-    which = _some(parted, body) if len(parted) < len(features) else "them"
-    return f"threshold = {light.in_image(level):.0f} parts {which} in this frame"
 
 
 def _sorted_out(
@@ -195,7 +169,7 @@ def _sorted_out(
         kind: {} for kind in ("nothing", "faint", "small", "large", "other")
     }
     for i in np.flatnonzero(expected.seen & ~expected.met).tolist():
-        region = _around(expected.y[i], _NEAR_SIGMAS * finding.sigma, scene.grey.shape)
+        region = around(expected.y[i], NEAR_SIGMAS * finding.sigma, scene.grey.shape)
         signal = float(scene.grey[region].max()) - scene.zero
         area = float(areas[labels[region]].max())
         if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
@@ -213,13 +187,14 @@ def _sorted_out(
 
 def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[str]:
     """What tells found things that belong to no feature from those that do."""
-    if finding.points is None or not expected.unexplained.any():
+    pattern = None if finding.view is None else finding.view.observation.pattern
+    if not isinstance(pattern, PointPattern) or not expected.unexplained.any():
         return []
-    sizes, peaks = [], []
-    for blob in find_blobs([(light.scene, light.options)])[0]:
-        place, radius = np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi)
-        sizes.append(blob.area)
-        peaks.append(float(light.raw[_around(place, radius, light.raw.shape)].max()))
+    # of several bodies these are what the others leave, and not all blobs of the image
+    peaks = [
+        float(light.raw[around(place, radius, light.raw.shape)].max())
+        for place, radius in zip(pattern.points, pattern.radii.tolist(), strict=True)
+    ]
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
     unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
@@ -227,7 +202,7 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
         # what looks like clutter may be the markers
         where = "shows more of the body" if expected.sure else "is ok"
         return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
-    size, peak = np.array(sizes), np.array(peaks)
+    size, peak = np.pi * pattern.radii**2, np.array(peaks)
     own = ~extra
     if size[extra].max() < 0.8 * size[own].min():
         middle = np.sqrt(size[extra].max() * size[own].min())
@@ -238,16 +213,23 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
     if peak[extra].max() < peak[own].min():
         level = (peak[extra].max() + peak[own].min()) / 2
         word = "fainter" if light.options.polarity == "bright" else "less dark"
-        return [
-            f"{text}, all {word} than those that do; they do no harm, and in this frame "
-            f"threshold = {light.in_image(level):.0f} would leave them out"
-        ]
+        text += f", all {word} than those that do; they do no harm"
+        number = leaving_out(finding, pattern.points[extra], light, level)
+        return [f"{text}, and in this frame {number} would leave them out" if number else text]
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
+
+
+def _can_be_counted(finding: Finding, body: Body) -> bool:
+    """Whether what was found is to be as much as the body has features: lines make more light."""
+    are_points = all(isinstance(feature, PointFeature) for feature in body.features)
+    return finding.points is not None or are_points
 
 
 def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
     """Advice without a pose: only the number of features is known."""
     options = light.options
+    if not _can_be_counted(finding, body):
+        return []
     if finding.count < 0.8 * len(body):
         lines = []
         areas = light.pieces[1] if options.method == "blobs" else np.zeros(0, np.int32)
@@ -264,7 +246,7 @@ def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
                 f"{large.min()} px: raise max_area = {options.max_area:g}"
             )
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
-        return lines or [f"too few: {_more(light, len(body))}{polarity}"]
+        return lines or [f"too few: {more(light, len(body))}{polarity}"]
     if finding.count > 3 * len(body):
         return [
             "too many: look which are markers, and whether they differ from the rest in brightness "
@@ -273,38 +255,23 @@ def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
     return []
 
 
-def _more(light: Light, expected: int) -> str:
-    """A threshold at which pieces are as many as expected, or nearly so, where there is one."""
-    options, base = light.options, float(np.median(light.raw))
-    if not isinstance(options.threshold, str):
-        return _direction(options, lower=light.share < _REVERSED)
-    over = float(light.scene.level)
-    counts = {}
-    for level in (base + share * over for share in _LOWER):
-        statistics = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))[2]
-        counts[level] = int(np.count_nonzero(statistics[1:, cv2.CC_STAT_AREA] >= options.min_area))
-    fits = {level: n for level, n in counts.items() if 0.8 * expected <= n <= 3 * expected}
-    if not fits:
-        return "no lower threshold finds them: hidden, out of light, or out of view?"
-    level = max(fits)
-    return f"threshold = {light.in_image(level):.0f} finds {fits[level]} in this frame"
-
-
 def _about_others(finding: Finding, body: Body) -> list[str]:
     """Advice for corners, unsharp spots and the user's own method."""
     options = finding.setup.extract
     expected = finding.expectation
-    if expected is None:
+    if expected is None or finding.passed_over:
+        if not _can_be_counted(finding, body):
+            return []
         few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
         lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
         few, many = bool(lost), bool(expected.unexplained.any())
-        missing = f"not met: {_some(lost, body)}" if lost else ""
+        missing = f"not met: {some(lost, body)}" if lost else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
-        lower, raised = (_direction(options, lower=way) for way in (True, False))
+        lower, raised = (direction(options, lower=way) for way in (True, False))
     lines = []
     if few:
         lines.append(f"{missing}; hidden, or {lower}")
@@ -317,17 +284,17 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
     """Advice for tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
     if finding.points is None:
-        if finding.count <= 2 * len(body):
+        if finding.count <= 2 * len(body) or not _can_be_counted(finding, body):
             return []
         return [
             "far more echoes than features: noise fills the profile; take its floor off, or raise "
-            "sigma in [extract]"
+            f"sigma in {finding.setup.table_of('sigma')}"
         ]
     if expected is None:
         return []
     lines = []
     if lost := np.flatnonzero(expected.seen & ~expected.met).tolist():
-        names = _some(lost, body)
+        names = some(lost, body)
         lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
     if extra := int(expected.unexplained.sum()):
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
@@ -340,40 +307,6 @@ def _about_sigma(finding: Finding) -> list[str]:
         return []
     return [
         f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
-        f"sigma in [extract] to about {expected.rms:.2g}, where markers give way on the body set "
-        "sigma in [object], or check calibration and markers"
+        f"sigma in {finding.setup.table_of('sigma')} to about {expected.rms:.2g}, where markers "
+        "give way on the body set sigma in [object], or check calibration and markers"
     ]
-
-
-def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """A box about a place in view, at least one pixel."""
-    u, v = (int(np.clip(round(x), 0, n - 1)) for x, n in zip(place, shape[::-1], strict=True))
-    r = max(round(radius), 1)
-    return slice(max(v - r, 0), v + r + 1), slice(max(u - r, 0), u + r + 1)
-
-
-def _looser(light: Light, level: float) -> str:
-    if float(np.mean(light.raw > level)) > _FLOODED:
-        return 'set threshold = "local", as the background is as bright elsewhere'
-    direction = "lower" if light.options.polarity == "bright" else "raise"
-    return f"{direction} it: threshold = {light.in_image(level):.0f}"
-
-
-def _direction(options: ExtractOptions, *, lower: bool, level: float | None = None) -> str:
-    """How to move a threshold, for dark features the other way; `level` is what a rule chose."""
-    down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
-    now = options.threshold
-    if isinstance(now, str):
-        side = "below" if down else "above"
-        if level is None:
-            return f'set threshold to a number {side} that of "{now}"'
-        return f'set threshold to a grey level {side} {level:.0f}, that of "{now}"'
-    return f"{'lower' if down else 'raise'} threshold = {now:g}"
-
-
-def _some(features: Iterable[int], body: Body) -> str:
-    """What features are called, for people."""
-    features = list(features)
-    shown = ", ".join(body.labels[i] for i in features[:_LISTED])
-    more = len(features) - _LISTED
-    return f"feature{'s' * (len(features) != 1)} {shown}" + (f" and {more} more" * (more > 0))

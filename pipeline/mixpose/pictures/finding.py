@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import Observation
 from mixpose.judgement import JudgementRules
 from mixpose.matching import AssociationRules, Matches, associate
 from mixpose.objective import View, matched_objective
@@ -39,7 +38,8 @@ class Finding:
     frame: RawFrame | None  # None where the sensor has no frame of this number
     view: View | None  # None where it has no frame
     points: Floats | None  # (M, m), where the extraction gives points
-    count: float  # points found, or points of light with the energy of a grid
+    # points found, with those passed over, or points of light with the energy of a grid
+    count: float
     expectation: Expectation | None  # None without a pose or without features
 
     @property
@@ -51,6 +51,11 @@ class Finding:
     def sigma(self) -> float:
         """Finest standard deviation of a feature, sensor units."""
         return self.setup.extract.sigma if self.view is None else self.view.observation.sigma
+
+    @property
+    def passed_over(self) -> int:
+        """Points found that are not among `points`, as they were too many."""
+        return 0 if self.view is None else self.view.observation.passed_over
 
 
 def find(
@@ -97,9 +102,7 @@ def _unexplained(view: View, others: Sequence[Sequence[Finding]]) -> View:
     for finding in (one for each in others for one in each):
         if finding.name == view.name and finding.expectation is not None:
             left &= finding.expectation.unexplained
-    rest = PointPattern(pattern.points[left], pattern.weights[left])
-    seen = view.observation
-    return replace(view, observation=Observation(rest, seen.sigma, seen.intrinsic))
+    return replace(view, observation=view.observation.only(left))
 
 
 def _finding(
@@ -109,7 +112,7 @@ def _finding(
         return Finding(setup, frame, None, None, 0.0, None)
     pattern, sigma = view.observation.pattern, view.observation.sigma
     if isinstance(pattern, PointPattern):
-        points, count = pattern.points, float(len(pattern.points))
+        points, count = pattern.points, float(view.observation.found)
     else:  # so many equal features would have the energy of the grid
         top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
         energy = view.observation.energy(sigma)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -50,6 +51,13 @@ class Light:
         if self.image.dtype == np.float32:
             return float(self.image.max()) - level
         return (255.0 if self.image.dtype == np.uint8 else 65535.0) - level
+
+    def written(self, level: float) -> str:
+        """A grey level as a session file has it; of floats, to three digits of their range."""
+        digits, span = 0, float(np.ptp(self.image))
+        if self.image.dtype == np.float32 and span > 0:
+            digits = max(2 - math.floor(math.log10(span)), 0)
+        return f"{level:.{digits}f}"
 
     @cached_property
     def level(self) -> float:

@@ -141,7 +141,7 @@ def _plot_ranges(
     title = f"{finding.name}: echoes as of {finding.count:.1f} points"
     if finding.points is not None:
         title = f"{finding.name}: {len(finding.points)} ranges"
-    axes.set_title(title, fontsize=9, loc="left")
+    axes.set_title(title, fontsize=9, loc="left", parse_math=False)
     axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
@@ -204,17 +204,17 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
     for group in np.split(np.arange(len(order)), np.flatnonzero(~near) + 1):
         names = ", ".join(body.labels[i] for i in order[group])
         middle = float(ranges[group].mean()) if len(group) else 0.0
-        axes.text(middle, 1.2, names, color=_EXPECTED, ha="center", fontsize=8)
+        axes.text(middle, 1.2, names, color=_EXPECTED, ha="center", fontsize=8, parse_math=False)
 
 
 def _span(finding: Finding) -> tuple[float, float]:
     """The ranges worth showing: around what is expected, else all that was measured."""
-    if finding.view is None or (finding.expectation is None and finding.view.observation.is_empty):
-        return 0.0, 1.0
     shown = np.zeros(0)
     if finding.expectation is not None:
         shown = finding.expectation.y[finding.expectation.seen, 0]
     if not len(shown):
+        if finding.view is None or finding.view.observation.is_empty:
+            return 0.0, 1.0
         shown = np.concatenate(finding.view.observation.extent)
     margin = max(_AROUND * float(np.ptp(shown)), _LEAST_AROUND * finding.sigma)
     return float(shown.min()) - margin, float(shown.max()) + margin

@@ -102,7 +102,7 @@ def _residuals(found: Calibration, kind: Literal["frame", "feature"]) -> Chart:
         numbers = numbers + 1
         axes.bar(numbers, values, **BARS)
         if len(numbers) <= _MOST_NAMED:
-            axes.set_xticks(numbers, labels)
+            axes.set_xticks(numbers, labels, parse_math=False)
         axes.set_xlabel("feature of the body")
     axes.set_ylabel("residual, standard deviations")
     alt = "nothing was met"

@@ -267,7 +267,7 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         unmet = np.ma.masked_where(~np.isinf(rows), np.ones_like(rows))
         axes.pcolormesh(x, y, unmet, vmin=0.0, vmax=1.0, cmap="Reds", rasterized=True)
         figure.colorbar(mesh, ax=axes, label=f"off by, {unit_of(name)}")
-        axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)])
+        axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)], parse_math=False)
         axes.set(xlabel=series.x_label, ylabel="feature; red: not met")
         met_by = {name: each[np.isfinite(each)] for name, each in residuals.items()}
         worst = max(met_by, key=lambda each: np.median(met_by[each]) if met_by[each].size else 0.0)

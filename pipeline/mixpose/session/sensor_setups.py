@@ -152,6 +152,7 @@ def _build_sensor(
         readout=getattr(table, "readout", 0.0),
         exposure=getattr(table, "exposure", 0.0),
         calibration_error=_calibration_error(table),
+        own=frozenset() if table.extract is None else frozenset(table.extract.model_fields_set),
     )
 
 

@@ -75,6 +75,11 @@ class SensorSetup:
     exposure: float = 0.0
     # how far off the geometry may be; None: exact
     calibration_error: CalibrationError | None = None
+    own: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets, whatever ``[extract]``
+
+    def table_of(self, key: str) -> str:
+        """The table of the session file in which a key of extraction takes effect, in words."""
+        return "its own [sensor.extract]" if key in self.own else "[extract]"
 
 
 @dataclass(frozen=True)
