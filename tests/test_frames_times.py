@@ -138,10 +138,11 @@ def test_many_frames_without_a_row_are_counted(tmp_path: Path) -> None:
 def test_a_run_without_a_row_leaves_the_poses_of_the_last_one(tmp_path: Path) -> None:
     session = video_session(tmp_path, *range(57), 58, 59)
     poses = tmp_path / "poses.jsonl"
-    poses.write_text("1 2\n")
+    before = '{"type": "header", "mixpose": "0.1"}\n'
+    poses.write_text(before)
     with pytest.raises(RecordingError, match=r"times\.csv: no row for frame 57; allowed"):
         run_session(session, RunRequest(poses, "jsonl", (), ALL_FRAMES, resume=False))
-    assert poses.read_text() == "1 2\n"
+    assert poses.read_text() == before
 
 
 @pytest.mark.parametrize("quick", [False, True])

@@ -93,6 +93,7 @@ def diagnosis(
     frames: Frames,
     others: Sequence[tuple[Change, Frames]] = (),
     further: Callable[[], Frames] = lambda: (),
+    rules: DiagnosisRules = DiagnosisRules(),
 ) -> Diagnosis:
     """What is most likely wrong with a session of one body, by frames of its recording.
 
@@ -100,7 +101,7 @@ def diagnosis(
     extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
     change by values undecided.
     """
-    rules, began = DiagnosisRules(), time.process_time()
+    began = time.process_time()
 
     def is_late(share: float = 1.0) -> bool:
         return time.process_time() - began > share * rules.patience_s
