@@ -7,18 +7,36 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import mixpose
+from mixpose.cli import main
 from mixpose.frames import pair
 from mixpose.pictures.advice import describe
 from mixpose.pictures.finding import find
 from mixpose.records import Estimate, Status
-from mixpose.runner import observe, open_sources
+from mixpose.runner import observe, open_sources, run
+from mixpose.selection import Selection
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 TWO_CAMERAS = SYNTHETIC / "two_cameras" / "session.toml"
 FRAME = 6  # which shows all markers to both cameras
+
+
+def command(*arguments: str | Path | float) -> int:
+    """The exit status of a command of `mixpose`."""
+    with pytest.raises(SystemExit) as leaving:
+        main([str(argument) for argument in arguments])
+    return int(str(leaving.value.code))
+
+
+def estimated_pose() -> NDArray[np.float64]:
+    """Where the body is in that frame."""
+    session = mixpose.load_session(TWO_CAMERAS)
+    (estimate,) = run(session, selection=Selection(FRAME, FRAME + 1))
+    assert estimate.T_world_object is not None
+    return estimate.T_world_object
 
 
 def copied(folder: Path) -> Path:

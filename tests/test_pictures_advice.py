@@ -12,9 +12,10 @@ import pytest
 from inspected import (
     FRAME,
     SYNTHETIC,
-    TWO_CAMERAS,
     advice_for,
+    command,
     copied,
+    estimated_pose,
     left_image,
     with_options,
     write_left,
@@ -23,16 +24,8 @@ from numpy.typing import NDArray
 
 import mixpose
 from mixpose import runner
-from mixpose.cli import main
 from mixpose.extraction import ExtractOptions, extract
 from mixpose.rigid import transform
-from mixpose.selection import Selection
-
-
-def command(*arguments: str | Path | float) -> int:
-    with pytest.raises(SystemExit) as leaving:
-        main([str(argument) for argument in arguments])
-    return int(str(leaving.value.code))
 
 
 @pytest.fixture
@@ -43,11 +36,7 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def pose() -> NDArray[np.float64]:
-    (estimate,) = mixpose.run(
-        mixpose.load_session(TWO_CAMERAS), selection=Selection(FRAME, FRAME + 1)
-    )
-    assert estimate.T_world_object is not None
-    return estimate.T_world_object
+    return estimated_pose()
 
 
 def test_clutter_beside_several_bodies_is_told_of_what_the_others_leave(

@@ -11,11 +11,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from inspected import SYNTHETIC, TWO_CAMERAS, advice_for, copied, with_options
+from inspected import (
+    SYNTHETIC,
+    TWO_CAMERAS,
+    advice_for,
+    command,
+    copied,
+    estimated_pose,
+    with_options,
+)
 from numpy.typing import NDArray
 
 import mixpose
-from mixpose.cli import main
 from mixpose.cli.inspect import summary
 from mixpose.frames import pair
 from mixpose.pictures.advice import describe
@@ -24,14 +31,7 @@ from mixpose.pictures.signature import write_png
 from mixpose.pictures.stages import ABOVE, threshold_picture
 from mixpose.records import Estimate, Status
 from mixpose.rigid import transform
-from mixpose.runner import begin, observe, open_sources, run
-from mixpose.selection import Selection
-
-
-def command(*arguments: str | Path | int) -> int:
-    with pytest.raises(SystemExit) as leaving:
-        main([str(argument) for argument in arguments])
-    return int(str(leaving.value.code))
+from mixpose.runner import begin, observe, open_sources
 
 
 @pytest.fixture
@@ -42,10 +42,7 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def pose_of_frame_6() -> NDArray[np.float64]:
-    session = mixpose.load_session(TWO_CAMERAS)
-    (estimate,) = run(session, selection=Selection(6, 7))
-    assert estimate.T_world_object is not None
-    return estimate.T_world_object
+    return estimated_pose()
 
 
 def test_cameras_get_a_picture_per_stage_and_a_sheet(
