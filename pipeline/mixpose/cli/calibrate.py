@@ -172,11 +172,7 @@ def known_poses(path: Path, session: Session) -> dict[int, Floats]:
     Raises RecordingError if the file holds none, or its unit is another.
     """
     poses = read_poses(path)
-    if poses.unit is not None and poses.unit != session.unit:
-        raise RecordingError(
-            f"--poses {path}: found the unit {poses.unit}; allowed: that of the session, "
-            f"{session.unit}"
-        )
+    poses.require_unit(session.unit, RecordingError)
     found = {
         line.frame: line.T_world_object
         for line in poses.poses

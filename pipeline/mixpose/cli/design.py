@@ -115,11 +115,7 @@ def _poses(session: Session, asked: DesignRequest) -> Floats:
 def _read(path: Path, session: Session) -> list[Floats]:
     """Poses of the session's body from a file; a SessionError if it has none of its unit."""
     read = read_poses(path)
-    if read.unit not in (None, session.unit):
-        raise SessionError(
-            f"--poses {path}: found the unit {read.unit}; allowed: that of the session, "
-            f"{session.unit}"
-        )
+    read.require_unit(session.unit, SessionError)
     name = session.body.name
     poses = [
         pose.T_world_object

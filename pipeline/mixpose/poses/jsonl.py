@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from mixpose import rigid
-from mixpose.errors import RecordingError, SessionError, reporting
+from mixpose.errors import MixposeError, RecordingError, SessionError, reporting
 from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
@@ -151,6 +151,14 @@ class PoseFile:
         """Recordings that the run read in place of the session's, by sensor name."""
         found: Mapping[str, str] = self.header.get("sources", {})
         return found
+
+    def require_unit(self, unit: str, error: type[MixposeError]) -> None:
+        """Refuse poses that `--poses` gives, by an error, where they are in another unit."""
+        if self.unit not in (None, unit):
+            raise error(
+                f"--poses {self.path}: found the unit {self.unit}; allowed: that of the session, "
+                f"{unit}"
+            )
 
 
 def read_poses(path: str | Path) -> PoseFile:
