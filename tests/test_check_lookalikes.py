@@ -60,6 +60,15 @@ def test_a_body_all_around_its_cameras_is_like_nothing_else() -> None:
         assert look_alikes(setups, body_of(SOLID), T, ALL) == []
 
 
+def test_disks_that_look_like_nothing_else_are_no_error() -> None:
+    points = np.asarray(SOLID, dtype=np.float64)
+    normals = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+    normals[0] = [0, 0, -1]
+    dots = replace(body_of(points, normals), shape="disk", radii=np.full(len(points), 8.0))
+    aside = from_parts(Rotation.from_euler("y", 60, degrees=True).as_matrix(), [-433, 0, 250])
+    assert look_alikes([camera(), camera(aside)], dots, facing_camera(500.0), ALL) == []
+
+
 def test_near_by_perspective_tells_the_tilts_apart() -> None:
     assert look_alikes([camera()], body_of(TEE), facing_camera(250.0), ALL) == []
 

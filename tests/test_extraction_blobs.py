@@ -205,6 +205,22 @@ def test_dark_dots_on_paper_on_a_dark_table_are_found(threshold: str) -> None:
     assert np.max(errors) < 0.1
 
 
+def test_bright_dots_on_a_grey_ball_are_found_and_not_the_ball() -> None:
+    truth = np.array([(95.3, 110.6), (140.8, 92.4), (118.2, 150.1)])
+    ball, dots = disk(240, 120.4, 119.7, 70), sum(disk(240, u, v, 7) for u, v in truth)
+    found = blobs(photograph(30 * ball + 180 * dots, 4))
+    assert found.shape == (3, 2)
+    assert np.max(distances(found, truth)) < 0.1
+
+
+def test_a_disk_with_one_highlight_is_one_disk() -> None:
+    centre = np.array([(60.4, 59.7)])
+    light = 40 * disk(120, *centre[0], 25) + spot((120, 120), 68.3, 52.1, 1.5, 160)
+    found = blobs(photograph(light, 4))
+    assert found.shape == (1, 2)
+    assert np.max(distances(found, centre)) < 0.1
+
+
 def test_spots_that_touch_come_apart() -> None:
     truth = np.array([(30.2, 30.7), (36.4, 31.5)])
     found = blobs(photograph(spots((60, 60), truth, 1.5, 150, 90), 8))

@@ -91,6 +91,7 @@ class Blob(NamedTuple):
     length: float = 1.0  # by width
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
+    carries: bool = False  # whether it has something far brighter on it: features, or a highlight
 
 
 def extract_blobs(
@@ -229,7 +230,10 @@ def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) 
     begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
     outlined = [(part.scene, part.contour) for part in large]
     for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):
-        part.found = [disk] if disk else []
+        if disk and disk.carries:
+            part.whole = [disk]
+        elif disk:
+            part.found = [disk]
     return [part for part in large if not part.found]
 
 
@@ -255,7 +259,10 @@ def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
         blobs += rims
         for part in some if not rims else []:
             inner = [blob for layer in part.inner for blob in _blobs_of(layer, rules)]
-            blobs += _blobs_of(part.beside, rules) + (inner or part.whole)
+            # one alone is a highlight
+            some_of = 2 if any(blob.carries for blob in part.whole) else 1
+            own = inner if len(inner) >= some_of else part.whole
+            blobs += _blobs_of(part.beside, rules) + own
     return blobs
 
 
@@ -278,9 +285,11 @@ def _disks(
     contrasts = rims.contrast[some]
     # mostly the brightest row of all tells, or pixel, which is quicker than the median
     doubted = contrasts < np.array([_usual_step(scene, rules) for scene in scenes])[which[some]]
+    carry = np.zeros(len(some), bool)
     for row, k in [(row, some[row]) for row in np.flatnonzero(doubted).tolist()]:
-        doubted[row] = not _stands_out(of_all[k], contours[k], float(contrasts[row]), rules)
-    some = some[~doubted]
+        stands_out, carry[row] = _seen_on(of_all[k], contours[k], float(contrasts[row]), rules)
+        doubted[row] = not stands_out
+    some, carry = some[~doubted], carry[~doubted]
     ellipses = rims.ellipses.select(some)
     # a larger one is told by its rim
     told = np.flatnonzero(ellipses.half_axes.prod(axis=1) < rules.large**2)
@@ -289,7 +298,9 @@ def _disks(
     by_number = dict(zip(told.tolist(), off.tolist(), strict=True))
     areas, lengths = (part.tolist() for part in (ellipses.area, ellipses.length))
     for k, (place, rim) in enumerate(zip(some.tolist(), rims.each(some), strict=True)):
-        disks[place] = Blob(rim.u, rim.v, areas[k], lengths[k], rim, by_number.get(k))
+        disks[place] = Blob(
+            rim.u, rim.v, areas[k], lengths[k], rim, by_number.get(k), bool(carry[k])
+        )
     return disks
 
 
@@ -298,15 +309,18 @@ def _usual_step(scene: Foreground, rules: BlobRules) -> float:
     return rules.spots.min_step * (scene.highest - scene.zero) if scene.judged else -math.inf
 
 
-def _stands_out(scene: Foreground, contour: Contour, contrast: float, rules: BlobRules) -> bool:
-    """Whether what a contour with a rim encloses is a disk, by the step there."""
+def _seen_on(
+    scene: Foreground, contour: Contour, contrast: float, rules: BlobRules
+) -> tuple[bool, bool]:
+    """Whether what a contour with a rim encloses is a disk, by the step there, and carries more."""
     least = rules.spots.min_step
     u, v, width, height = box = cv2.boundingRect(contour)
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
     if contrast >= least * (highest - scene.zero):
-        return True
+        return True, False
     patch, inside, _ = cut_out(scene, contour, box, 0)
-    return contrast >= least * _brightness(scene, patch, inside)
+    typical, peak = _brightness(scene, patch, inside), cv2.minMaxLoc(patch, inside)[1]
+    return contrast >= least * typical, peak >= rules.core_ratio * typical
 
 
 def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
@@ -335,10 +349,12 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
         and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
     )
     if (stands_out or not scene.judged) and not on_border(scene, box):
-        part.whole = [_hull_blob(contour)]
+        part.whole = part.whole or [_hull_blob(contour)]
     if scene.judged:
         apart = come_apart(scene, contour, patch, inside, level, rules.spots)
-        higher = rules.level_ratio * level
+        # what is brighter than half of a core is not what it lights
+        lit = rules.core_ratio / 2 * typical if peak >= rules.core_ratio * typical else 0.0
+        higher = max(rules.level_ratio * level, lit)
         clear = stands_out and peak < rules.core_ratio * typical
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]

@@ -137,7 +137,7 @@ class BodyProjection:
         steps = np.sqrt(0.5) * radii * axes
         # four points, by twos on either side
         nodes = np.concatenate([middle + steps, middle - steps], axis=1)
-        y, J, seen = self._batch.linearise(nodes.reshape(-1, 4 * count, 3))
+        y, J, seen = self._batch.linearise(nodes.reshape(len(nodes), 4 * count, 3))
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
         along, across = (np.vecdot(J, axes[:, k, None, :, None]) for k in (0, 1))
         weights = np.abs(along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0])
