@@ -45,9 +45,7 @@ def test_two_faults_at_once_are_told_together(right: Session) -> None:
     seen = recorded(right)
     swapped = {"left": seen["right"], "right": seen["left"]}
     frames = frames_of(right, swapped)[:2]
-    # two at once are tried last, which a slow machine might not come to
-    patient = replace(RULES, patience_s=60.0)
-    assert diagnosis(mirrored(right), frames, rules=patient).change == (
+    assert diagnosis(mirrored(right), frames).change == (
         "'left' and 'right' are swapped, and the body of [object] is mirrored: with the source of "
         "each given to the other, and with one coordinate of all points negated"
     )

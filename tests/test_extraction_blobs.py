@@ -215,7 +215,7 @@ def test_bright_dots_on_a_grey_ball_are_found_and_not_the_ball() -> None:
 
 def test_a_disk_with_one_highlight_is_one_disk() -> None:
     centre = np.array([(60.4, 59.7)])
-    light = 40 * disk(120, *centre[0], 25) + spot((120, 120), 68.3, 52.1, 1.5, 160)
+    light = 40 * disk(120, 60.4, 59.7, 25) + spot((120, 120), 68.3, 52.1, 1.5, 160)
     found = blobs(photograph(light, 4))
     assert found.shape == (1, 2)
     assert np.max(distances(found, centre)) < 0.1

@@ -155,11 +155,11 @@ _CHECKING = (
         _DIAGNOSIS,
     ),
     Mutant(
-        "checking-the-best-change-is-left-when-it-is-late",
+        "checking-the-best-change-is-left-when-guesses-are-used-up",
         "checking/trials.py",
-        "if is_late() and (k == 0 or place > 0):",
-        "if is_late():",
-        "what explains the first frame is not told on a slow machine",
+        "if left < 0 and (k == 0 or place > 0):",
+        "if left < 0:",
+        "what explains the first frame is not told where guesses are used up",
         _DIAGNOSIS,
     ),
     Mutant(

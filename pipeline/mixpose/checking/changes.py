@@ -291,5 +291,5 @@ def _alone(session: Session, number: int, view: View) -> Floats | None:
     """T_world_object (4, 4) that one camera finds by itself."""
     if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
         return None
-    pose = best_pose(anywhere(session), session.body, number, [view])
+    pose, _ = best_pose(anywhere(session), session.body, number, [view])
     return None if pose is None else pose.T_world_object

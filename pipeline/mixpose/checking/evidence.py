@@ -115,14 +115,16 @@ def anywhere(session: Session) -> Session:
 
 def best_pose(
     session: Session, body: Body, number: int, views: Views, guesses: float = np.inf
-) -> ScoredPose | None:
-    """The best pose of a frame, searched for with as many guesses at most."""
+) -> tuple[ScoredPose | None, int]:
+    """The best pose of a frame, searched for with as many guesses at most, and how many it took."""
     tracker, track = begin(replace(session, body=body))
     search = replace(tracker.rules.search, max_guesses=guesses)
     tracker = replace(tracker, rules=replace(tracker.rules, search=search))
     with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
-        ranked = tracker.explain(tracker.data(track, number, None, views))
-    return ranked[0] if ranked else None
+        data = tracker.data(track, number, None, views)
+        ranked = tracker.explain(data)
+    made = sum(report.made for report, _ in data.searches)
+    return (ranked[0] if ranked else None), made
 
 
 def pose_near(

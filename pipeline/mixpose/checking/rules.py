@@ -58,10 +58,12 @@ class DiagnosisRules:
     leaders: int = constant(
         3, "changes that explain most, though no frame, that are tried with each other one as well"
     )
-    patience_s: float = constant(7.0, "of processor time, for all trials together")
-    as_it_is: float = constant(
-        0.3,
-        "of that, after which no more frames are estimated by the session as it is: 0.6 s a frame "
-        "in most, 1 to 3 s of 400 dots",
+    all_guesses: float = constant(
+        800_000,
+        "of all changes without values: two at once take 700,000; 8 s, and the same on any machine",
     )
-    whole: float = constant(0.75, "of that, for changes without values: the rest is for values")
+    in_vain: float = constant(
+        100_000,
+        "guesses, after which no more frames are estimated by the session as it is: 1 s, of 400 "
+        "dots 3 s",
+    )

@@ -8,10 +8,8 @@ not explained; values are fitted to the matches of all frames, those that promis
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -63,12 +61,14 @@ class _Runner:
     frames: Frames
     poses: list[ScoredPose | None] = field(default_factory=list)
 
-    def advance(self, session: Session) -> None:
-        """Try the next frame."""
+    def advance(self, session: Session) -> int:
+        """Try the next frame; the guesses that took."""
         number, views = self.frames[len(self.poses)]
         body = self.change.body(session.body)
-        seen, guesses = self.change.views(views), DiagnosisRules().guesses
-        self.poses.append(best_pose(session, body, number, seen, guesses))
+        seen, most = self.change.views(views), DiagnosisRules().guesses
+        pose, made = best_pose(session, body, number, seen, most)
+        self.poses.append(pose)
+        return made
 
     def explains(self, rules: DiagnosisRules) -> bool:
         """Whether it explains the last frame."""
@@ -93,7 +93,6 @@ def diagnosis(
     frames: Frames,
     others: Sequence[tuple[Change, Frames]] = (),
     further: Callable[[], Frames] = lambda: (),
-    rules: DiagnosisRules = DiagnosisRules(),
 ) -> Diagnosis:
     """What is most likely wrong with a session of one body, by frames of its recording.
 
@@ -101,19 +100,13 @@ def diagnosis(
     extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
     change by values undecided.
     """
-    began = time.process_time()
-
-    def is_late(share: float = 1.0) -> bool:
-        return time.process_time() - began > share * rules.patience_s
-
-    session = anywhere(session)
-    before = _as_it_is(session, frames, partial(is_late, rules.as_it_is))
+    session, rules = anywhere(session), DiagnosisRules()
+    before = _as_it_is(session, frames)
     frames = frames[: len(before.poses)]
     is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        in_part = partial(is_late, rules.whole)  # the rest is for values
-        tried += _without_values(session, frames, before, others, in_part)
+        tried += _without_values(session, frames, before, others)
     # values only follow the noise where all frames are explained to within it without any
     if not any(
         all(is_well_explained(pose, rules) for pose in one.explained.poses)
@@ -123,14 +116,14 @@ def diagnosis(
     ):
         best = max((one for one in tried if one.change.values), key=lambda t: t.gain, default=None)
         met = best.explained if best and best.gain > rules.margin else before
-        tried += _with_values(session, frames, before, is_late, met)
+        tried += _with_values(session, frames, before, met)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
         return found
     more = further()
-    poses = before.poses + _as_it_is(session, more, is_late).poses
+    poses = before.poses + _as_it_is(session, more).poses
     before, frames = Explained(poses), [*frames, *more][: len(poses)]
-    return simplest([*_with_values(session, frames, before, is_late, before)], before, rules)
+    return simplest([*_with_values(session, frames, before, before)], before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -142,13 +135,15 @@ def explanation(session: Session, frames: Frames) -> str | None:
     return late_sensor(session, frames) or diagnosis(session, frames).change or None
 
 
-def _as_it_is(session: Session, frames: Frames, is_late: Callable[[], bool]) -> Explained:
+def _as_it_is(session: Session, frames: Frames) -> Explained:
     """Poses of the session as it is, of fewer frames where a search takes long in vain."""
-    rules, poses = DiagnosisRules(), list[ScoredPose | None]()
+    rules, poses, left = DiagnosisRules(), list[ScoredPose | None](), DiagnosisRules().in_vain
     for number, views in frames:
-        if poses and is_late() and not is_well_explained(poses[-1], rules):
+        if poses and left < 0 and not is_well_explained(poses[-1], rules):
             break
-        poses.append(best_pose(session, session.body, number, views))
+        pose, made = best_pose(session, session.body, number, views)
+        poses.append(pose)
+        left -= made
     return Explained(tuple(poses))
 
 
@@ -157,20 +152,20 @@ def _without_values(
     frames: Frames,
     before: Explained,
     others: Sequence[tuple[Change, Frames]],
-    is_late: Callable[[], bool],
 ) -> Iterator[Tried]:
     """Changes that explain frames better: a race in which those far behind the best drop out."""
     rules, runners = DiagnosisRules(), [_Runner(*each) for each in others]
     runners += [_Runner(change, frames) for change in changes(session)]
+    left = rules.all_guesses
     for k in range(len(frames)):
         for place, runner in enumerate(runners):
-            if is_late() and (k == 0 or place > 0):
+            if left < 0 and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
-            runner.advance(session)
+            left -= runner.advance(session)
         for runner in _less_simple(session, frames, runners, before) if k == 0 else ():
-            if is_late():
+            if left < 0:
                 break
-            runner.advance(session)
+            left -= runner.advance(session)
             runners.append(runner)
         tried = [runner for runner in runners if len(runner.poses) > k]
         tried.sort(key=lambda runner: -runner.gain(before))
@@ -208,7 +203,6 @@ def _with_values(
     session: Session,
     frames: Frames,
     before: Explained,
-    is_late: Callable[[], bool],
     met: Explained,
 ) -> Iterator[Tried]:
     """Values that suit the matches of all frames, as they are `met`, better than those given."""
@@ -237,8 +231,6 @@ def _with_values(
     doubted = {None, *list(dict.fromkeys(markers))[: rules.markers]}
     promising = [each for each in promising if each[1].feature in doubted]
     for _, unknown, matches in promising[: rules.most]:
-        if is_late():
-            return
         yield from _fitted(session, frames, before, known, matches, unknown)
 
 
@@ -280,7 +272,7 @@ def _fitted(
     for k, (number, views) in enumerate(frames):
         # a pose that wrong values led to may be another one
         if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]) - rules.chance:
-            again = best_pose(session, body, number, _by(unknown, values, views))
+            again, _ = best_pose(session, body, number, _by(unknown, values, views), rules.guesses)
             after[k] = max(again, after[k], key=evidence_of) if k in known else again
     explained, count = Explained(tuple(after)), len(values)
     unlikely = float(((values / unknown.deviations) ** 2).sum())
