@@ -6,6 +6,7 @@ it takes most of the time and has tests of its own.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -255,14 +256,13 @@ def test_every_fifth_frame_is_held_back_together_or_every_fifth_run() -> None:
 
 def test_what_was_searched_is_found_again(tmp_path: Path) -> None:
     path = tmp_path / "a.partial"
-    first = Saved(path, "key")
-    first[3, 1] = Hypotheses(np.array([motion(0.3)]), np.array([7.0]))
-    first.close(finished=False)
-    again = Saved(path, "key")
-    assert again.resumed == 1
-    assert np.array_equal(again[3, 1].poses[0], motion(0.3))
-    again.close(finished=False)
-    other = Saved(path, "another")
-    assert other.resumed == 0
-    other.close(finished=True)
+    with suppress(KeyboardInterrupt), Saved(path, "key") as first:
+        first[3, 1] = Hypotheses(np.array([motion(0.3)]), np.array([7.0]))
+        raise KeyboardInterrupt
+    with suppress(KeyboardInterrupt), Saved(path, "key") as again:
+        assert again.resumed == 1
+        assert np.array_equal(again[3, 1].poses[0], motion(0.3))
+        raise KeyboardInterrupt
+    with Saved(path, "another") as other:
+        assert other.resumed == 0
     assert not path.exists()

@@ -130,8 +130,10 @@ class Saved(Known):
         self._stream.write(json.dumps([*key, one.poses.tolist(), one.evidence.tolist()]) + "\n")
         self._stream.flush()
 
-    def close(self, *, finished: bool) -> None:
-        """Close the file; a finished calibration needs it no more."""
+    def __enter__(self) -> Saved:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._stream.close()
-        if finished:
+        if error is None:  # a finished calibration needs the file no more
             self._path.unlink(missing_ok=True)

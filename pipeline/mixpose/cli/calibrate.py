@@ -95,25 +95,13 @@ def _calibrated(
             if request.output is not None and not is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")
                 refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
-                saved = kept.enter_context(_kept(partial, _key_of(session, task)))
+                saved = kept.enter_context(Saved(partial, _key_of(session, task)))
+                if saved.resumed:
+                    say(f"going on: {saved.resumed} frames of cameras were searched before")
             found = calibrate(task, rules, progress=progress, found=saved)
         if request.length is not None:
             found = in_length(found, request.length)
         yield found if request.world is None else in_world(found, request.world)
-
-
-@contextmanager
-def _kept(path: Path, key: str) -> Iterator[Saved]:
-    """What was searched, in a file that goes when all is written."""
-    saved = Saved(path, key)
-    if saved.resumed:
-        say(f"going on: {saved.resumed} frames of cameras were searched before")
-    finished = False
-    try:
-        yield saved
-        finished = True
-    finally:
-        saved.close(finished=finished)
 
 
 def task_of(

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import Output, OutputPerBody, is_apart, refuse_to_overwrite, written_paths
+from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import first_answers, header_of, objects_of, relative_to
 from mixpose.poses.formats import ONE_TRAJECTORY
-from mixpose.poses.header import UNITS_PER_METRE, Header
+from mixpose.poses.header import UNITS_PER_METRE
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
-from mixpose.whole_files import appearing_whole
 
 _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 
@@ -73,28 +70,9 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
     if name != "bop" or (request.object is not None and request.obj_id is not None):
         header = replace(header, objects=objects_of(lines))
     labels = tuple(dict.fromkeys(line.label for line in lines))
-    with ExitStack() as stack:
-        output = _output(stack, name, header, labels, options, request.output)
-        stack.enter_context(output)
+    with pose_output(request.output, name, header, labels, options=options, whole=True) as output:
         for line in lines:
             output.write(relative_to(T_sensor_world, line))
-
-
-def _output(
-    stack: ExitStack,
-    name: str,
-    header: Header,
-    labels: Sequence[str],
-    options: Mapping[str, int | str],
-    path: Path | None,
-) -> Output | OutputPerBody:
-    """Where poses go; files are whole when they appear."""
-
-    def whole(own: Path | None) -> Output:
-        part = None if own is None else stack.enter_context(appearing_whole(own))
-        return Output(part, name, header, options=options, called=own)
-
-    return OutputPerBody(path, name, labels, whole) if is_apart(name, labels) else whole(path)
 
 
 def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:

@@ -45,16 +45,15 @@ def learn_session(request: LearnRequest) -> None:
             f"-o -: found {len(bodies)} bodies, each of which gets a table of its own; name a "
             "file, as -o body.csv"
         )
-    files = [_file(request.output, k) for k in range(len(bodies))]
+    first = request.output
+    others = [
+        first.with_name(f"{first.stem}-{k + 2}{first.suffix}") for k in range(len(bodies) - 1)
+    ]
+    files = [first, *others]
     for file, body in zip(files, bodies, strict=True):
         refuse_to_overwrite_but(file, inputs, MARK)
         write_text(file, table_text(body), "-o")
     _tell(lesson, bodies, files, session, rules)
-
-
-def _called(file: Path) -> Path:
-    """How a table is called, also one that goes to standard output."""
-    return Path("body.csv") if is_stdout(file) else file
 
 
 def _older(path: Path, session: Session) -> Markers:
@@ -89,10 +88,6 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
     return bodies
 
 
-def _file(output: Path, index: int) -> Path:
-    return output if not index else output.with_name(f"{output.stem}-{index + 1}{output.suffix}")
-
-
 def _tell(
     lesson: Lesson,
     bodies: Sequence[Learnt],
@@ -101,7 +96,7 @@ def _tell(
     rules: LearningRules,
 ) -> None:
     lines = list[str]()
-    called = [_called(file) for file in files]
+    called = [Path("body.csv") if is_stdout(file) else file for file in files]
     for file, body in zip(called, bodies, strict=True):
         lines += lines_of(body, file.name, session.unit)
     if len(bodies) > 1 or bodies[0].count > 1:

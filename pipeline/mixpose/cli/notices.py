@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.calibration.task import Progress
@@ -246,16 +246,33 @@ class Summary:
 
 
 @contextmanager
-def bar(what: str, total: int | None, *, shown: bool = True) -> Iterator[Callable[..., None]]:
-    """What moves a bar on standard error on, while a person is watching; else nothing is seen."""
+def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
+    """A display of rich on standard error, while a person is watching; else None."""
     if not shown or not sys.stderr.isatty():
-        yield lambda **moved: None
+        yield None
         return
     from rich.console import Console  # noqa: PLC0415 - only where it is shown
-    from rich.progress import Progress as Bar  # noqa: PLC0415
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
 
-    with Bar(console=Console(stderr=True), transient=True) as progress:
-        yield partial(progress.update, progress.add_task(what, total=total))
+    spinning = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = spinning if spins else ()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as display:
+        yield display
+
+
+@contextmanager
+def bar(
+    what: str, total: int | None, *, shown: bool = True, spins: bool = False
+) -> Iterator[Callable[..., None]]:
+    """What moves a bar on standard error on, while a person is watching; else nothing is seen.
+
+    Of a bar that `spins` nobody is to see how much is left.
+    """
+    with _display(shown=shown, spins=spins) as display:
+        if display is None:
+            yield lambda **moved: None
+        else:
+            yield partial(display.update, display.add_task(what, total=total))
 
 
 @contextmanager
@@ -279,21 +296,15 @@ def watched() -> Iterator[Progress]:
             about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
             say(f"{left} frames of cameras left to search, about {about}")
 
-    if not sys.stderr.isatty():
-        yield expect
-        return
-    from rich.console import Console  # noqa: PLC0415 - only where it is shown
-    from rich.progress import Progress as Bar  # noqa: PLC0415
-
-    with Bar(console=Console(stderr=True), transient=True) as bar:
+    with _display() as display:
         tasks: dict[str, object] = {}
 
         def show(stage: str, done: int, total: int) -> None:
             expect(stage, done, total)
             if stage not in tasks:
                 for other in tasks.values():
-                    bar.update(other, visible=False)  # type: ignore[arg-type]
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+                    display.update(other, visible=False)
+                tasks[stage] = display.add_task(stage, total=total)
+            display.update(tasks[stage], completed=done, total=total)
 
-        yield show
+        yield expect if display is None else show

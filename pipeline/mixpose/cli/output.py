@@ -6,8 +6,9 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TextIO, cast
+from typing import Self, TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
@@ -30,12 +31,12 @@ _FIRST_LINES = re.compile(
 """Of files of poses, whole as they are written."""
 
 
-class Output:
+class Output(ExitStack):
     """Writes poses; a file is opened with the first of them, so that no failure empties it.
 
     Without a path poses go to standard output. `goes_on` is a file of JSON lines that has its
     header already, in place of opening `path`; `options` are what the writer of the format takes
-    besides; `called` is what messages call the file, where that is not `path`.
+    besides; a `whole` file appears when all is written.
     """
 
     def __init__(
@@ -46,20 +47,24 @@ class Output:
         *,
         goes_on: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
-        called: Path | None = None,
+        whole: bool = False,
     ) -> None:
-        self._called = called or path
-        self._path, self._format, self._header = path, format_name, header
-        self._options = options or {}
+        super().__init__()
+        self._called = self._path = path
+        self._format, self._header = format_name, header
+        self._options, self._is_whole = options or {}, whole
         self._writer: PoseWriter | None = None
         self.file = goes_on
         if goes_on is not None:
-            self._writer = JsonlWriter(_as_stream(goes_on), header, resume=True)
+            self._writer = JsonlWriter(cast(TextIO, goes_on), header, resume=True)
 
-    def __enter__(self) -> Output:
-        return self
+    def __enter__(self) -> Self:
+        if self._is_whole and self._called is not None:
+            self._path = self.enter_context(appearing_whole(self._called))
+        self.push(self._end)
+        return super().__enter__()
 
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
+    def _end(self, kind: object, error: object, trace: object) -> None:
         try:
             if error is None and self._writer is None:
                 self._open()  # a run without frames says at least what it was
@@ -82,7 +87,8 @@ class Output:
     def _open(self) -> PoseWriter:
         if self._path is not None:
             self.file = LineFile(self._path, called=self._called)
-        stream = sys.stdout if self.file is None else _as_stream(self.file)
+        # the writers only ever write and flush
+        stream = sys.stdout if self.file is None else cast(TextIO, self.file)
         self._writer = FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
@@ -133,19 +139,31 @@ def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
-def is_apart(format_name: str, labels: Sequence[str]) -> bool:
+def pose_output(
+    path: Path | None,
+    format_name: str,
+    header: Header,
+    labels: Sequence[str],
+    *,
+    goes_on: LineFile | None = None,
+    options: Mapping[str, int | str] | None = None,
+    whole: bool = False,
+) -> Output | OutputPerBody:
+    """Where the poses of bodies go, as `Output` says; to a file each where the format needs it."""
+    start = partial(Output, format_name=format_name, header=header, options=options, whole=whole)
+    if _is_apart(format_name, labels):
+        return OutputPerBody(path, format_name, labels, start)
+    return start(path, goes_on=goes_on)
+
+
+def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
     """Whether a format needs a file for each of the bodies."""
     return format_name in ONE_TRAJECTORY and len(labels) > 1
 
 
 def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
     """The files that poses go to."""
-    return _body_paths(path, labels) if is_apart(format_name, labels) else [path]
-
-
-def _as_stream(file: LineFile) -> TextIO:
-    """The writers only ever write and flush."""
-    return cast(TextIO, file)
+    return _body_paths(path, labels) if _is_apart(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -12,16 +11,8 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
-from mixpose.cli.lines import LineFile
-from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import (
-    Output,
-    OutputPerBody,
-    is_apart,
-    refuse_stdout,
-    refuse_to_overwrite,
-    written_paths,
-)
+from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
+from mixpose.cli.output import pose_output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -70,7 +61,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = _output(request, header, go_on.file)
+    output = pose_output(request.output, request.format, header, header.labels, goes_on=go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, go_on.there)
         watch = _each(
@@ -103,17 +94,6 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
                 say(f"frame {estimate.frame}: {origin_of(estimate)}")
     names = [str(path) for path in (*outputs, request.overlay) if path is not None]
     summary.say(f" -> {', '.join(names)}" if names else "")
-
-
-def _output(
-    request: RunRequest, header: Header, goes_on: LineFile | None
-) -> Output | OutputPerBody:
-    name = request.format
-    if not is_apart(name, header.labels):
-        return Output(request.output, name, header, goes_on=goes_on)
-    return OutputPerBody(
-        request.output, name, header.labels, lambda path: Output(path, name, header)
-    )
 
 
 @contextmanager
@@ -268,18 +248,10 @@ def _with_progress(
     estimates: Generator[Estimate, None, None], session: Session, *, quiet: bool
 ) -> Iterable[Estimate]:
     """Show a bar on standard error while poses go to a file and a person is watching."""
-    if quiet or not sys.stderr.isatty():
-        yield from estimates
-        return
-    from rich.console import Console  # noqa: PLC0415 - only where it is shown
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(str(session.path), total=None)
+    with bar(str(session.path), None, shown=not quiet, spins=True) as moved:
         lost = 0
         for count, estimate in enumerate(estimates, 1):
             lost += estimate.status == "lost"
             text = f"frame {estimate.frame}, {count} done, {lost} lost"
-            progress.update(task, advance=1, description=text)
+            moved(advance=1, description=text)
             yield estimate

@@ -43,7 +43,6 @@ USUAL_STEM = "session"
 
 SUMMARY, TABLE = "summary.json", "summary.csv"
 
-_SUFFIXES = {"bop": ".bop.csv", "ros": ".yaml"}
 _COLUMNS = ("name", "state", "ok", "ambiguous", "lost", "warnings", "seconds", "reason")
 _STATUSES = ("ok", "ambiguous", "lost")
 
@@ -109,22 +108,21 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
             )
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)
-    before = {k: outcome for k, job in enumerate(jobs) if (outcome := finished(job)) is not None}
-    if before:
-        say(f"{len(before)} of {len(jobs)} recordings are done already")
-    left = [k for k in range(len(jobs)) if k not in before]
-    outcomes = dict(before)
+    outcomes = {k: outcome for k, job in enumerate(jobs) if (outcome := finished(job)) is not None}
+    if outcomes:
+        say(f"{len(outcomes)} of {len(jobs)} recordings are done already")
+    left = [k for k in range(len(jobs)) if k not in outcomes]
     try:
         with _doing(request, workers) as (executor, function):
             for place, result in executor.run(function, [jobs[k] for k in left]):
                 number = left[place]
-                outcome = _outcome_of(jobs[number], result)
-                outcomes[number] = outcome
-                say(f"{sessions[number]}: {_line(outcome)}")
+                outcomes[number] = _outcome_of(jobs[number], result)
+                say(f"{sessions[number]}: {_line(outcomes[number])}")
     finally:
-        _sweep(folder, list(outcomes.values()))
-        _write_summary(folder, [outcomes[k] for k in sorted(outcomes)], len(jobs))
-    return _say_all(folder, [outcomes[k] for k in sorted(outcomes)])
+        ended = [outcomes[k] for k in sorted(outcomes)]
+        _sweep(folder, ended)
+        _write_summary(folder, ended, len(jobs))
+    return _say_all(folder, ended)
 
 
 @contextmanager
@@ -154,7 +152,7 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
     names = names_of(sessions)
-    suffix = _SUFFIXES.get(request.format, f".{request.format}")
+    suffix = next(end for end, format_name in SUFFIXES.items() if format_name == request.format)
     return [
         Job(
             session=str(session.absolute()),

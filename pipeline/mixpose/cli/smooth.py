@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,8 @@ from mixpose.cli.request import output_of
 from mixpose.errors import RecordingError
 from mixpose.poses.estimates import header_of
 from mixpose.poses.jsonl import PoseFile, read_poses
-from mixpose.records import Estimate
 from mixpose.trajectories.motion import ORDERS
 from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
-from mixpose.whole_files import appearing_whole
 
 
 def smooth_poses(request: SmoothRequest) -> None:
@@ -66,15 +63,9 @@ def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) 
     )
     order = {label: k for k, label in enumerate(bodies)}
     lines = [each for body in bodies.values() for each in body.estimates]
-
-    def place(one: Estimate) -> tuple[int, int]:
-        return one.frame, order[one.label]
-
-    with ExitStack() as stack:
-        part = None if path is None else stack.enter_context(appearing_whole(path))
-        with Output(part, "jsonl", header, called=path) as writer:
-            for each in sorted(lines, key=place):
-                writer.write(each)
+    with Output(path, "jsonl", header, whole=True) as writer:
+        for each in sorted(lines, key=lambda one: (one.frame, order[one.label])):
+            writer.write(each)
 
 
 def _model(body: SmoothedBody) -> dict[str, Any]:
