@@ -18,6 +18,8 @@ GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
     "encoding",
     "limits",
     "whole_files",
+    "naming",
+    "units",
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
@@ -30,6 +32,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "limits": set(),
     "executing": GROUND,
     "whole_files": set(),
+    "naming": set(),
+    "units": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,

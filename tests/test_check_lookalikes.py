@@ -18,7 +18,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, from_rotation_vector
 from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.session.setup import Unit
+from mixpose.units import Unit
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
 ALL = np.ones(6, dtype=np.bool_)

@@ -16,7 +16,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import Session, load_session
-from mixpose.session.setup import Unit
+from mixpose.units import Unit
 
 Writer = Callable[[Path], list[Path]]
 

@@ -43,6 +43,7 @@ PACKAGE = "pipeline/mixpose"
 TESTS: dict[str, tuple[str, ...]] = {
     "rigid": ("test_rigid.py",),
     "records": ("test_records.py",),
+    "units": ("test_session_calibration.py", "test_poses_*.py"),
     "sensors": ("test_sensors.py", "test_sensors_*.py"),
     "body": ("test_body.py",),
     "optimise": ("test_optimise.py",),

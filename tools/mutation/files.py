@@ -6,10 +6,10 @@ from mutation.mutant import Mutant
 
 _PLACES = (
     Mutant(
-        "session-centimetres-are-millimetres",
-        "session/setup.py",
-        '"cm": 1e-2',
-        '"cm": 1e-3',
+        "units-centimetres-are-millimetres",
+        "units.py",
+        '"cm": 100.0',
+        '"cm": 1000.0',
         "lengths of a session in cm are ten times too short",
     ),
     Mutant(
@@ -207,8 +207,8 @@ _EVALUATION = (
         "of answers alike in rotation a far one is taken",
     ),
     Mutant(
-        "poses-truth-unit-the-other-way",
-        "poses/header.py",
+        "units-truth-the-other-way",
+        "units.py",
         "UNITS_PER_METRE[to_unit] / UNITS_PER_METRE[from_unit]",
         "UNITS_PER_METRE[from_unit] / UNITS_PER_METRE[to_unit]",
         "a truth in m is a million times off from poses in mm",

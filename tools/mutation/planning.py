@@ -42,7 +42,7 @@ _FORMATS = (
     Mutant(
         "session-poses-in-files-keep-their-unit",
         "session/sensor_setups.py",
-        "T[:3, 3] * scale_between(stated or unit, unit)",
+        "T[:3, 3] * length_ratio(stated or unit, unit)",
         "T[:3, 3]",
         "Kalibr's metres are taken for the session's millimetres",
         _IMPORTS,
@@ -50,7 +50,7 @@ _FORMATS = (
     Mutant(
         "session-bodies-keep-their-unit",
         "session/marker_files.py",
-        "points=markers.points * scale_between(stated, unit)",
+        "points=markers.points * length_ratio(stated, unit)",
         "points=markers.points",
         "an .obj in metres is a thousandth as large",
         ("test_session_bodies.py",),

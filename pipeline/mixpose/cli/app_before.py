@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from mixpose.cli.words import AllowCode, LengthUnit, Recordings, SessionFile, option
+from mixpose.cli.words import AllowCode, Recordings, SessionFile, option
+from mixpose.units import Unit
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class ImportRequest:
     output: Path = option(
         ..., "The session file, which must be new; or stdout (-).", "-o", "--output"
     )
-    unit: LengthUnit = option("mm", "Unit of lengths in the session.")
-    lengths: LengthUnit | None = option(
+    unit: Unit = option("mm", "Unit of lengths in the session.")
+    lengths: Unit | None = option(
         None, "Unit of translations in files whose format does not fix it."
     )
 

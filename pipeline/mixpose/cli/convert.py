@@ -17,11 +17,11 @@ from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_marker
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import first_answers, header_of, objects_of, relative_to
 from mixpose.poses.formats import ONE_TRAJECTORY
-from mixpose.poses.header import UNITS_PER_METRE
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
+from mixpose.units import UNITS_PER_METRE
 
 _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 

@@ -14,6 +14,7 @@ from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
+from mixpose.naming import distinct
 from mixpose.poses.benchmarks import BOP_COLUMNS, TUM_COLUMNS
 from mixpose.poses.csvtable import FRAME_COLUMNS
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
@@ -127,15 +128,7 @@ class OutputPerBody(ExitStack):
 
 def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
     """Where the poses of several bodies go: ``poses.tum`` → ``poses.tool.tum``; no two alike."""
-    words: list[str] = []
-    taken: set[str] = set()  # some file systems know no capitals
-    for label in labels:
-        plain = word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
-        number = len(words)
-        while word.casefold() in taken:
-            word, number = f"{plain}_{number}", number + 1
-        taken.add(word.casefold())
-        words.append(word)
+    words = distinct(labels, partial(re.sub, r"[^\w\- ]", "_"), str.casefold)
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 

@@ -13,7 +13,6 @@ import typer
 
 Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
 ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
-LengthUnit: TypeAlias = Literal["m", "cm", "mm", "um"]
 
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
 PosesFile = Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")]

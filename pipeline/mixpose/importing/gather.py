@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.errors import SessionError
+from mixpose.naming import distinct
 from mixpose.records import Floats
 from mixpose.session.calibration import CalibratedCamera, Rig, read_rigs
 from mixpose.session.marker_files import READERS, read_marker_file
 from mixpose.session.messages import BadKeyError, one_line
-from mixpose.session.setup import Unit, scale_between
+from mixpose.units import Unit, length_ratio
 
 _TABLES = (".csv", *READERS)
 _EXAMPLE_MM = [[0, 0, 0], [60, 0, 0], [0, 100, 0], [20, 30, 80]]
@@ -74,7 +75,7 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
         stated, remark, warning = _stated_unit(rig, unit, lengths)
         remarks.append(remark)
         warnings.append(warning)
-        factor = scale_between(stated, unit)
+        factor = length_ratio(stated, unit)
         cameras += [replace(c, T_camera_rig=_scaled(c.T_camera_rig, factor)) for c in rig.cameras]
     cameras = _renamed(cameras)
     return Imported(
@@ -106,17 +107,13 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
 
 def _renamed(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
     """Cameras whose names are unique and can stand in NAME=PATH."""
-    taken: set[str] = set()
-    renamed = []
-    for camera in cameras:
-        name = "".join("_" if c in '=/\\"' or not c.isprintable() else c for c in camera.name)
-        name = base = name.strip() or "camera"
-        number = 2
-        while name in taken:
-            name, number = f"{base}_{number}", number + 1
-        taken.add(name)
-        renamed.append(replace(camera, name=name))
-    return renamed
+
+    def plain(name: str) -> str:
+        kept = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
+        return "".join(kept).strip() or "camera"
+
+    names = distinct([camera.name for camera in cameras], plain)
+    return [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
 
 
 def _scaled(T: Floats | None, factor: float) -> Floats | None:
@@ -184,7 +181,7 @@ def session_text(imported: Imported, output: Path) -> str:
 
 def _objects(imported: Imported, output: Path) -> list[str]:
     if not imported.bodies:
-        scale = scale_between("mm", imported.unit)
+        scale = length_ratio("mm", imported.unit)
         points = [[float(f"{value * scale:g}") for value in point] for point in _EXAMPLE_MM]
         return [
             '# an example: put in the places of your markers, or file = "markers.csv"\n'

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.naming import distinct
 from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
 from mixpose.pictures.finding import Finding
@@ -151,9 +153,4 @@ def _some(sigmas: Sequence[float], most: int) -> list[float]:
 
 def file_names(wanted: Sequence[str]) -> list[str]:
     """Names that any file system takes, no two alike."""
-    names: list[str] = []
-    for one in wanted:
-        name = re.sub(r"[^\w.-]", "_", one)
-        taken = {one.casefold() for one in names}
-        names.append(name if name.casefold() not in taken else f"{name}_{len(names)}")
-    return names
+    return distinct(wanted, partial(re.sub, r"[^\w.-]", "_"), str.casefold)

@@ -11,9 +11,10 @@ from __future__ import annotations
 from typing import TextIO
 
 from mixpose import rigid
-from mixpose.poses.header import UNITS_PER_METRE, Header
+from mixpose.poses.header import Header
 from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate
+from mixpose.units import UNITS_PER_METRE
 
 TUM_COLUMNS = "# time tx ty tz qx qy qz qw, in s and m, by mixpose"
 BOP_COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose import rigid
-from mixpose.poses.header import Header, length_ratio
+from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.units import length_ratio
 
 
 def header_of(poses: PoseFile, unit: str, version: str) -> Header:

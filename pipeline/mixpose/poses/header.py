@@ -1,4 +1,4 @@
-"""What a poses file says about itself, and the units it may use."""
+"""What a poses file says about itself."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from mixpose.records import Floats, label_of
 FORMAT = "mixpose-poses"
 VERSION = 1
 COVARIANCE = "x y z rx ry rz, world axes, unit^2 and rad^2"
-
-# Whole numbers, so that dividing by them rounds once: 1500 mm are 1.5 m exactly.
-UNITS_PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "um": 1e6}
 
 
 @dataclass(frozen=True)
@@ -47,8 +44,3 @@ class Header:
             for name, count in self.objects.items()
             for instance in (range(count) if count > 1 else (None,))
         )
-
-
-def length_ratio(from_unit: str, to_unit: str) -> float:
-    """Length of one `from_unit` in `to_unit`; 1000 from "m" to "mm"."""
-    return UNITS_PER_METRE[to_unit] / UNITS_PER_METRE[from_unit]

@@ -11,8 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.header import FORMAT, UNITS_PER_METRE, VERSION
+from mixpose.poses.header import FORMAT, VERSION
 from mixpose.records import Estimate, Floats, Hypothesis, Label, MeasuredPoint, SensorReport, Status
+from mixpose.units import UNITS_PER_METRE
 
 # Files by other people round their rotations to a few digits.
 RIGID_TOLERANCE = 1e-3

@@ -14,9 +14,10 @@ import numpy as np
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.header import UNITS_PER_METRE, Header
+from mixpose.poses.header import Header
 from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate, Floats
+from mixpose.units import UNITS_PER_METRE
 
 _LARGEST_SECOND = 2**31 - 1  # builtin_interfaces/Time counts them in an int32
 

@@ -12,6 +12,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from statistics import median_low
@@ -20,9 +21,10 @@ from typing import TextIO
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.poses.header import length_ratio
+from mixpose.naming import distinct
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Mask
+from mixpose.units import length_ratio
 
 TRC_MARK = "by mixpose"
 """In the first line of files that mixpose wrote."""
@@ -121,7 +123,7 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space
-    names = _without_blanks(trajectories.names)
+    names = distinct(trajectories.names, partial(re.sub, r"\s", "_"))
     rate, first = repr(trajectories.rate), trajectories.first
     axes = [f"{axis}{k + 1}" for k in range(markers) for axis in "XYZ"]
     keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame"
@@ -142,20 +144,6 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
         time = (first + k) / trajectories.rate
         stream.write("\t".join([str(first + k), f"{time:.9g}", *cells]) + "\n")
     stream.flush()
-
-
-def _without_blanks(names: Sequence[str]) -> list[str]:
-    """Names without white space, all different as those given."""
-    taken = {name for name in names if not re.search(r"\s", name)}
-    found = []
-    for name in names:
-        own = base = re.sub(r"\s", "_", name)
-        number = 2
-        while own != name and own in taken:
-            own, number = f"{base}_{number}", number + 1
-        taken.add(own)
-        found.append(own)
-    return found
 
 
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:

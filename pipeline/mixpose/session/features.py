@@ -15,8 +15,8 @@ from mixpose.records import Floats
 from mixpose.session.marker_files import Markers, read_marker_file
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
-from mixpose.session.setup import Unit
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, is_number, numbers
+from mixpose.units import Unit
 
 FEWEST_FEATURES = 3
 

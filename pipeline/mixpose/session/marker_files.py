@@ -27,9 +27,9 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.session.messages import BadKeyError, found, in_file, under
-from mixpose.session.setup import Unit, scale_between
 from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.values import as_number, is_number
+from mixpose.units import Unit, length_ratio
 
 _ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterTrack's .obj"
 
@@ -63,7 +63,7 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
         for number in markers.points.ravel().tolist():
             if not is_number(number):
                 raise BadKeyError(found(number, "finite coordinates of markers"))
-    return replace(markers, points=markers.points * scale_between(stated, unit))
+    return replace(markers, points=markers.points * length_ratio(stated, unit))
 
 
 def read_rom(content: bytes) -> Markers:

@@ -18,8 +18,8 @@ from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.schema_common import ExtractTable, Motion, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
-from mixpose.session.setup import Unit
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, Free
+from mixpose.units import Unit
 
 MOST_ALIKE = 1000
 """Identical bodies that a session may have."""

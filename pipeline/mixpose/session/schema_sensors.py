@@ -21,7 +21,6 @@ from mixpose.session.schema_common import (
     Table,
     Text,
 )
-from mixpose.session.setup import Unit
 from mixpose.session.values import (
     RESOLUTION_FORM,
     ArrayOf,
@@ -31,6 +30,7 @@ from mixpose.session.values import (
     read_calibration_key,
 )
 from mixpose.session.values import resolution as resolution_of
+from mixpose.units import Unit
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
 

@@ -36,7 +36,8 @@ from mixpose.session.schema_sensors import (
     ParallelTable,
     PlacedTable,
 )
-from mixpose.session.setup import SensorSetup, Unit, scale_between
+from mixpose.session.setup import SensorSetup
+from mixpose.units import Unit, length_ratio
 
 _WIDEST_PX = 1000
 _WIDEST_BINS = 100_000
@@ -203,7 +204,7 @@ def _pose_in_file(camera: CalibratedCamera, wanted: CalibrationTable | None, uni
             "calibration",
             "unit",
         )
-    return from_parts(T[:3, :3], T[:3, 3] * scale_between(stated or unit, unit))
+    return from_parts(T[:3, :3], T[:3, 3] * length_ratio(stated or unit, unit))
 
 
 def _calibrated(table: CameraTable, folder: Path) -> CalibratedCamera:

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal
 
 from mixpose.body import Body
 from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
 from mixpose.records import Floats, label_of
 from mixpose.sensors import CalibrationError, Sensor
-
-Unit: TypeAlias = Literal["m", "cm", "mm", "um"]
-
-METRES_PER_UNIT: dict[Unit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
-
-
-def scale_between(unit: Unit, other: Unit) -> float:
-    """What lengths in one unit are multiplied by to be in another; exactly 1 for the same."""
-    return float(f"{METRES_PER_UNIT[unit] / METRES_PER_UNIT[other]:.0e}")
+from mixpose.units import Unit, length_ratio
 
 
 @dataclass(frozen=True)
@@ -121,4 +113,4 @@ class Session:
     @property
     def metres_per_unit(self) -> float:
         """Length of the session's unit in metres."""
-        return METRES_PER_UNIT[self.unit]
+        return length_ratio(self.unit, "m")

@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 from mixpose.records import Floats
 from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, in_file
-from mixpose.session.setup import Unit
 from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_bytes
+from mixpose.units import Unit
 
 Group: TypeAlias = "Sequence[Content]"
 

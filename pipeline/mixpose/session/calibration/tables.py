@@ -14,7 +14,7 @@ from mixpose.session.calibration.camera import CalibratedCamera, Content, Format
 from mixpose.session.calibration.pieces import motion_of, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, Key, found, under
-from mixpose.session.setup import Unit
+from mixpose.units import Unit
 
 Cameras: TypeAlias = dict[str, tuple[Key, dict[str, Any]]]
 """By a camera's name: where its table is, and the table."""
