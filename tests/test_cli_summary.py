@@ -93,7 +93,7 @@ def test_a_sensor_that_meets_nothing_is_named_whatever_else_is_odd_about_it(
         seen = View("left", session.sensors[0].sensor, Observation(FEW, 1.0))
         pictures = {name: RawFrame(frame, None, FEW) for name in ("left", "right")}
         estimate = Estimate(frame, None, session.labels[0], "ok", np.eye(4), None, 0.5, {})
-        found.watch(FrameSet(frame, None, pictures), [seen], estimate)
+        found.findings.watch(FrameSet(frame, None, pictures), [seen], estimate)
     assert [line for line in found.warnings() if "no feature" in line]
     assert warning in found.warnings()
 

@@ -24,7 +24,7 @@ def test_what_a_run_remembers_does_not_grow_with_its_frames(tmp_path: Path) -> N
     (path,) = make_recordings(tmp_path, 1, 150)
     session = load_session(path)
     summary = Summary(session)
-    estimates = run(session, watch=summary.watch)
+    estimates = run(session, watch=summary.findings.watch)
     tracemalloc.start()
     try:
         remembered = []

@@ -329,7 +329,7 @@ def outcome(fault: Fault, folder: Path, stop: int | None = None) -> Result:
     session = load_session(folder / "session.toml")
     summary = Summary(session)
     counts = {"right": 0, "wrong": 0, "ambiguous": 0, "lost": 0}
-    for estimate in run(session, selection=Selection(stop=stop), watch=summary.watch):
+    for estimate in run(session, selection=Selection(stop=stop), watch=summary.findings.watch):
         summary.add(estimate)
         if estimate.status != "ok":
             counts[estimate.status] += 1

@@ -91,8 +91,8 @@ _SETUPS = (
     Mutant(
         "session-common-keys-win",
         "session/sensor_setups.py",
-        "given = _keys_given(defaults) | ({} if own is None else _keys_given(own))",
-        "given = ({} if own is None else _keys_given(own)) | _keys_given(defaults)",
+        "[defaults, own]",
+        "[own, defaults]",
         "[sensor.extract] changes nothing",
     ),
     Mutant(
@@ -324,8 +324,8 @@ _FORMATS = (
     Mutant(
         "poses-covariance-stays-in-world-axes",
         "poses/estimates.py",
-        "covariance = turn @ covariance @ turn.T",
-        "covariance = 1.0 * covariance",
+        "else by_twist @ covariance @ by_twist.T",
+        "else covariance",
         "poses relative to a sensor have the covariance of other axes",
     ),
     Mutant(

@@ -169,12 +169,10 @@ def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tupl
 
 
 def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
-    """Standard deviation of detections (L,) from residuals under a Gaussian weight.
-
-    That of a sensor is like that of others of its kind, within the factor `unlike`.  Where frames
-    err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it had
-    no noise at all.
-    """
+    """Standard deviation of detections (L,) from residuals under a Gaussian weight."""
+    # that of a sensor is like that of others of its kind, within the factor `unlike`. Where frames
+    # err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it
+    # had no noise at all
     rules, sigmas, sensors = bundle.rules, bundle.sigmas, state.rig.sensors
     weighted, alone = _weighted(bundle, state, blur, np.ones(len(blur)))
     rows = [each for each, _ in weighted]
@@ -202,11 +200,9 @@ def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
 
 
 def _of_cauchy(dimension: float, tail: float) -> float:
-    """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations.
-
-    Of Gaussian errors with radius r in units of their deviation, whose weight is w = 1/(1 + r²/c²):
-    E[w² r²/m] E[w] / E[w + w' r/m]².
-    """
+    """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations."""
+    # of Gaussian errors with radius r in their deviations, whose weight is w = 1/(1 + r²/c²):
+    # E[w² r²/m] E[w] / E[w + w' r/m]²
     r = np.linspace(0, 10, 2001)
     density = r ** (dimension - 1) * np.exp(-(r**2) / 2)
     density /= density.sum()
@@ -217,11 +213,9 @@ def _of_cauchy(dimension: float, tail: float) -> float:
 
 
 def _inflation(bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats) -> float:
-    """By how much frames differ more than independent errors of detections would let them.
-
-    Each frame's pull on the rig has the covariance of its information; a common error of its
-    detections, as of a sensor out of step, makes it larger.
-    """
+    """By how much frames differ more than independent errors of detections would let them."""
+    # each frame's pull on the rig has the covariance of its information; a common error of its
+    # detections, as of a sensor out of step, makes it larger
     if not bundle.count:
         return 1.0
     pulls = np.zeros((len(bundle.frames), bundle.count))

@@ -112,12 +112,10 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
 def _normal_equations(
     bundle: Bundle, weighted: Sequence[Weighted], damping: float
 ) -> tuple[Floats, Floats, Floats, Callable[[Floats], Floats]]:
-    """The normal equations S δ = b of the rig (G, G), poses eliminated.
-
-    Beside S there is the information (G, C) between the rig and what is held, beside b the poses'
-    step that belongs to one of the rig.  Weights include the inverse variance; a share of the
-    diagonal is added to the poses' part.
-    """
+    """The normal equations S δ = b of the rig (G, G), poses eliminated."""
+    # beside S there is the information (G, C) between the rig and what is held, beside b the poses'
+    # step that belongs to one of the rig. Weights include the inverse variance; a share of the
+    # diagonal is added to the poses' part
     G, free = bundle.count, np.flatnonzero(bundle.pose_free)
     P = len(free) * len(bundle.frames)
     edges = G + np.cumsum([0] + [rows.by_held.shape[2] for rows, _ in weighted])
@@ -204,10 +202,8 @@ def solved(
 
 
 def _told(information: Floats, pulls: Floats) -> Floats:
-    """Information (g, g) that is left where held parameters are off.
-
-    A solution x = I⁻¹ b then has the covariance I⁻¹ (I + P Pᵀ) I⁻¹.
-    """
+    """Information (g, g) that is left where held parameters are off."""
+    # a solution x = I⁻¹ b then has the covariance I⁻¹ (I + P Pᵀ) I⁻¹
     if not pulls.any():
         return information
     return np.asarray(information @ np.linalg.pinv(information + pulls @ pulls.T) @ information)

@@ -73,11 +73,9 @@ def calibrate(
 def _from_cameras(
     task: Task, known: Known, rules: CalibrationRules, progress: Progress
 ) -> tuple[int, _Run] | None:
-    """The run from what cameras know alone, and again without those it misplaced.
-
-    What these know alone may have linked them wrongly; they are placed by the poses that the others
-    tell then.
-    """
+    """The run from what cameras know alone, and again without those it misplaced."""
+    # what these know alone may have linked them wrongly; they are placed by the poses that the
+    # others tell then
     best = _best(task, [start_from_cameras(task, known, rules)], rules, progress)
     if best is None or task.known is not None:
         return best

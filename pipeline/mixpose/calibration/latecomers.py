@@ -96,11 +96,9 @@ def _starts(
 def _motions(
     rig: Rig, sensor: int, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
 ) -> Floats:
-    """Small motions (H, 4, 4) of the world, each of which three detections of any frames tell.
-
-    Three features near them, about equally far off in the image, are brought onto their lines of
-    sight.  The first motion is none.
-    """
+    """Small motions (H, 4, 4) of the world, each of which three detections of any frames tell."""
+    # three features near them, about equally far off in the image, are brought onto their lines of
+    # sight. The first motion is none
     places, lines, off, number = _near(rig, sensor, seen, rules)
     none = np.eye(4)[None]
     if len(off) < 3:

@@ -197,10 +197,8 @@ def _poses(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
 
 
 def _consensus(before: Rig, after: Rig) -> Floats:
-    """The motion of the world (4, 4) after which most sensors stand where they stood.
-
-    That of the sensor from which the others differ least: the bumped ones are outvoted.
-    """
+    """The motion of the world (4, 4) after which most sensors stand where they stood."""
+    # that of the sensor from which the others differ least: the bumped ones are outvoted
     count = len(before.names)
     poses = [_poses(before, after, k) for k in range(count)]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
@@ -235,10 +233,8 @@ def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float
 
 
 def _deviations(found: Calibration) -> list[tuple[float, float]]:
-    """Standard deviations of turn in degrees and shift of each sensor; those held have the least.
-
-    A sensor that is held is as uncertain against the others as they are against it.
-    """
+    """Standard deviations of turn (degrees) and shift of each sensor; those held have the least."""
+    # a sensor that is held is as uncertain against the others as they are against it
     own: dict[int, tuple[float, float]] = {}
     for block in found.blocks:
         if block.kind in ("pose", "position") and block.sensor is not None:

@@ -109,11 +109,9 @@ def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> 
 def _likeliest_poses(
     rig: Rig, task: Task, seen: _Seen, linked: Sequence[int]
 ) -> tuple[Floats, Floats]:
-    """The pose of each frame (K, 4, 4) that most detections of all linked sensors agree with.
-
-    And the mean share (K,) of features in view that are met.  Where no sensor knew a pose these are
-    the identity and -1.
-    """
+    """The pose of each frame (K, 4, 4) that most detections of all linked sensors agree with."""
+    # and the mean share (K,) of features in view that are met. Where no sensor knew a pose these
+    # are the identity and -1
     frames = task.frames
     poses, worth = np.tile(np.eye(4), (len(frames), 1, 1)), np.full(len(frames), -1.0)
     for k, (frame, each) in enumerate(zip(frames, seen, strict=True)):
@@ -168,11 +166,9 @@ def _biased(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
 
 
 def _agreed_bias(shifts: Floats, farthest: float, sigma: float) -> float:
-    """The shift that most ranges agree on.
-
-    That is the objective over one number at a wide blur: Σ over all frames, features and ranges of
-    a kernel at range − distance − bias.
-    """
+    """The shift that most ranges agree on."""
+    # that is the objective over one number at a wide blur: Σ over all frames, features and ranges
+    # of a kernel at range − distance − bias
     step = sigma / _BIAS_STEPS
     places = np.arange(-farthest, farthest, step)
     counts, _ = np.histogram(shifts, bins=np.append(places, places[-1] + step) - step / 2)
@@ -257,11 +253,9 @@ def _pair_link(task: Task, seen: _Seen, a: int, b: int, rules: CalibrationRules)
 def _link_all(
     task: Task, seen: _Seen, placed: Collection[int], wanted: Sequence[int], rules: CalibrationRules
 ) -> tuple[dict[int, Floats], dict[int, tuple[int, int]]]:
-    """Place sensors one after the other, along the strongest links to those that stay.
-
-    Of all that are linked T_sensor_world (4, 4); and through which sensor each was linked, and in
-    how many frames the two agree.
-    """
+    """Place sensors one after the other, along the strongest links to those that stay."""
+    # of all that are linked T_sensor_world (4, 4); and through which sensor each was linked, and in
+    # how many frames the two agree
     T, through = {s: _pose_of(task, s) for s in placed}, {}
     left = [one for one in wanted if one not in T]
     links: dict[tuple[int, int], _Link | None] = {}

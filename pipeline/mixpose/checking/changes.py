@@ -84,13 +84,15 @@ def changes(session: Session) -> Iterator[Change]:
     sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
-            lenses = {a: sensors[b], b: sensors[a]}
+            lenses = {a: sensors[b], b: sensors[a]}  # each where it is, with that of the other
             yield _of_sensors(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
                 (a, b),
-                lambda view, lenses=lenses: with_sensor(  # type: ignore[misc]
-                    view, _with_lens(view.sensor, lenses[view.name])
+                lambda view, lenses=lenses: of_camera(  # type: ignore[misc]
+                    view,
+                    camera_matrix=lenses[view.name].camera_matrix,
+                    distortion=lenses[view.name].distortion,
                 ),
             )
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
@@ -127,6 +129,12 @@ def scaled(sensor: Any, factor: float) -> Any:
 def with_sensor(view: View, sensor: Any) -> View:
     """A view as if by another sensor."""
     return view if sensor is view.sensor else replace(view, sensor=sensor)
+
+
+def of_camera(view: View, **changed: Floats) -> View:
+    """A view as if by a camera that differs in what is changed."""
+    camera: Any = view.sensor
+    return replace(view, sensor=replace(camera, **changed))
 
 
 def _of_the_body(body: Body) -> Iterator[Change]:
@@ -207,18 +215,8 @@ def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
             "(it maps world to sensor coordinates)",
             "with the inverse",
             names,
-            _inverted,
+            lambda view: of_camera(view, T_sensor_world=inverse(view.sensor.T_sensor_world)),  # type: ignore[attr-defined]
         )
-
-
-def _with_lens(sensor: Any, other: Any) -> Any:
-    """A camera where it is, with the lens of another."""
-    return replace(sensor, camera_matrix=other.camera_matrix, distortion=other.distortion)
-
-
-def _inverted(view: View) -> View:
-    sensor: Any = view.sensor
-    return replace(view, sensor=replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world)))
 
 
 def _swapped(views: Views, a: str, b: str) -> Views:
@@ -258,17 +256,15 @@ def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
                 misplaced(setup),
                 moved_by(sensor.T_sensor_world, T, session.unit),
                 [name],
-                lambda view, T=T: with_sensor(view, replace(view.sensor, T_sensor_world=T)),  # type: ignore[misc]
+                lambda view, T=T: of_camera(view, T_sensor_world=T),  # type: ignore[misc]
             )
             yield replace(moved, cost=3 * math.log(2 * len(session.body) * len(found)), values=6)
 
 
 def _other_sizes(session: Session, found: Sequence[dict[str, Any]]) -> Iterator[Change]:
-    """A body of the size that cameras see.
-
-    Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
-    in two cameras that stand at (R, t) to each other.
-    """
+    """A body of the size that cameras see."""
+    # each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
+    # in two cameras that stand at (R, t) to each other
     middle, sizes = np.append(session.body.means.mean(axis=0), 1.0), list[float]()
     for each in found:
         for (a, T_a), (b, T_b) in combinations(each.values(), 2):

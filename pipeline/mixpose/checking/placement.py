@@ -130,9 +130,10 @@ def _no_common_view(session: Session) -> list[str]:
     blind = _blind(session, cameras)
     if len(cameras) < 2 or not blind:
         return []
-    text = f"{_names(blind)} would not see the body where the other sensors look"
+    names = ", ".join(repr(setup.name) for setup in blind)
+    text = f"{names} would not see the body where the other sensors look"
     if len(blind) == len(cameras):
-        text = f"no place was found that is in view of {_names(cameras)}"
+        text = f"no place was found that is in view of {names}"
     flipped = replace(
         session, sensors=tuple(replace(s, sensor=_with_inverse(s.sensor)) for s in cameras)
     )
@@ -267,10 +268,6 @@ def _numbers(values: Floats, digits: int = 4) -> str:
     # what is a rounding error beside the largest is zero
     shown = (0.0 if abs(v) <= 1e-9 * largest else float(f"{v:.{digits}g}") for v in values)
     return f"({', '.join(f'{value:g}' for value in shown)})"
-
-
-def _names(setups: list[SensorSetup]) -> str:
-    return ", ".join(repr(setup.name) for setup in setups)
 
 
 def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | None]) -> Session:

@@ -180,10 +180,8 @@ def _without_values(
 def _less_simple(
     session: Session, frames: Frames, runners: Sequence[_Runner], before: Explained
 ) -> Iterator[_Runner]:
-    """Where the best of those so far do not explain the first frame: as cameras alone see it.
-
-    And, where that does not either, those that explain most with every other change.
-    """
+    """Where the best of those so far do not explain the first frame: as cameras alone see it."""
+    # and, where that does not either, those that explain most with every other change
     rules = DiagnosisRules()
 
     def best() -> list[_Runner]:

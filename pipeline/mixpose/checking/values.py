@@ -108,13 +108,10 @@ def promise(unknown: Unknown, given: Adjustment) -> float:
         own = _own(given, f, k)
         r, J = _linearised(unknown, given, f, T, begun[own], scales[own])
         # what is far off may be of clutter, and gains no more than what is outlying
-        without, by_values = (_loss(r + J @ step[own]).sum() for step in steps)
+        left = [np.minimum(np.abs(r + J @ step[own]), _OUTLYING) for step in steps]
+        without, by_values = ((0.5 * each**2).sum() for each in left)
         gain += float(without - by_values)
     return gain
-
-
-def _loss(residuals: Floats) -> Floats:
-    return np.asarray(0.5 * np.minimum(np.abs(residuals), _OUTLYING) ** 2)
 
 
 def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:
@@ -142,10 +139,8 @@ def _own(given: Adjustment, f: int, k: int) -> list[int]:
 
 
 def _scales(unknown: Unknown, given: Adjustment) -> Floats:
-    """Units in which poses, velocities and values are fitted: the body's size, radians, deviations.
-
-    Of velocities they are deviations, too.
-    """
+    """Units in which poses (the body's size, radians), velocities and values are fitted."""
+    # of velocities and values they are deviations
     size = float(np.linalg.norm(given.points - given.points.mean(axis=0), axis=1).max())
     pose = np.array([size] * 3 + [1.0] * 3 + [_SHIFTING * size] * 3 + [_TURNING] * 3)
     return np.concatenate([np.tile(pose[: given.motion], len(given.frames)), unknown.deviations])
@@ -154,10 +149,8 @@ def _scales(unknown: Unknown, given: Adjustment) -> Floats:
 def _normal(
     unknown: Unknown, given: Adjustment, poses: Sequence[Floats], state: Floats
 ) -> tuple[Floats, Floats]:
-    """Normal equations of a step of poses, velocities and values, in their scales.
-
-    Of the state only velocities and values count; poses are what they are.
-    """
+    """Normal equations of a step of poses, velocities and values, in their scales."""
+    # of the state only velocities and values count; poses are what they are
     k, scales = len(unknown.deviations), _scales(unknown, given)
     A, b = 1e-9 * np.eye(len(state)), np.zeros(len(state))
     frames = np.arange(len(state) - k) % given.motion
@@ -176,10 +169,8 @@ def _normal(
 def _linearised(
     unknown: Unknown, given: Adjustment, f: int, T: Floats, state: Floats, scales: Floats
 ) -> tuple[Floats, Floats]:
-    """Residuals (R,) of a frame in the noise, and their derivatives (R, p + k), in scales.
-
-    Of the state (p + k,) of the frame, the velocity and the values.
-    """
+    """Residuals (R,) of a frame in the noise, and their derivatives (R, p + k), in scales."""
+    # of the state (p + k,) of the frame, the velocity and the values
     p, values = given.motion, state[given.motion :]
     points, steps = unknown.points(given.points, values), _STEP * np.diag(unknown.deviations)
     lever = points @ T[:3, :3].T
@@ -246,10 +237,6 @@ def unknowns(session: Session) -> Iterator[Unknown]:
         )
 
 
-def _length(vector: Floats) -> float:
-    return float(np.linalg.norm(vector))
-
-
 def _markers(session: Session) -> Iterator[Unknown]:
     body = session.body
     for i, label in enumerate(body.labels):
@@ -257,7 +244,7 @@ def _markers(session: Session) -> Iterator[Unknown]:
         yield Unknown(
             f"marker {label} of [object] {{is}} measured wrong",
             lambda v, i=i: (
-                f"with it {_length(v):.2g} {session.unit} away at "  # type: ignore[misc]
+                f"with it {np.linalg.norm(v):.2g} {session.unit} away at "  # type: ignore[misc]
                 f"{np.round(body.means[i] + v, 2).tolist()}"
             ),
             np.full(3, _MARKER * body.radius),

@@ -39,10 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Put something in the place of streams that whoever started this has closed.
-
-    Messages then go nowhere, rather than to standard output; poses cannot be written.
-    """
+    """Put something in the place of streams that whoever started this has closed."""
+    # messages then go nowhere, rather than to standard output; poses cannot be written
     if sys.stderr is None:
         sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     if sys.stdout is None:

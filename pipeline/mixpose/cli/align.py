@@ -62,11 +62,7 @@ def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate
     """Poses that are ok, of a file or of a body in a frame of the recording."""
     if Path(words).is_file():
         poses = read_poses(words)
-        if poses.unit not in (None, session.unit):
-            raise RecordingError(
-                f"--floor {words}: lengths in {poses.unit}; allowed: those of the session, "
-                f"{session.unit}"
-            )
+        poses.require_unit(session.unit, RecordingError, "--floor")
         lines = [line for line in poses.poses if line.status == "ok"]
         if not lines:
             raise RecordingError(f"--floor {words}: found no pose that is ok")

@@ -170,7 +170,8 @@ def _say_sensor(
     surveys: Mapping[str, Survey],
 ) -> None:
     found = surveys[setup.name]
-    report.say("sensor", f"{setup.name}: {_geometry(setup)}, {_extraction(setup, session.unit)}")
+    size = "" if setup.resolution is None else f" {setup.resolution[0]}x{setup.resolution[1]}"
+    report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, session.unit)}")
     for line in placement_lines(setup, session.unit):
         report.say("", line)
     total = len(found.numbers) + len(found.damage)
@@ -255,12 +256,6 @@ def _say_features(
 def _numbers(numbers: list[int]) -> str:
     text = ", ".join(map(str, numbers[:_LISTED]))
     return text if len(numbers) <= _LISTED else f"{text}, ... ({len(numbers)} frames)"
-
-
-def _geometry(setup: SensorSetup) -> str:
-    if setup.resolution is None:
-        return setup.model
-    return f"{setup.model} {setup.resolution[0]}x{setup.resolution[1]}"
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:

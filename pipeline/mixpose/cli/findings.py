@@ -43,30 +43,25 @@ class Stretches:
     count: int = 0
     found: list[list[int]] = field(default_factory=list)
     left_out: int = 0  # stretches
-    _last: int = -2
+    last_place: int = -2  # in the run, of the last frame
 
     def add(self, frame: int, place: int) -> None:
         """Add a frame, which is the `place`-th of the run."""
-        if place == self._last:
+        if place == self.last_place:
             return
-        if place == self._last + 1:
+        if place == self.last_place + 1:
             self.found[-1][1:] = [frame, self.found[-1][2] + 1]
         else:
             if len(self.found) > _SHOWN:  # the shortest can be named no more
                 self.found.remove(min(reversed(self.found), key=lambda each: each[2]))
                 self.left_out += 1
             self.found.append([frame, frame, 1])
-        self.count, self._last = self.count + 1, place
+        self.count, self.last_place = self.count + 1, place
 
     @property
     def longest(self) -> int:
         """Frames of the longest stretch."""
         return max((each[2] for each in self.found), default=0)
-
-    @property
-    def last_place(self) -> int:
-        """Place in the run of the last frame."""
-        return self._last
 
     def text(self) -> str:
         """The frames for people, the longest stretches if there are many."""
@@ -105,13 +100,10 @@ class Findings:
         self._places = -1
         self._ok = self._lost = 0
         names = [setup.name for setup in session.sensors]
-        self._no_frame = {name: Stretches() for name in names}
-        self._no_feature = {name: Stretches() for name in names}
-        self._flooded = {name: Stretches() for name in names}
+        kinds = [{name: Stretches() for name in names} for _ in range(5)]
+        self._no_frame, self._no_feature, self._flooded, self._same, self._far = kinds
         self._most = dict.fromkeys(names, 0)  # features of one frame
         self._expected = sum(len(one.body) * len(one.labels) for one in session.objects)
-        self._same = {name: Stretches() for name in names}
-        self._far = {name: Stretches() for name in names}
         self._usual = {name: deque[float](maxlen=_USUAL) for name in names}
         self._sigmas = {setup.name: setup.extract.sigma for setup in session.sensors}
         self._units = {

@@ -41,12 +41,12 @@ def inspect_frame(request: InspectRequest) -> None:
     session = load_session(request.session, allow_code=request.allow_code)
     require_matplotlib()
     _check_folder(folder, session)
-    file = None if poses is None else _of_session(read_poses(poses), session)
-    opened = (
-        open_sources(session, named_sources(request.source or ()))
-        if file is None
-        else recording_of(file, session, request.source or ())
-    )
+    file, named = None if poses is None else read_poses(poses), request.source or ()
+    if file is None:
+        opened = open_sources(session, named_sources(named))
+    else:
+        file.require_unit(session.unit, SessionError)
+        opened = recording_of(file, session, named)
     frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
@@ -98,15 +98,6 @@ def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
     if number is None:
         raise RecordingError(f"the recording has no frame; it has {recordings}")
     raise SessionError(f"--frame {number}: the recording has no such frame; it has {recordings}")
-
-
-def _of_session(file: PoseFile, session: Session) -> PoseFile:
-    if file.unit is not None and file.unit != session.unit:
-        raise SessionError(
-            f"--poses {file.path}: lengths are in {file.unit}, those of the session in "
-            f"{session.unit}; give poses of this session"
-        )
-    return file
 
 
 def _from_file(file: PoseFile, session: Session, number: int) -> list[Estimate]:

@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from statistics import median
@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.calibration.task import Progress
     from mixpose.frames import Source
-    from mixpose.objective import View
-    from mixpose.records import DelaySeen, Estimate, FrameSet
+    from mixpose.records import DelaySeen, Estimate
     from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
@@ -156,14 +155,6 @@ class Summary:
                 if rms is not None:
                     residuals.append(rms)
 
-    def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Look at what a frame was made from."""
-        self.findings.watch(frame_set, views, estimate)
-
-    def text(self) -> str:
-        """One line: how many frames came to which status."""
-        return frames_text(self.statuses, self.bodies)
-
     def say(self, where: str) -> None:
         """Print the line, and warn of sensors that took no part or fit badly."""
         if not sum(self.statuses.values()):
@@ -175,7 +166,7 @@ class Summary:
             say(remark)
         if self.statuses["lost"] == sum(self.statuses.values()) and not self.findings.change:
             warn(f"every frame is lost: run mixpose check {self.path}, which says what is odd")
-        say(f"{self.text()}{where}")
+        say(f"{frames_text(self.statuses, self.bodies)}{where}")
 
     def warnings(self) -> list[str]:
         """What is most likely wrong with the geometry, once for each sensor at most."""

@@ -67,7 +67,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
         watch = _each(
             is_new,
             _publishing(stack, session, request, header),
-            summary.watch,
+            summary.findings.watch,
             _overlay(stack, session, request),
             view,
         )

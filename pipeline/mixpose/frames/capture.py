@@ -102,10 +102,8 @@ def _backend_for(address: str) -> int:
 
 
 def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
-    """Descriptor of a pipe that somebody writes to; closed with the stack.
-
-    It does not block, so that FFmpeg's limits of time hold for a writer that falls silent.
-    """
+    """Descriptor of a pipe that somebody writes to; closed with the stack."""
+    # it does not block, so that FFmpeg's limits of time hold for a writer that falls silent
     end = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     stack.callback(os.close, end)
     with contextlib.suppress(ImportError, AttributeError, OSError):  # where pipes can be widened

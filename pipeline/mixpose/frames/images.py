@@ -240,10 +240,8 @@ def _png_fault(data: bytes) -> str | None:
 
 
 def _checksum(content: memoryview) -> int:
-    """CRC-32 in pieces for which zlib keeps the interpreter lock.
-
-    Chunks are many and small, and to get the lock back from a busy thread takes far longer.
-    """
+    """CRC-32 in pieces for which zlib keeps the interpreter lock."""
+    # chunks are many and small, and to get the lock back from a busy thread takes far longer
     value = 0
     for at in range(0, len(content), _PIECE):
         value = zlib.crc32(content[at : at + _PIECE], value)
@@ -251,11 +249,9 @@ def _checksum(content: memoryview) -> int:
 
 
 def _jpeg_is_whole(data: bytes) -> bool:
-    """Tell whether the end marker follows the first scan.
-
-    The segments before it are stepped over (ITU T.81, annex B), as a preview image inside them
-    has an end marker of its own.
-    """
+    """Tell whether the end marker follows the first scan."""
+    # the segments before it are stepped over (ITU T.81, annex B), as a preview image inside them
+    # has an end marker of its own
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

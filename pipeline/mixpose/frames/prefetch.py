@@ -63,10 +63,8 @@ def _fetch(
     stop: threading.Event,
     more: Callable[[T], int] | None,
 ) -> None:
-    """Move items to the queue, one for each piece of room, until they end, fail or `stop` is set.
-
-    Two plain queues cost less than one that is bounded: their locks are not Python's.
-    """
+    """Move items to the queue, one for each piece of room, until they end, fail or are stopped."""
+    # two plain queues cost less than one that is bounded: their locks are not Python's
     error: BaseException | None = None
     try:
         with contextlib.ExitStack() as closing:

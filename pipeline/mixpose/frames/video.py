@@ -143,12 +143,10 @@ class Video(Source):
         return f"{which}{promised} could be read"
 
     def _ends_early(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> bool:
-        """Tell a lost end from a promise that was only an estimate.
-
-        Whole MP4 and Matroska files may hold fewer frames than FFmpeg counts (edit lists, varying
-        rates).  In other containers the *time* of the last frame tells: it is kept by a varying
-        rate, but not where frames are lost.
-        """
+        """Tell a lost end from a promise that was only an estimate."""
+        # whole MP4 and Matroska files may hold fewer frames than FFmpeg counts (edit lists, varying
+        # rates). In other containers the *time* of the last frame tells: it is kept by a varying
+        # rate, but not where frames are lost
         fps = capture.get(cv2.CAP_PROP_FPS)
         promised = self.promised or 0
         if count >= promised or last_time_s is None or not _positive(fps):

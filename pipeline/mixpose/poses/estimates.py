@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.records import Estimate, Floats
 from mixpose.units import length_ratio
+
+_Posed = TypeVar("_Posed", bound=Estimate)
 
 
 def header_of(poses: PoseFile, unit: str, version: str) -> Header:
@@ -43,18 +46,19 @@ def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
 
 def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
     """An estimate in the axes of a sensor, (4, 4): its pose is then T_sensor_object."""
-    if estimate.T_world_object is None:
-        return estimate
-    covariance = estimate.covariance
-    if covariance is not None:
-        turn = np.kron(np.eye(2), T_sensor_world[:3, :3])  # lengths and turns alike
-        covariance = turn @ covariance @ turn.T
+    turn = np.asarray(np.kron(np.eye(2), T_sensor_world[:3, :3]), dtype=np.float64)
+    return _changed(estimate, lambda T: T_sensor_world @ T, turn)
+
+
+def _changed(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:
+    """An estimate of other motions, which change a twist of its pose by a matrix (6, 6)."""
+    T, covariance = estimate.T_world_object, estimate.covariance
     return replace(
         estimate,
-        T_world_object=T_sensor_world @ estimate.T_world_object,
-        covariance=covariance,
+        T_world_object=None if T is None else motion_of(T),
+        covariance=None if covariance is None else by_twist @ covariance @ by_twist.T,
         hypotheses=tuple(
-            replace(rival, T_world_object=T_sensor_world @ rival.T_world_object)
+            replace(rival, T_world_object=motion_of(rival.T_world_object))
             for rival in estimate.hypotheses
         ),
     )
@@ -77,21 +81,7 @@ def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
     def scaled(T: Floats) -> Floats:
         return rigid.from_parts(T[..., :3, :3], T[..., :3, 3] * ratio)
 
-    twist_scale = np.array([ratio] * 3 + [1.0] * 3)
-    lines = tuple(
-        replace(
-            line,
-            T_world_object=None if line.T_world_object is None else scaled(line.T_world_object),
-            covariance=(
-                None
-                if line.covariance is None
-                else line.covariance * twist_scale[:, None] * twist_scale
-            ),
-            hypotheses=tuple(
-                Hypothesis(scaled(rival.T_world_object), rival.weight) for rival in line.hypotheses
-            ),
-        )
-        for line in file.poses
-    )
+    by_twist: Floats = np.diag([ratio] * 3 + [1.0] * 3)
+    lines = tuple(_changed(line, scaled, by_twist) for line in file.poses)
     symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}
     return replace(file, poses=lines, unit=unit, symmetries=symmetries)

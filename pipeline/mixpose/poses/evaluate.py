@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -157,9 +157,6 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
     sure = [(error.frame, error.twist) for error in trusted if error.twist is not None]
     best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
     counts = Counter(error.status for error in errors)
-    rotation_deg, translation = _spreads(twists)
-    ok_rotation_deg, ok_translation = _spreads(sure)
-    best_rotation_deg, best_translation = _spreads(best)
     return Evaluation(
         unit=poses.unit or truth.unit,
         frames=len(errors),
@@ -168,13 +165,10 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         lost=counts["lost"],
         missing=counts["missing"],
         without_truth=sum((line.frame, line.label) not in compared for line in poses.poses),
-        rotation_deg=rotation_deg,
-        translation=translation,
+        **_spreads(twists),
         per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
-        ok_rotation_deg=ok_rotation_deg,
-        ok_translation=ok_translation,
-        best_rotation_deg=best_rotation_deg,
-        best_translation=best_translation,
+        **_spreads(sure, "ok_"),
+        **_spreads(best, "best_"),
         nees=consistency([(e.nees, e.dimensions) for e in trusted if e.nees is not None]),
         offset=constant_offset([error.pair for error in trusted if error.pair is not None]),
         exchanged=any(line.covariance is not None for line in truth.poses)
@@ -269,17 +263,18 @@ def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
     return twists[nearest], answers[nearest // len(poses)]
 
 
-def _spreads(twists: Sequence[tuple[int, Floats]]) -> tuple[Spread | None, Spread | None]:
-    """Spread of the angles in degrees and of the distances of errors, by frame number."""
-    if not twists:
-        return None, None
+def _spreads(twists: Sequence[tuple[int, Floats]], of: str = "") -> dict[str, Any]:
+    """Spread of the angles in degrees and of the distances of errors, by their field."""
+    errors = np.array([twist for _, twist in twists]).reshape(-1, 2, 3)
+    distance, angle = np.linalg.norm(errors, axis=2).T
+    found = {f"{of}rotation_deg": np.degrees(angle), f"{of}translation": distance}
     frames = [frame for frame, _ in twists]
-    values = np.stack([twist for _, twist in twists])
-    angle_deg = np.degrees(np.linalg.norm(values[:, 3:], axis=1))
-    return _spread(frames, angle_deg), _spread(frames, np.linalg.norm(values[:, :3], axis=1))
+    return {name: _spread(frames, values) for name, values in found.items()}
 
 
-def _spread(frames: Sequence[int], values: Floats) -> Spread:
+def _spread(frames: Sequence[int], values: Floats) -> Spread | None:
+    if not frames:
+        return None
     return Spread(
         rms=float(np.sqrt(np.mean(values**2))),
         median=float(np.median(values)),

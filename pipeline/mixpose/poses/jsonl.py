@@ -152,11 +152,11 @@ class PoseFile:
         found: Mapping[str, str] = self.header.get("sources", {})
         return found
 
-    def require_unit(self, unit: str, error: type[MixposeError]) -> None:
-        """Refuse poses that `--poses` gives, by an error, where they are in another unit."""
+    def require_unit(self, unit: str, error: type[MixposeError], option: str = "--poses") -> None:
+        """Refuse poses that an option gives, by an error, where they are in another unit."""
         if self.unit not in (None, unit):
             raise error(
-                f"--poses {self.path}: found the unit {self.unit}; allowed: that of the session, "
+                f"{option} {self.path}: found the unit {self.unit}; allowed: that of the session, "
                 f"{unit}"
             )
 

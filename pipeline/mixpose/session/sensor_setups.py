@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -79,7 +78,8 @@ def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOp
 
     Raises BadKeyError if the largest area is not above the smallest.
     """
-    given = _keys_given(defaults) | ({} if own is None else _keys_given(own))
+    tables = [defaults] if own is None else [defaults, own]
+    given = {k: v for each in tables for k, v in each.model_dump(exclude_unset=True).items()}
     options = ExtractOptions(**given)
     if options.max_area is not None and options.max_area <= options.min_area:
         raise BadKeyError(
@@ -97,10 +97,6 @@ def _check_extraction(options: ExtractOptions) -> None:
     except SessionError as error:
         key, _, text = str(error).partition(": ")
         raise BadKeyError(text, key.removeprefix("extract.")) from error
-
-
-def _keys_given(table: ExtractTable) -> dict[str, Any]:
-    return {key: getattr(table, key) for key in table.model_fields_set}
 
 
 def _build_sensor(
