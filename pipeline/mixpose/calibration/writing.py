@@ -11,17 +11,7 @@ from mixpose.body import Body
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block
 from mixpose.records import Floats
-from mixpose.session import Session
-from mixpose.session.rewriting import (
-    document_of,
-    objects_of,
-    plain,
-    put,
-    put_gravity,
-    put_motion,
-    put_starts,
-    text_of,
-)
+from mixpose.session import Session, rewriting
 
 MARK = "# Calibrated by mixpose"
 _LENS = {"focal", "principal_point", "distortion"}
@@ -32,11 +22,11 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
 
     Comments and keys that were not calibrated stay; paths lead to the same files as before.
     """
-    document = document_of(session, target)
+    document = rewriting.document_of(session, target)
     for index, table in enumerate(document["sensor"]):
         _put_sensor(table, found, session, index)
     scale = found.after.scale
-    first, *others = zip(objects_of(document), session.objects, strict=True)
+    first, *others = zip(rewriting.objects_of(document), session.objects, strict=True)
     if scale != 1 or any(block.kind == "body" for block in found.blocks):
         _put_body(first[0], first[1].body, found.after.points, scale)
     if scale != 1:
@@ -44,11 +34,13 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
             _put_body(table, one.body, scale * one.body.means, scale)
     T_new_old = found.T_new_old
     if scale != 1 or T_new_old is not None:
-        put_starts(document, session, np.eye(4) if T_new_old is None else T_new_old, scale)
+        rewriting.put_starts(
+            document, session, np.eye(4) if T_new_old is None else T_new_old, scale
+        )
     if T_new_old is not None:
-        put_gravity(document, session, T_new_old)
+        rewriting.put_gravity(document, session, T_new_old)
     origin = f"{session.path.name}, {len(found.used)} frames"
-    return text_of(document, session, f"{MARK} {version} from {origin}.\n")
+    return rewriting.text_of(document, session, f"{MARK} {version} from {origin}.\n")
 
 
 def _put_sensor(table: Any, found: Calibration, session: Session, index: int) -> None:
@@ -64,7 +56,9 @@ def _put_sensor(table: Any, found: Calibration, session: Session, index: int) ->
     # a file of a calibration also says where its camera stands
     was_filed = is_lens and table.pop("calibration", None) is not None
     if was_filed or has_moved("T_sensor_world"):
-        put_motion(table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose")))
+        rewriting.put_motion(
+            table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose"))
+        )
     if is_lens:
         if was_filed and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
@@ -83,7 +77,7 @@ def _put_sensor(table: Any, found: Calibration, session: Session, index: int) ->
 
 
 def _put(table: Any, key: str, value: Floats | float, said: str | None) -> None:
-    put(table, key, plain(value), _deviation(said))
+    rewriting.put(table, key, rewriting.plain(value), _deviation(said))
 
 
 def _deviation(said: str | None) -> str | None:
@@ -104,18 +98,18 @@ def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
     """Features as points, which replace a file of them; other lengths of the body are scaled."""
     had_file = table.pop("file", None) is not None
     if had_file and body.normals is not None:
-        table["normals"] = plain(body.normals)
+        table["normals"] = rewriting.plain(body.normals)
     if (had_file or scale != 1) and body.covariances.any():
-        table["sigma"] = [plain(scale**2 * covariance) for covariance in body.covariances]
+        table["sigma"] = [rewriting.plain(scale**2 * covariance) for covariance in body.covariances]
     count = len(body) - len(table.get("segments", ()))
     if count:  # segments come after the points
-        table["points"] = plain(points[:count])
+        table["points"] = rewriting.plain(points[:count])
     if had_file and body.names:
         table["names"] = list(body.names)
     if scale == 1:
         return
     for key in ("segments", "radius", "tip"):
         if key in table:
-            put(table, key, plain(scale * np.array(table[key], float)))
+            rewriting.put(table, key, rewriting.plain(scale * np.array(table[key], float)))
     if body.gravity is not None:
-        put(table["gravity"], "sigma", plain(scale * body.gravity.sigma))
+        rewriting.put(table["gravity"], "sigma", rewriting.plain(scale * body.gravity.sigma))

@@ -20,19 +20,7 @@ from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
 from mixpose.runner import run
 from mixpose.selection import Selection
-from mixpose.session import Session, load_session
-from mixpose.session.rewriting import (
-    ALL_DIGITS,
-    document_of,
-    plain,
-    put,
-    put_gravity,
-    put_motion,
-    put_starts,
-    refuse_held,
-    refuse_lost_code,
-    text_of,
-)
+from mixpose.session import Session, load_session, rewriting
 from mixpose.trajectories.floor import Axis, Floor, floor_of
 
 MARK = "# Aligned by mixpose"
@@ -46,8 +34,8 @@ def align_session(request: AlignRequest) -> None:
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
-    refuse_held(session)
-    refuse_lost_code(session, request.output)
+    rewriting.refuse_held(session)
+    rewriting.refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
     sources = request.source or ()
@@ -88,21 +76,24 @@ def _places(session: Session) -> Floats:
 
 
 def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
-    document = document_of(session, target)
+    document = rewriting.document_of(session, target)
     T_old_new, T_new_old = floor.T_old_new, rigid.inverse(floor.T_old_new)
     for table, setup in zip(document["sensor"], session.sensors, strict=True):
         sensor: Any = setup.sensor
         if hasattr(sensor, "position"):
             place = rigid.transform(T_new_old, sensor.position[None])[0]
-            put(table, "position", plain(place, ALL_DIGITS))
+            rewriting.put(table, "position", rewriting.plain(place, rewriting.ALL_DIGITS))
         else:
-            put_motion(
-                table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=ALL_DIGITS
+            rewriting.put_motion(
+                table,
+                "T_sensor_world",
+                sensor.T_sensor_world @ T_old_new,
+                digits=rewriting.ALL_DIGITS,
             )
-    put_starts(document, session, T_new_old)
-    put_gravity(document, session, T_new_old)
+    rewriting.put_starts(document, session, T_new_old)
+    rewriting.put_gravity(document, session, T_new_old)
     head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"
-    return text_of(document, session, head)
+    return rewriting.text_of(document, session, head)
 
 
 def _tell(session: Session, floor: Floor, up: Axis) -> None:

@@ -11,30 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.checking import (
-    LookAlike,
-    Survey,
-    advice,
-    depends_on_distance,
-    expected_count,
-    fewest_count,
-    geometry_doubts,
-    image_of,
-    judge,
-    key_warnings,
-    look_alikes,
-    noise_of,
-    numbers_of,
-    placement_lines,
-    placement_warnings,
-    shared_part_warnings,
-    shared_source_warnings,
-    some_of,
-    survey,
-    told_apart,
-    typical_poses,
-    with_image_sizes,
-)
+from mixpose import checking
 from mixpose.cli.notices import bar
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
@@ -95,33 +72,37 @@ def check_session(
     report.say("session", f"{session.path}, lengths in {session.unit}")
     for one in session.objects:
         _say_object(report, session, one)
-    surveys: dict[str, Survey] = {}
-    some = None if quick else some_of(opened)
+    surveys: dict[str, checking.Survey] = {}
+    some = None if quick else checking.some_of(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as moved:
         for setup in session.sensors:
             source = opened[setup.name]
-            surveys[setup.name] = survey(
+            surveys[setup.name] = checking.survey(
                 session, setup, source, quick=quick, looked_at=some, done=partial(moved, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
-    report.warnings += shared_source_warnings(session, replaced) + _pairing_warnings(opened)
+    report.warnings += checking.shared_source_warnings(session, replaced) + _pairing_warnings(
+        opened
+    )
     sizes = {name: each.size for name, each in surveys.items()}
-    given = _of_geometry(with_image_sizes(session, sizes))
-    doubts = geometry_doubts(session, opened, surveys)
+    given = _of_geometry(checking.with_image_sizes(session, sizes))
+    doubts = checking.geometry_doubts(session, opened, surveys)
     if doubts.mended is None:
         report.lines += given.lines
         report.warnings = (
-            told_apart(report.of_counts, len(session.sensors)) + report.warnings + given.warnings
+            checking.told_apart(report.of_counts, len(session.sensors))
+            + report.warnings
+            + given.warnings
         )
         report.warnings += doubts.warnings
         if doubts.unexplained and not (report.of_counts or doubts.warnings):
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings]
-        mended = _of_geometry(with_image_sizes(doubts.mended, sizes))
+        mended = _of_geometry(checking.with_image_sizes(doubts.mended, sizes))
         report.lines += mended.lines
         report.warnings += mended.warnings
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
@@ -136,12 +117,12 @@ def check_session(
 def _of_geometry(session: Session) -> _Report:
     """What is said of where sensors stand and what they see of the bodies there."""
     report = _Report()
-    report.warnings += key_warnings(session) + placement_warnings(session)
+    report.warnings += checking.key_warnings(session) + checking.placement_warnings(session)
     for one in session.objects:
         report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
         _say_accuracy(report, session.alone(one.body.name))
     report.of = ""
-    report.warnings += shared_part_warnings(session)
+    report.warnings += checking.shared_part_warnings(session)
     return report
 
 
@@ -167,12 +148,12 @@ def _say_sensor(
     session: Session,
     setup: SensorSetup,
     source: Source,
-    surveys: Mapping[str, Survey],
+    surveys: Mapping[str, checking.Survey],
 ) -> None:
     found = surveys[setup.name]
     size = "" if setup.resolution is None else f" {setup.resolution[0]}x{setup.resolution[1]}"
     report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, session.unit)}")
-    for line in placement_lines(setup, session.unit):
+    for line in checking.placement_lines(setup, session.unit):
         report.say("", line)
     total = len(found.numbers) + len(found.damage)
     read = "all read" if found.is_whole else f"looked at {total}"
@@ -190,7 +171,7 @@ def _say_sensor(
     _say_features(report, session, setup, source, found)
 
 
-def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> None:
+def _say_missing(report: _Report, name: str, surveys: Mapping[str, checking.Survey]) -> None:
     """Frames that other sensors have."""
     own = {*surveys[name].numbers, *surveys[name].damaged}
     others = [each for other, each in surveys.items() if other != name]
@@ -203,7 +184,9 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> N
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
     """Sensors whose frames hardly pair with those of others, told by numbers alone."""
-    numbers = {name: found for name, each in sources.items() if (found := numbers_of(each))}
+    numbers = {
+        name: found for name, each in sources.items() if (found := checking.numbers_of(each))
+    }
     warnings = []
     for name, own in numbers.items():
         known = set().union(*(each for other, each in numbers.items() if other != name))
@@ -217,10 +200,13 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
 
 
 def _say_features(
-    report: _Report, session: Session, setup: SensorSetup, source: Source, found: Survey
+    report: _Report, session: Session, setup: SensorSetup, source: Source, found: checking.Survey
 ) -> None:
     where = f"sensor {setup.name!r}"
-    each = [(expected_count(setup, session.alone(o.body.name)), o.count) for o in session.objects]
+    each = [
+        (checking.expected_count(setup, session.alone(o.body.name)), o.count)
+        for o in session.objects
+    ]
     expected = sum(seen * count for seen, count in each)
     if not (found.numbers or found.damage):
         report.warnings.append(f"{where}: its recording has no frame")
@@ -238,16 +224,16 @@ def _say_features(
         f"features per frame: {low} / {middle:g} / {high} (least / median / most{of}), expected: "
         f"{expected}",
     )
-    fewest = min(fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
-    judgement = judge(middle, expected, fewest if len(session.labels) == 1 else None)
+    fewest = min(checking.fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
+    judgement = checking.judge(middle, expected, fewest if len(session.labels) == 1 else None)
     if judgement is not None:
         number = found.typical_frame
         assert number is not None, "there are counts"
-        image = image_of(source, number)
+        image = checking.image_of(source, number)
         count = found.counts[found.counted.index(number)]
         report.of_counts.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
-            f"{expected} are expected: {advice(session, setup, number, image, expected)}"
+            f"{expected} are expected: {checking.advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
         report.warnings.append(f"{where}: no feature in frame {_numbers(list(found.empty))}")
@@ -272,9 +258,9 @@ def _say_accuracy(report: _Report, session: Session) -> None:
     if session.start is not None:
         _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
         return
-    several = depends_on_distance(session)
+    several = checking.depends_on_distance(session)
     for away in _AWAY if several else _AWAY[:1]:
-        poses = typical_poses(session, _TYPICAL_POSES, away=away)
+        poses = checking.typical_poses(session, _TYPICAL_POSES, away=away)
         if not poses:
             report.say("start", "none, and no place is in view of the sensors: add [start]")
             return
@@ -324,7 +310,7 @@ def _say_accuracy_at(
                 "at the pose of [start] with free in [estimator], or add a sensor"
             )
     others = [
-        look_alikes(session.sensors, session.body, T, free)
+        checking.look_alikes(session.sensors, session.body, T, free)
         for T, (covariance, _) in zip(poses, expected, strict=True)
         if np.isfinite(np.diag(covariance)).all()
     ]
@@ -334,16 +320,18 @@ def _say_accuracy_at(
     return bool(found)
 
 
-def _look_alike_text(session: Session, found: list[list[LookAlike]], tried: int, where: str) -> str:
+def _look_alike_text(
+    session: Session, found: list[list[checking.LookAlike]], tried: int, where: str
+) -> str:
     best = min((alike[0] for alike in found), key=lambda other: other.difference)
     orientations = f" in {len(found)} of {tried} orientations" if tried > 1 else ""
     count = max(map(len, found))
     poses = "another pose looks" if count == 1 else f"{count} other poses look"
-    largest = max(session.sensors, key=noise_of)
+    largest = max(session.sensors, key=checking.noise_of)
     unit = "px" if largest.sensor.unit == "px" else session.unit
     return (
         f"{where}{orientations}, {poses} the same where features err by "
-        f"{noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
+        f"{checking.noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
         f"{best.difference:.1f} standard deviations apart): expect ambiguous frames, or move a "
         "marker out of line and plane, come closer, or add a sensor"
     )

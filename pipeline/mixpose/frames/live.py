@@ -128,7 +128,8 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
                 waits = sensor not in stalled or len(stalled) == len(readers)
                 patience = None if given[sensor] < 0 else STALLED_S if waits else 0.0
                 reader.wait(given[sensor], patience)
-            going = [each for each in readers if readers[each].is_newer_than(given[each])]
+            newer = {each: readers[each].newer_than(given[each]) for each in readers}
+            going = {each: frames for each, frames in newer.items() if frames}
             left = [each for each in readers if each in going or not readers[each].has_ended]
             if not left:
                 return
@@ -136,7 +137,7 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             stalled = set(left) - set(going)
             if not going:
                 continue
-            frames = _together({each: readers[each].newer_than(given[each]) for each in going})
+            frames = _together(going)
             given.update((sensor, frame.number) for sensor, frame in frames.items())
             number = max(number + 1, *given.values())
             if number >= wanted.stop:
@@ -169,7 +170,7 @@ class _Reader:
         self._frames = deque[RawFrame](maxlen=kept)
         self._count = 0
         self._error: BaseException | None = None
-        self._ended = False
+        self.has_ended = False  # no further frame will come
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name="mixpose-live", daemon=True)
 
@@ -185,24 +186,14 @@ class _Reader:
     def wait(self, after: int, patience_s: float | None) -> None:
         """Wait for a frame with a number above `after`, until none will come, or so long."""
         with self._changed:
-            self._changed.wait_for(lambda: self.is_newer_than(after) or self._ended, patience_s)
-        if self._error is not None and not self.is_newer_than(after):
+            self._changed.wait_for(lambda: self.newer_than(after) or self.has_ended, patience_s)
+        if self._error is not None and not self.newer_than(after):
             raise self._error
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether no further frame will come."""
-        return self._ended
 
     def newer_than(self, number: int) -> list[RawFrame]:
         """Frames with numbers above this one, the newest last."""
         with self._changed:
             return [frame for frame in self._frames if frame.number > number]
-
-    def is_newer_than(self, number: int) -> bool:
-        """Whether there is a frame with a number above this one."""
-        with self._changed:
-            return bool(self._frames) and self._frames[-1].number > number
 
     def _read(self) -> None:
         try:
@@ -210,7 +201,7 @@ class _Reader:
         except BaseException as caught:  # whatever it is, it belongs to the consumer
             self._error = caught
         with self._changed:
-            self._ended = True
+            self.has_ended = True
             self._changed.notify_all()
 
     def _keep_newest(self) -> None:

@@ -85,9 +85,8 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
                 if head is not None and head.number == number
             }
             for sensor, head in frames.items():
-                if head.time_s is not None:
-                    _require_later(sensor, head, last[sensor])
-                    last[sensor] = head.time_s
+                _require_later(sensor, head, last[sensor])
+                last[sensor] = last[sensor] if head.time_s is None else head.time_s
             times = (frame.time_s for frame in frames.values() if frame.time_s is not None)
             yield FrameSet(number, next(times, None), frames)
             for sensor in frames:
@@ -124,17 +123,13 @@ def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
         return dict(sources)
     paired = dict(sources)
     known: list[int] = []
-    reach = _SHARE * min(_usual_step(source.numbers) for source in stamped.values())
+    steps = [[b - a for a, b in pairwise(source.numbers)] for source in stamped.values()]
+    reach = _SHARE * min((median(each) for each in steps if each), default=math.inf)
     for name, source in stamped.items():
         numbers = _nearest(source.numbers, known, reach)
         paired[name] = _renumbered(source, numbers)
         known = sorted({*known, *numbers})
     return paired
-
-
-def _usual_step(numbers: Sequence[int]) -> float:
-    steps = [after - before for before, after in pairwise(numbers)]
-    return median(steps) if steps else float("inf")
 
 
 def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:

@@ -161,11 +161,10 @@ class DetectionTable(Source):
         if too_small.any() or max(np.abs(points).max(), weights.max()) > _LARGEST:
             self._complain(group)
         pattern = PointPattern(points[weights > 0], weights[weights > 0])
-        times = self._column("time_s", values)
-        time_s = None if times is None else float(times.min())
         if self.clock is not None:
-            time_s = self.clock(number)
-        return RawFrame(number, time_s, pattern)
+            return RawFrame(number, self.clock(number), pattern)
+        times = self._column("time_s", values)
+        return RawFrame(number, None if times is None else float(times.min()), pattern)
 
     def _column(self, name: str, values: Floats) -> Floats | None:
         return values[:, self.columns.index(name)] if name in self.columns else None
@@ -190,13 +189,10 @@ class DetectionTable(Source):
         """Rows of the file with what their frame goes by: its number, else its time."""
         rows = csv_rows(self.path)
         next(rows, None)
-        at = self.columns.index("frame" if self._is_numbered else "time_s")
-        if self._is_numbered:
-            for line, cells in rows:
-                yield whole(cells[at], self.path, line, "frame"), line, cells
-        else:
-            for line, cells in rows:
-                yield finite(cells[at], self.path, line, "time_s"), line, cells
+        read, name = (whole, "frame") if self._is_numbered else (finite, "time_s")
+        at = self.columns.index(name)
+        for line, cells in rows:
+            yield read(cells[at], self.path, line, name), line, cells
 
     @cached_property
     def _contents(self) -> _Contents:

@@ -291,12 +291,11 @@ def _parse(path: Path, data: bytes) -> PoseFile:
     unit: str | None = None
     symmetries: Mapping[str, Floats] = {}
     poses: list[PoseLine] = []
-    is_first = True
     for number, values in _lines(path, data):
         where = f"{path}:{number}"
         kind = values.get("type", "pose")
         if kind == "header":
-            if not is_first:
+            if header or poses:
                 raise RecordingError(f"{where}: a header after the first line; one file, one run")
             header = values
             unit, symmetries = parse_header(values, where)
@@ -304,7 +303,6 @@ def _parse(path: Path, data: bytes) -> PoseFile:
             poses.append(parse_pose(values, where, number))
         else:
             raise RecordingError(f"{where}: type is {kind!r}; allowed are 'header' and 'pose'")
-        is_first = False
     return PoseFile(path, header, tuple(poses), unit, symmetries)
 
 

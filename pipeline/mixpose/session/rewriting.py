@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import tomlkit
@@ -17,6 +17,7 @@ from mixpose.rigid import TWIST_NAMES
 from mixpose.session.setup import Session
 
 ALL_DIGITS = 17  # of float64
+Role: TypeAlias = Literal["source", "times", "file"]
 _BOM = "\ufeff"
 _BARE_END = re.compile(r"(?<!\r)\n")
 
@@ -125,23 +126,28 @@ def _lead_back(document: Any, old: Path, new: Path) -> None:
     if old.resolve() == new.resolve():
         return
 
-    def path(value: str) -> str:
-        if Path(value).is_absolute() or "://" in value or value.startswith("camera:"):
-            return value
-        return Path(os.path.relpath(old.resolve() / value, new.resolve())).as_posix()
+    for table, key, *_ in places_of(document):
+        value = str(table[key])
+        if not (Path(value).is_absolute() or "://" in value or value.startswith("camera:")):
+            path = os.path.relpath(old.resolve() / value, new.resolve())
+            table[key] = Path(path).as_posix()
 
-    def lead(table: Any, key: str) -> None:
-        value = table.get(key)
-        if isinstance(value, str):
-            table[key] = path(value)
-        elif isinstance(value, list):
-            table[key] = [path(each) for each in value]
 
-    for table in objects_of(document):
-        lead(table, "file")
-    for table in document["sensor"]:
-        lead(table, "source")
-        lead(table, "times")
-        lead(table, "calibration")
-        if isinstance(table.get("calibration"), dict):
-            lead(table["calibration"], "file")
+def places_of(document: Any) -> Iterator[tuple[Any, str | int, Role, str]]:
+    """Where a session file holds paths: container, key, what the path is for, and what has it."""
+    objects = list(objects_of(document))
+    for one in objects:
+        if "file" in one:
+            yield one, "file", "file", "object" if len(objects) == 1 else one["name"]
+    for sensor in document["sensor"]:
+        name = sensor["name"]
+        if isinstance(sensor.get("source"), list):
+            yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
+        elif isinstance(sensor.get("source"), str):
+            yield sensor, "source", "source", name
+        if "times" in sensor:
+            yield sensor, "times", "times", name
+        if isinstance(sensor.get("calibration"), dict):
+            yield sensor["calibration"], "file", "file", name
+        elif "calibration" in sensor:
+            yield sensor, "calibration", "file", name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any, TypeAlias
@@ -15,37 +15,24 @@ from mixpose.limits import MOST_DETECTIONS
 
 DEFAULT_FPS = 25.0
 
-Rule: TypeAlias = tuple[Callable[[float], bool], str]
+Rule: TypeAlias = tuple[float, float, bool, str]
 
 # squares of larger numbers, and quotients of smaller ones, cannot be reckoned with
 _LARGEST, _SMALLEST = 1e12, 1e-12
 _MOST_COMPANIONS = 1000
 
-_NOT_NEGATIVE: Rule = (
-    lambda value: 0 <= value <= _LARGEST,
-    f"a number of at least 0, at most {_LARGEST:g}",
-)
-_POSITIVE: Rule = (
-    lambda value: _SMALLEST <= value <= _LARGEST,
-    f"a number greater than 0, from {_SMALLEST:g} to {_LARGEST:g}",
-)
-_PROBABILITY: Rule = (lambda value: 0 <= value <= 1, "a probability from 0 to 1")
-_COUNT: Rule = (lambda value: value >= 0 and value == int(value), "a whole number from 0")
-_FEW: Rule = (
-    lambda value: 0 <= value <= _MOST_COMPANIONS and value == int(value),
-    f"a whole number from 0 to {_MOST_COMPANIONS}",
-)
-_FALSE: Rule = (
-    lambda value: 0 <= value <= MOST_DETECTIONS,
-    f"a number from 0 to {MOST_DETECTIONS}",
-)
-_FRAMES: Rule = (lambda value: value >= 1 and value == int(value), "a whole number from 1")
-_SIGMA: Rule = (lambda value: 0.1 <= value <= 1e4, "a number of at least 0.1 px, at most 1e4 px")
-_QUALITY: Rule = (lambda value: 1 <= value <= 100, "a quality from 1 to 100")
-_ANY: Rule = (
-    lambda value: abs(value) <= _LARGEST,
-    f"a number from {-_LARGEST:g} to {_LARGEST:g}",
-)
+# least and most of a number, whether it is a whole one, and that in words
+_NOT_NEGATIVE: Rule = 0, _LARGEST, False, f"a number of at least 0, at most {_LARGEST:g}"
+_POSITIVE_TEXT = f"a number greater than 0, from {_SMALLEST:g} to {_LARGEST:g}"
+_POSITIVE: Rule = _SMALLEST, _LARGEST, False, _POSITIVE_TEXT
+_PROBABILITY: Rule = 0, 1, False, "a probability from 0 to 1"
+_COUNT: Rule = 0, math.inf, True, "a whole number from 0"
+_FEW: Rule = 0, _MOST_COMPANIONS, True, f"a whole number from 0 to {_MOST_COMPANIONS}"
+_FALSE: Rule = 0, MOST_DETECTIONS, False, f"a number from 0 to {MOST_DETECTIONS}"
+_FRAMES: Rule = 1, math.inf, True, "a whole number from 1"
+_SIGMA: Rule = 0.1, 1e4, False, "a number of at least 0.1 px, at most 1e4 px"
+_QUALITY: Rule = 1, 100, False, "a quality from 1 to 100"
+_ANY: Rule = -_LARGEST, _LARGEST, False, f"a number from {-_LARGEST:g} to {_LARGEST:g}"
 
 
 def _option(default: Any, rule: Rule) -> Any:
@@ -126,8 +113,9 @@ class SimulationOptions:
             value = getattr(self, one.name)
             if value is None or "rule" not in one.metadata:
                 continue
-            is_allowed, allowed = one.metadata["rule"]
-            if not (math.isfinite(value) and is_allowed(value)):
+            least, most, is_whole, allowed = one.metadata["rule"]
+            is_allowed = math.isfinite(value) and least <= value <= most
+            if not is_allowed or (is_whole and value != int(value)):
                 raise SessionError(f"simulate: {one.name}: found {value}; allowed: {allowed}")
 
 

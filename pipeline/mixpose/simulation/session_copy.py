@@ -10,19 +10,16 @@ import copy
 import json
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from mixpose.errors import SessionError
 from mixpose.session import Session
+from mixpose.session.rewriting import places_of
 
 SESSION_NAME = "session.toml"
-
-Role: TypeAlias = Literal["source", "times", "file"]
-# The container and the key that hold a path, what it is for, and the folder it may move to.
-_Place: TypeAlias = tuple[Any, str | int, Role, str]
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ def copy_session(session: Session) -> SessionCopy:
     new_data = copy.deepcopy(data)
     files: dict[str, Path] = {}
     times: dict[str, str] = {}
-    for container, key, role, owner in _places(new_data):
+    for container, key, role, owner in places_of(new_data):
         old = container[key]
         new = container[key] = moved.get(old, old)
         if role == "file":
@@ -81,30 +78,10 @@ def copy_session(session: Session) -> SessionCopy:
     )
 
 
-def _places(data: dict[str, Any]) -> Iterator[_Place]:
-    """Where a session file holds paths."""
-    objects = data["object"] if isinstance(data["object"], list) else [data["object"]]
-    for one in objects:
-        if "file" in one:
-            yield one, "file", "file", "object" if len(objects) == 1 else one["name"]
-    for sensor in data["sensor"]:
-        name = sensor["name"]
-        if isinstance(sensor.get("source"), list):
-            yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
-        elif isinstance(sensor.get("source"), str):
-            yield sensor, "source", "source", name
-        if "times" in sensor:
-            yield sensor, "times", "times", name
-        if isinstance(sensor.get("calibration"), dict):
-            yield sensor["calibration"], "file", "file", name
-        elif "calibration" in sensor:
-            yield sensor, "calibration", "file", name
-
-
 def _moved(session: Session, data: dict[str, Any]) -> dict[str, str]:
     """New paths for those that lead out of the session's folder."""
     moved: dict[str, str] = {}
-    for container, key, role, owner in _places(data):
+    for container, key, role, owner in places_of(data):
         old = container[key]
         path = PurePath(old)
         leads_out = path.is_absolute() or ".." in path.parts
