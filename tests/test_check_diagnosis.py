@@ -24,10 +24,10 @@ from diagnosed import (
 
 import mixpose
 from mixpose.body import Body
-from mixpose.checking import geometry_doubts, survey
 from mixpose.checking.changes import Change, of_units
 from mixpose.checking.evidence import Seen, best_pose
-from mixpose.checking.geometry import _by_some
+from mixpose.checking.geometry import _by_some, geometry_doubts
+from mixpose.checking.recordings import survey
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
 from mixpose.checking.values import Adjustment, adjusted, promise, unknowns

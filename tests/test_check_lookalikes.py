@@ -11,7 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.checking import look_alikes, noise_of, typical_poses, with_image_sizes
+from mixpose.checking import look_alikes, noise_of, with_image_sizes
+from mixpose.checking.placement import typical_poses
 from mixpose.extraction import ExtractOptions
 from mixpose.fit import EstimatorOptions
 from mixpose.records import Floats

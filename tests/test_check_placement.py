@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mixpose.checking import expected_count, placement_lines, placement_warnings
+from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session

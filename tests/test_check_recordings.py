@@ -13,14 +13,10 @@ import pytest
 
 import mixpose
 from mixpose.body import Body, PointFeature
-from mixpose.checking import (
-    Survey,
-    expected_count,
-    fewest_count,
-    judge,
-    some_of,
-    told_apart,
-)
+from mixpose.checking import judge
+from mixpose.checking.keys import told_apart
+from mixpose.checking.placement import expected_count, fewest_count
+from mixpose.checking.recordings import Survey, some_of
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.runner import open_sources

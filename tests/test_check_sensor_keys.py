@@ -11,7 +11,8 @@ import pytest
 from inspected import copied, left_image, write_left
 
 from mixpose import runner
-from mixpose.checking import advice, key_warnings
+from mixpose.checking import key_warnings
+from mixpose.checking.keys import advice
 from mixpose.cli.check import check_session
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session

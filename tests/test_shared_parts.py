@@ -17,7 +17,7 @@ from mixpose.body import (
     symmetries,
     tolerance_of,
 )
-from mixpose.checking import shared_part_warnings
+from mixpose.checking.keys import shared_part_warnings
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.session import load_session

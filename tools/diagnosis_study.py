@@ -23,15 +23,10 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from mixpose.body import Body, PointFeature
-from mixpose.checking import (
-    Survey,
-    geometry_doubts,
-    key_warnings,
-    placement_warnings,
-    some_of,
-    survey,
-    with_image_sizes,
-)
+from mixpose.checking import key_warnings, with_image_sizes
+from mixpose.checking.geometry import geometry_doubts
+from mixpose.checking.placement import placement_warnings
+from mixpose.checking.recordings import Survey, some_of, survey
 from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.runner import open_sources

@@ -50,7 +50,10 @@ def placed(
     sure = replace(rules, undetermined=np.inf)
     bundle = Bundle(own, blocks, known, lambda _: np.zeros((0, 6)), task.sigmas, sure)
     best, best_met = None, 0.0
-    for T in _starts(task, state, sensor, linked, own, rules):
+    session: list[Floats] = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
+    now: list[Floats] = [one.T_sensor_world for one in state.rig.sensors]  # type: ignore[attr-defined]
+    told = [session[sensor] @ inverse(session[a]) @ now[a] for a in linked] or [session[sensor]]
+    for T in _starts(state, sensor, np.array(told), own, rules):
         start = State(state.rig.placed(sensor, T), state.poses)
         blurs = np.array(noise)
         blurs[sensor] = rules.widest * min(feature_spacing(start, sensor), 1e6)
@@ -63,19 +66,9 @@ def placed(
 
 
 def _starts(
-    task: Task,
-    state: State,
-    sensor: int,
-    linked: Sequence[int],
-    frames: Sequence[SeenFrame],
-    rules: CalibrationRules,
+    state: State, sensor: int, told: Floats, frames: Sequence[SeenFrame], rules: CalibrationRules
 ) -> Floats:
-    """Where to begin (H, 4, 4): near the mean of what all linked sensors tell."""
-    session: list[Floats] = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
-    now: list[Floats] = [one.T_sensor_world for one in state.rig.sensors]  # type: ignore[attr-defined]
-    told = np.array(
-        [session[sensor] @ inverse(session[a]) @ now[a] for a in linked] or [session[sensor]]
-    )
+    """Where to begin (H, 4, 4): near the mean of what linked sensors tell of it (A, 4, 4)."""
     centre = np.median(np.array([inverse(T)[:3, 3] for T in told]), axis=0)
     R = Rotation.from_matrix(told[:, :3, :3]).mean().as_matrix()
     T_mean = from_parts(R, -R @ centre)

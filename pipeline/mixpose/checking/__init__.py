@@ -10,39 +10,11 @@ to what sensors met; `evidence` says what they met and how well frames are expla
 change is told.
 """
 
-from mixpose.checking.keys import advice as advice, judge as judge, told_apart as told_apart
 from mixpose.checking.changes import times_as_large as times_as_large
-from mixpose.checking.geometry import (
-    CAUSES as CAUSES,
-    Doubts as Doubts,
-    geometry_doubts as geometry_doubts,
-)
-from mixpose.checking.keys import (
-    key_warnings as key_warnings,
-    shared_part_warnings as shared_part_warnings,
-    shared_source_warnings as shared_source_warnings,
-)
-from mixpose.checking.lookalikes import (
-    LookAlike as LookAlike,
-    look_alikes as look_alikes,
-    noise_of as noise_of,
-)
-from mixpose.checking.placement import (
-    expected_count as expected_count,
-    fewest_count as fewest_count,
-    placement_lines as placement_lines,
-    placement_warnings as placement_warnings,
-)
-from mixpose.checking.recordings import (
-    Survey as Survey,
-    image_of as image_of,
-    numbers_of as numbers_of,
-    some_of as some_of,
-    survey as survey,
-)
+from mixpose.checking.geometry import CAUSES as CAUSES
+from mixpose.checking.keys import judge as judge, key_warnings as key_warnings
+from mixpose.checking.keys import shared_source_warnings as shared_source_warnings
+from mixpose.checking.lookalikes import LookAlike as LookAlike, look_alikes as look_alikes
+from mixpose.checking.lookalikes import noise_of as noise_of
+from mixpose.checking.placement import with_image_sizes as with_image_sizes
 from mixpose.checking.trials import explanation as explanation
-from mixpose.checking.placement import (
-    depends_on_distance as depends_on_distance,
-    typical_poses as typical_poses,
-    with_image_sizes as with_image_sizes,
-)

@@ -80,6 +80,15 @@ class _Runner:
         return sum(evidence_of(a) - evidence_of(b) for a, b in zip(self.poses, before.poses))
 
 
+@dataclass(frozen=True)
+class _Case:
+    """Frames of a session, and how they are explained as it is."""
+
+    session: Session
+    frames: Frames
+    before: Explained
+
+
 class Tried(NamedTuple):
     """A change, by which frames are explained so much better."""
 
@@ -102,11 +111,12 @@ def diagnosis(
     """
     session, rules = anywhere(session), DiagnosisRules()
     before = _as_it_is(session, frames)
-    frames = frames[: len(before.poses)]
+    case = _Case(session, frames[: len(before.poses)], before)
+    frames = case.frames
     is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        tried += _without_values(session, frames, before, others)
+        tried += _without_values(case, others)
     # values only follow the noise where all frames are explained to within it without any
     if not any(
         all(is_well_explained(pose, rules) for pose in one.explained.poses)
@@ -116,14 +126,14 @@ def diagnosis(
     ):
         best = max((one for one in tried if one.change.values), key=lambda t: t.gain, default=None)
         met = best.explained if best and best.gain > rules.margin else before
-        tried += _with_values(session, frames, before, met)
+        tried += _with_values(case, met)
     found = simplest(tried, before, rules)
     if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
         return found
     more = further()
-    poses = before.poses + _as_it_is(session, more).poses
-    before, frames = Explained(poses), [*frames, *more][: len(poses)]
-    return simplest([*_with_values(session, frames, before, before)], before, rules)
+    before = Explained(before.poses + _as_it_is(session, more).poses)
+    case = _Case(session, [*frames, *more][: len(before.poses)], before)
+    return simplest([*_with_values(case, before)], before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -147,22 +157,17 @@ def _as_it_is(session: Session, frames: Frames) -> Explained:
     return Explained(tuple(poses))
 
 
-def _without_values(
-    session: Session,
-    frames: Frames,
-    before: Explained,
-    others: Sequence[tuple[Change, Frames]],
-) -> Iterator[Tried]:
+def _without_values(case: _Case, others: Sequence[tuple[Change, Frames]]) -> Iterator[Tried]:
     """Changes that explain frames better: a race in which those far behind the best drop out."""
-    rules, runners = DiagnosisRules(), [_Runner(*each) for each in others]
-    runners += [_Runner(change, frames) for change in changes(session)]
-    left = rules.all_guesses
-    for k in range(len(frames)):
+    session, before, runners = case.session, case.before, [_Runner(*each) for each in others]
+    runners += [_Runner(change, case.frames) for change in changes(session)]
+    rules, left = DiagnosisRules(), DiagnosisRules().all_guesses
+    for k in range(len(case.frames)):
         for place, runner in enumerate(runners):
             if left < 0 and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
             left -= runner.advance(session)
-        for runner in _less_simple(session, frames, runners, before) if k == 0 else ():
+        for runner in _less_simple(case, runners) if k == 0 else ():
             if left < 0:
                 break
             left -= runner.advance(session)
@@ -177,34 +182,28 @@ def _without_values(
         yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
 
 
-def _less_simple(
-    session: Session, frames: Frames, runners: Sequence[_Runner], before: Explained
-) -> Iterator[_Runner]:
+def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
     """Where the best of those so far do not explain the first frame: as cameras alone see it."""
     # and, where that does not either, those that explain most with every other change
-    rules = DiagnosisRules()
+    session, rules = case.session, DiagnosisRules()
 
     def best() -> list[_Runner]:
-        ahead = [one for one in runners if one.poses and one.gain(before) > rules.margin]
-        ahead.sort(key=lambda one: -one.gain(before))
+        ahead = [one for one in runners if one.poses and one.gain(case.before) > rules.margin]
+        ahead.sort(key=lambda one: -one.gain(case.before))
         return [] if ahead and ahead[0].explains(rules) else ahead[: rules.leaders]
 
     first = [one for one in runners if one.poses and one.explains(rules)]
     if best() or not first:
-        yield from [_Runner(change, frames) for change in by_cameras_alone(session, frames[:2])]
+        alone = by_cameras_alone(session, case.frames[:2])
+        yield from [_Runner(change, case.frames) for change in alone]
     for one in best():
         others = [change for change in changes(session) if change.what != one.change.what]
         yield from [_Runner(change.and_also(one.change), one.frames) for change in others]
 
 
-def _with_values(
-    session: Session,
-    frames: Frames,
-    before: Explained,
-    met: Explained,
-) -> Iterator[Tried]:
+def _with_values(case: _Case, met: Explained) -> Iterator[Tried]:
     """Values that suit the matches of all frames, as they are `met`, better than those given."""
-    rules = DiagnosisRules()
+    session, frames, rules = case.session, case.frames, DiagnosisRules()
     known = [k for k, pose in enumerate(met.poses) if evidence_of(pose) > 0]
     posed = [(frames[k][1], pose) for k in known if (pose := met.poses[k]) is not None]
     if not posed:
@@ -229,18 +228,14 @@ def _with_values(
     doubted = {None, *list(dict.fromkeys(markers))[: rules.markers]}
     promising = [each for each in promising if each[1].feature in doubted]
     for _, unknown, matches in promising[: rules.most]:
-        yield from _fitted(session, frames, before, known, matches, unknown)
+        yield from _fitted(case, known, matches, unknown)
 
 
 def _fitted(
-    session: Session,
-    frames: Frames,
-    before: Explained,
-    known: Sequence[int],
-    given: Adjustment,
-    unknown: Unknown,
+    case: _Case, known: Sequence[int], given: Adjustment, unknown: Unknown
 ) -> Iterator[Tried]:
     """A change by values, fitted twice: matches are better known by then."""
+    session, frames, before = case.session, case.frames, case.before
     rules, found = DiagnosisRules(), list[Any]()
     for _ in range(2):
         fitted = adjusted(unknown, given)
@@ -269,7 +264,8 @@ def _fitted(
         return  # nor are the others worth a search then
     for k, (number, views) in enumerate(frames):
         # a pose that wrong values led to may be another one
-        if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]) - rules.chance:
+        least = evidence_of(before.poses[k]) - rules.chance
+        if k not in known or evidence_of(after[k]) < least:
             again, _ = best_pose(session, body, number, _by(unknown, values, views), rules.guesses)
             after[k] = max(again, after[k], key=evidence_of) if k in known else again
     explained, count = Explained(tuple(after)), len(values)

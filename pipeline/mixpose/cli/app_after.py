@@ -9,14 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from mixpose.cli.words import (
-    AllowCode,
-    ConvertFormat,
-    PosesFile,
-    Recordings,
-    SessionFile,
-    option,
-)
+from mixpose.cli.words import AllowCode, ConvertFormat, PosesFile, Recordings, SessionFile, option
 
 TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 

@@ -28,13 +28,7 @@ from mixpose.calibration.words import (
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import (
-    is_stdout,
-    print_lines,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
+from mixpose.cli.output import is_stdout, print_lines, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -193,10 +187,9 @@ def _warn(found: Calibration, unit: str) -> None:
             f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
             "was: record the body where both see it"
         )
-    for doubt in doubts_of(found, unit):
+    refused = (f"not determined, stays as it was: {direction}" for direction in found.refused)
+    for doubt in (*doubts_of(found, unit), *refused):
         warn(doubt)
-    for direction in found.refused:
-        warn(f"not determined, stays as it was: {direction}")
     if found.bad:
         numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
         warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose import checking
+from mixpose.checking import geometry, keys, lookalikes, placement, recordings
 from mixpose.cli.notices import bar
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
@@ -72,28 +72,26 @@ def check_session(
     report.say("session", f"{session.path}, lengths in {session.unit}")
     for one in session.objects:
         _say_object(report, session, one)
-    surveys: dict[str, checking.Survey] = {}
-    some = None if quick else checking.some_of(opened)
+    surveys: dict[str, recordings.Survey] = {}
+    some = None if quick else recordings.some_of(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as moved:
         for setup in session.sensors:
             source = opened[setup.name]
-            surveys[setup.name] = checking.survey(
+            surveys[setup.name] = recordings.survey(
                 session, setup, source, quick=quick, looked_at=some, done=partial(moved, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
-    report.warnings += checking.shared_source_warnings(session, replaced) + _pairing_warnings(
-        opened
-    )
+    report.warnings += keys.shared_source_warnings(session, replaced) + _pairing_warnings(opened)
     sizes = {name: each.size for name, each in surveys.items()}
-    given = _of_geometry(checking.with_image_sizes(session, sizes))
-    doubts = checking.geometry_doubts(session, opened, surveys)
+    given = _of_geometry(placement.with_image_sizes(session, sizes))
+    doubts = geometry.geometry_doubts(session, opened, surveys)
     if doubts.mended is None:
         report.lines += given.lines
         report.warnings = (
-            checking.told_apart(report.of_counts, len(session.sensors))
+            keys.told_apart(report.of_counts, len(session.sensors))
             + report.warnings
             + given.warnings
         )
@@ -102,7 +100,7 @@ def check_session(
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings]
-        mended = _of_geometry(checking.with_image_sizes(doubts.mended, sizes))
+        mended = _of_geometry(placement.with_image_sizes(doubts.mended, sizes))
         report.lines += mended.lines
         report.warnings += mended.warnings
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
@@ -117,12 +115,12 @@ def check_session(
 def _of_geometry(session: Session) -> _Report:
     """What is said of where sensors stand and what they see of the bodies there."""
     report = _Report()
-    report.warnings += checking.key_warnings(session) + checking.placement_warnings(session)
+    report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
     for one in session.objects:
         report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
         _say_accuracy(report, session.alone(one.body.name))
     report.of = ""
-    report.warnings += checking.shared_part_warnings(session)
+    report.warnings += keys.shared_part_warnings(session)
     return report
 
 
@@ -132,15 +130,9 @@ def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
     extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
     many = f", {one.count} that are identical" if one.count > 1 else ""
     report.say("object", f"{body.name}: {extent}{spread}{many}")
-    alike = len(body.symmetries)
-    text = "none"
-    if alike > 1:
-        text = (
-            f"{alike} orientations look the same; the pose nearest to the previous one is written"
-        )
-    if len(session.objects) > 1:
-        text = f"{body.name}: {text}"
-    report.say("symmetry", text)
+    alike, of = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
+    text = f"{alike} orientations look the same; the pose nearest to the previous one is written"
+    report.say("symmetry", of + (text if alike > 1 else "none"))
 
 
 def _say_sensor(
@@ -148,12 +140,12 @@ def _say_sensor(
     session: Session,
     setup: SensorSetup,
     source: Source,
-    surveys: Mapping[str, checking.Survey],
+    surveys: Mapping[str, recordings.Survey],
 ) -> None:
     found = surveys[setup.name]
     size = "" if setup.resolution is None else f" {setup.resolution[0]}x{setup.resolution[1]}"
     report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, session.unit)}")
-    for line in checking.placement_lines(setup, session.unit):
+    for line in placement.placement_lines(setup, session.unit):
         report.say("", line)
     total = len(found.numbers) + len(found.damage)
     read = "all read" if found.is_whole else f"looked at {total}"
@@ -171,7 +163,7 @@ def _say_sensor(
     _say_features(report, session, setup, source, found)
 
 
-def _say_missing(report: _Report, name: str, surveys: Mapping[str, checking.Survey]) -> None:
+def _say_missing(report: _Report, name: str, surveys: Mapping[str, recordings.Survey]) -> None:
     """Frames that other sensors have."""
     own = {*surveys[name].numbers, *surveys[name].damaged}
     others = [each for other, each in surveys.items() if other != name]
@@ -185,7 +177,7 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, checking.Surv
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
     """Sensors whose frames hardly pair with those of others, told by numbers alone."""
     numbers = {
-        name: found for name, each in sources.items() if (found := checking.numbers_of(each))
+        name: found for name, each in sources.items() if (found := recordings.numbers_of(each))
     }
     warnings = []
     for name, own in numbers.items():
@@ -200,11 +192,11 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
 
 
 def _say_features(
-    report: _Report, session: Session, setup: SensorSetup, source: Source, found: checking.Survey
+    report: _Report, session: Session, setup: SensorSetup, source: Source, found: recordings.Survey
 ) -> None:
     where = f"sensor {setup.name!r}"
     each = [
-        (checking.expected_count(setup, session.alone(o.body.name)), o.count)
+        (placement.expected_count(setup, session.alone(o.body.name)), o.count)
         for o in session.objects
     ]
     expected = sum(seen * count for seen, count in each)
@@ -213,7 +205,7 @@ def _say_features(
     if found.counts is None:
         if found.numbers and found.empty:
             report.warnings.append(
-                f"{where}: nothing but one value in frame {_numbers(list(found.empty))}"
+                f"{where}: nothing but one value in frame {_numbers(found.empty)}"
             )
         return
     low, high = min(found.counts), max(found.counts)
@@ -224,22 +216,22 @@ def _say_features(
         f"features per frame: {low} / {middle:g} / {high} (least / median / most{of}), expected: "
         f"{expected}",
     )
-    fewest = min(checking.fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
-    judgement = checking.judge(middle, expected, fewest if len(session.labels) == 1 else None)
+    fewest = min(placement.fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
+    judgement = keys.judge(middle, expected, fewest if len(session.labels) == 1 else None)
     if judgement is not None:
         number = found.typical_frame
         assert number is not None, "there are counts"
-        image = checking.image_of(source, number)
+        image = recordings.image_of(source, number)
         count = found.counts[found.counted.index(number)]
         report.of_counts.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
-            f"{expected} are expected: {checking.advice(session, setup, number, image, expected)}"
+            f"{expected} are expected: {keys.advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
-        report.warnings.append(f"{where}: no feature in frame {_numbers(list(found.empty))}")
+        report.warnings.append(f"{where}: no feature in frame {_numbers(found.empty)}")
 
 
-def _numbers(numbers: list[int]) -> str:
+def _numbers(numbers: Sequence[int]) -> str:
     text = ", ".join(map(str, numbers[:_LISTED]))
     return text if len(numbers) <= _LISTED else f"{text}, ... ({len(numbers)} frames)"
 
@@ -258,9 +250,9 @@ def _say_accuracy(report: _Report, session: Session) -> None:
     if session.start is not None:
         _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
         return
-    several = checking.depends_on_distance(session)
+    several = placement.depends_on_distance(session)
     for away in _AWAY if several else _AWAY[:1]:
-        poses = checking.typical_poses(session, _TYPICAL_POSES, away=away)
+        poses = placement.typical_poses(session, _TYPICAL_POSES, away=away)
         if not poses:
             report.say("start", "none, and no place is in view of the sensors: add [start]")
             return
@@ -310,7 +302,7 @@ def _say_accuracy_at(
                 "at the pose of [start] with free in [estimator], or add a sensor"
             )
     others = [
-        checking.look_alikes(session.sensors, session.body, T, free)
+        lookalikes.look_alikes(session.sensors, session.body, T, free)
         for T, (covariance, _) in zip(poses, expected, strict=True)
         if np.isfinite(np.diag(covariance)).all()
     ]
@@ -321,17 +313,17 @@ def _say_accuracy_at(
 
 
 def _look_alike_text(
-    session: Session, found: list[list[checking.LookAlike]], tried: int, where: str
+    session: Session, found: list[list[lookalikes.LookAlike]], tried: int, where: str
 ) -> str:
     best = min((alike[0] for alike in found), key=lambda other: other.difference)
     orientations = f" in {len(found)} of {tried} orientations" if tried > 1 else ""
     count = max(map(len, found))
     poses = "another pose looks" if count == 1 else f"{count} other poses look"
-    largest = max(session.sensors, key=checking.noise_of)
+    largest = max(session.sensors, key=lookalikes.noise_of)
     unit = "px" if largest.sensor.unit == "px" else session.unit
     return (
         f"{where}{orientations}, {poses} the same where features err by "
-        f"{checking.noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
+        f"{lookalikes.noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
         f"{best.difference:.1f} standard deviations apart): expect ambiguous frames, or move a "
         "marker out of line and plane, come closer, or add a sensor"
     )

@@ -12,7 +12,7 @@ from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
-from mixpose.cli.request import SUFFIXES, output_of
+from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import first_answers, header_of, objects_of, relative_to
@@ -90,22 +90,18 @@ def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
 
 
 def _format(request: ConvertRequest) -> str:
-    if request.format is not None:
-        return request.format
-    name = "" if request.output is None else request.output.name.casefold()
-    found_by_suffix = next((each for end, each in _BY_SUFFIX.items() if name.endswith(end)), None)
-    if found_by_suffix is None:
-        suffixes = ", ".join(_BY_SUFFIX)
-        if request.output is None:
-            raise SessionError(
-                "--format: missing, where there is no -o whose suffix tells the format; add "
-                f"--format csv, or -o with a name that ends in {suffixes}"
-            )
+    found, suffixes = request.format or by_suffix(request.output, _BY_SUFFIX), ", ".join(_BY_SUFFIX)
+    if found is None and request.output is None:
+        raise SessionError(
+            "--format: missing, where there is no -o whose suffix tells the format; add "
+            f"--format csv, or -o with a name that ends in {suffixes}"
+        )
+    if found is None:
         raise SessionError(
             f"-o {request.output}: no format has this suffix; add --format, or choose a name that "
             f"ends in {suffixes}"
         )
-    return found_by_suffix
+    return found
 
 
 def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from mixpose.cli.output import (
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
-from mixpose.executing import Executor, executor
+from mixpose.executing import executor
 from mixpose.pictures.signature import refuse_foreign, sign_figure
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Floats
@@ -55,7 +55,10 @@ def design_sessions(asked: DesignRequest) -> None:
         tolerance=asked.tolerance,
     )
     told = say if sys.stderr.isatty() else lambda text: None
-    with _simulating(asked) as workers:
+    # what does the simulated frames: this process, others, or a cluster
+    alone = not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None)
+    several = asked.workers if asked.workers > 1 else None
+    with nullcontext() if alone else executor(asked.scheduler, several) as workers:
         found = study(list(zip(names, sessions, strict=True)), request, told, workers)
     print_lines([study_text(found).removesuffix("\n")], asked.json)
     if asked.json is not None:
@@ -83,13 +86,6 @@ def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
         if not asked.plot.parent.is_dir():
             raise SessionError(f"--plot {asked.plot}: there is no folder {asked.plot.parent}")
         refuse_foreign(asked.plot, "--plot")
-
-
-def _simulating(asked: DesignRequest) -> AbstractContextManager[Executor | None]:
-    """What does the simulated frames: this process, others, or a cluster."""
-    if not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None):
-        return nullcontext()
-    return executor(asked.scheduler, asked.workers if asked.workers > 1 else None)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -7,13 +7,7 @@ from pathlib import Path
 
 from mixpose.cli.app_before import LearnRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import (
-    is_stdout,
-    print_lines,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
+from mixpose.cli.output import is_stdout, print_lines, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
@@ -106,10 +100,9 @@ def _tell(
             lines += [f"count = {body.count}"] if body.count > 1 else []
     print_lines(lines, *files)
     names = [file.name for file in called]
-    for body, name in zip(bodies, names, strict=True):
-        for doubt in doubts_of(body, name, session.unit, rules):
-            warn(doubt)
-    for doubt in look_alikes(bodies, names):
+    pairs = zip(bodies, names, strict=True)
+    doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit, rules)]
+    for doubt in (*doubts, *look_alikes(bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(shown, files))}{others}")

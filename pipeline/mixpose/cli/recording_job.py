@@ -158,15 +158,15 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
         lines.append(f"mixpose: ended by signal {-status}")
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
-    frames, bodies = _frames(lines)
+    told = [found for line in lines if (found := told_frames(line))]
+    frames, bodies = told[-1] if told else ({}, 1)  # as the run said in the end
+    said = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
     outcome = replace(
         outcome_of(job, state, 128 - status if status < 0 else status),
         frames=frames,
         bodies=bodies,
         warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
-        reason=None
-        if status == 0
-        else (lines or ["it said nothing"])[-1].removeprefix("mixpose: "),
+        reason=None if status == 0 else said,
         seconds=round(time.monotonic() - began, 3),
     )
     if state == DONE:  # nothing is left to go on with
@@ -217,9 +217,3 @@ def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
     same = ("name", "session", "session_sha256", "options", "mixpose")
     told = {key: getattr(job, key) for key in same}
     return Outcome(**told, state=state, exit_status=exit_status, host=socket.gethostname())
-
-
-def _frames(lines: list[str]) -> tuple[dict[str, int], int]:
-    """Poses by status and the number of bodies, as the run said in the end."""
-    said = [found for line in lines if (found := told_frames(line))]
-    return said[-1] if said else ({}, 1)

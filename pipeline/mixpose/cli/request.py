@@ -5,6 +5,7 @@ Apart from the run itself, so that a command which only starts others need not l
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,6 +72,12 @@ def output_of(named: Path | None) -> Path | None:
     return None if named == Path("-") else named
 
 
+def by_suffix(output: Path | None, suffixes: Mapping[str, str]) -> str | None:
+    """The format that the name of a file tells by its end; None where it tells none."""
+    name = "" if output is None else output.name.casefold()
+    return next((each for end, each in suffixes.items() if name.endswith(end)), None)
+
+
 def format_of(output: Path | None, named: str | None) -> str:
     """The format of poses: the one that is named, else that of the file's suffix.
 
@@ -80,15 +87,14 @@ def format_of(output: Path | None, named: str | None) -> str:
     """
     if named is not None:
         return named
-    name = "" if output is None else output.name.casefold()
     if output is None or not output.suffix or (output.exists() and not output.is_file()):
         return "jsonl"
-    if name.endswith(".rrd"):
+    if output.name.casefold().endswith(".rrd"):
         raise SessionError(
             f"-o {output}: poses are not written in this format while they are estimated; write "
             f".jsonl, and then: mixpose convert POSES.jsonl -o {output}"
         )
-    told = next((each for end, each in SUFFIXES.items() if name.endswith(end)), None)
+    told = by_suffix(output, SUFFIXES)
     if told is None:
         raise SessionError(
             f"-o {output}: found the suffix {output.suffix}, which is no format of poses; allowed: "

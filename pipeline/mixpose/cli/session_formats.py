@@ -73,7 +73,13 @@ def write_markers(
                 write_trc(stream, trajectories, output.name)
         elif not write_c3d(part, trajectories):
             warn(f"{output}: frames are numbered from 1, not from {trajectories.first}")
-    _say(trajectories, output)
+    frames, markers = trajectories.is_known.shape
+    known, found = trajectories.is_known.sum(), trajectories.is_measured.sum()
+    say(
+        f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
+        f"{found} places measured, {known - found} by the pose, "
+        f"{trajectories.is_known.size - known} gaps -> {output}"
+    )
 
 
 def trajectories_of(
@@ -173,16 +179,6 @@ def _require_c3d(output: Path | None) -> None:
             "--format c3d: needs the package ezc3d; install it with: "
             "python -m pip install 'mixpose[c3d]'; .trc needs none"
         )
-
-
-def _say(trajectories: Trajectories, output: Path) -> None:
-    frames, markers = trajectories.is_known.shape
-    known, measured = trajectories.is_known.sum(), trajectories.is_measured.sum()
-    say(
-        f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
-        f"{measured} places measured, {known - measured} by the pose, "
-        f"{trajectories.is_known.size - known} gaps -> {output}"
-    )
 
 
 def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequest) -> None:

@@ -120,7 +120,10 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
                 say(f"{sessions[number]}: {_line(outcomes[number])}")
     finally:
         ended = [outcomes[k] for k in sorted(outcomes)]
-        _sweep(folder, ended)
+        # what killed workers left of recordings that others did after them
+        for name in (glob.escape(one.name) for one in ended if one.state == DONE):
+            for part in folder.glob(f".{name}.*"):
+                shutil.rmtree(part, ignore_errors=True)
         _write_summary(folder, ended, len(jobs))
     return _say_all(folder, ended)
 
@@ -230,14 +233,6 @@ def _folder(folder: Path | None, count: int) -> Path:
     with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
     return folder
-
-
-def _sweep(folder: Path, outcomes: Sequence[Outcome]) -> None:
-    """Remove what killed workers left of recordings that others did after them."""
-    for outcome in outcomes:
-        if outcome.state == DONE:
-            for left in folder.glob(f".{glob.escape(outcome.name)}.*"):
-                shutil.rmtree(left, ignore_errors=True)
 
 
 def _line(outcome: Outcome) -> str:

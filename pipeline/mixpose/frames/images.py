@@ -77,10 +77,8 @@ class ImageSequence(Source):
                 "the names of its images end in nanoseconds, which are taken for their times, and "
                 "not fps; drop fps, or name a table of times"
             )
-        if self.length < 3 or self.numbers != tuple(range(self.length)):
-            return None
-        values = [_ending(path) for path in self.paths]
-        if all(value == number for value, number in zip(values, self.numbers, strict=True)):
+        values, places = [_ending(path) for path in self.paths], [*range(self.length)]
+        if self.length < 3 or [*self.numbers] != places or values == places:
             return None
         bare = [path.name for path, value in zip(self.paths, values, strict=True) if value is None]
         if bare and len(bare) < self.length / 2:

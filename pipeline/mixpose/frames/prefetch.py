@@ -5,21 +5,10 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class _Item(Generic[T]):
-    value: T
-
-
-@dataclass(frozen=True)
-class _End:
-    error: BaseException | None
 
 
 def prefetch(
@@ -33,7 +22,8 @@ def prefetch(
     out in its place, after the items before it. At most `depth` items wait, one more may be on its
     way; `more`, told the first item, says how many more may wait.
     """
-    waiting: SimpleQueue[_Item[T] | _End] = SimpleQueue()
+    # items, each by itself in a tuple, and in the end what was raised, or None
+    waiting: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()
     room: SimpleQueue[None] = SimpleQueue()
     for _ in range(max(depth, 1)):
         room.put(None)
@@ -43,11 +33,11 @@ def prefetch(
     )
     worker.start()
     try:
-        while isinstance(entry := waiting.get(), _Item):
+        while isinstance(entry := waiting.get(), tuple):
             room.put(None)
-            yield entry.value
-        if entry.error is not None:
-            raise entry.error
+            yield entry[0]
+        if entry is not None:
+            raise entry
     finally:
         stop.set()
         room.put(None)  # a worker that waits for room goes on, and stops
@@ -58,7 +48,7 @@ def prefetch(
 
 def _fetch(
     items: Iterator[T],
-    waiting: SimpleQueue[_Item[T] | _End],
+    waiting: SimpleQueue[tuple[T] | BaseException | None],
     room: SimpleQueue[None],
     stop: threading.Event,
     more: Callable[[T], int] | None,
@@ -76,8 +66,8 @@ def _fetch(
                 room.get()
                 if stop.is_set():
                     break
-                waiting.put(_Item(item))
+                waiting.put((item,))
     except BaseException as caught:  # whatever it is, it belongs to the consumer
         error = caught
     if not stop.is_set():
-        waiting.put(_End(error))
+        waiting.put(error)

@@ -19,17 +19,14 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
     the world's axes; ``ok_frames`` the errors of frames that are ok alone; ``best_hypothesis``
     those of the best hypothesis of ambiguous frames.
     """
-    nees, unit = evaluation.nees, evaluation.unit
-    per_axis = evaluation.per_axis_rms
-    ok_rotation, best_rotation = evaluation.ok_rotation_deg, evaluation.best_rotation_deg
-    ok = _errors(ok_rotation, evaluation.ok_translation, unit)
-    best = _errors(best_rotation, evaluation.best_translation, unit)
+    nees, per_axis = evaluation.nees, evaluation.per_axis_rms
+    best = {"frames": evaluation.ambiguous, **_errors(evaluation, "best_")}
     return {
         **{key: getattr(evaluation, key) for key in _COUNTED},
-        **_errors(evaluation.rotation_deg, evaluation.translation, unit),
+        **_errors(evaluation),
         "per_axis": None if per_axis is None else dict(per_axis),
-        "ok_frames": None if ok_rotation is None else ok,
-        "best_hypothesis": {"frames": evaluation.ambiguous, **best} if best_rotation else None,
+        "ok_frames": _errors(evaluation, "ok_") if evaluation.ok_rotation_deg else None,
+        "best_hypothesis": best if evaluation.best_rotation_deg else None,
         "nees": None
         if nees is None
         else {
@@ -131,24 +128,20 @@ def _one_body(evaluation: Evaluation) -> list[str]:
 def _spread_lines(evaluation: Evaluation, unit: str) -> list[str]:
     if evaluation.rotation_deg is None or evaluation.translation is None:
         return ["no frame has a pose to compare"]
-    rows = [
-        ("rotation, deg", evaluation.rotation_deg),
-        (f"position, {unit}", evaluation.translation),
-    ]
-    if evaluation.best_rotation_deg is not None and evaluation.best_translation is not None:
-        if evaluation.ok_rotation_deg is not None and evaluation.ok_translation is not None:
-            rows += [
-                ("ok alone, deg", evaluation.ok_rotation_deg),
-                (f"ok alone, {unit}", evaluation.ok_translation),
-            ]
-        rows += [
-            ("best hypothesis, deg", evaluation.best_rotation_deg),
-            (f"best hypothesis, {unit}", evaluation.best_translation),
-        ]
+    rows: dict[str, Spread | None] = {
+        "rotation, deg": evaluation.rotation_deg,
+        f"position, {unit}": evaluation.translation,
+    }
+    if evaluation.best_rotation_deg is not None:
+        rows["ok alone, deg"] = evaluation.ok_rotation_deg
+        rows[f"ok alone, {unit}"] = evaluation.ok_translation
+        rows["best hypothesis, deg"] = evaluation.best_rotation_deg
+        rows[f"best hypothesis, {unit}"] = evaluation.best_translation
     lines = [_row("error", [*_STATISTICS, "in frame"])]
-    for name, spread in rows:
-        figures = [f"{getattr(spread, statistic):.4g}" for statistic in _STATISTICS]
-        lines.append(_row(name, [*figures, str(spread.worst_frame)]))
+    for name, spread in rows.items():
+        if spread is not None:
+            figures = [f"{getattr(spread, statistic):.4g}" for statistic in _STATISTICS]
+            lines.append(_row(name, [*figures, str(spread.worst_frame)]))
     return lines
 
 
@@ -169,10 +162,10 @@ def _row(name: str, cells: list[str]) -> str:
     return name.ljust(24) + "".join(cell.rjust(11) for cell in cells)
 
 
-def _errors(
-    rotation: Spread | None, translation: Spread | None, unit: str | None
-) -> dict[str, Any]:
+def _errors(evaluation: Evaluation, of: str = "") -> dict[str, Any]:
+    turn, shift = (getattr(evaluation, f"{of}{kind}") for kind in ("rotation_deg", "translation"))
+    unit = {"unit": evaluation.unit}
     return {
-        "rotation_deg": None if rotation is None else asdict(rotation),
-        "translation": None if translation is None else {**asdict(translation), "unit": unit},
+        "rotation_deg": None if turn is None else asdict(turn),
+        "translation": None if shift is None else asdict(shift) | unit,
     }

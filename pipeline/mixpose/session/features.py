@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +67,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
     gravity = _gravity(table)
-    names = _names(markers) if table.names is None else _stated_names(table.names, table, markers)
+    names = _names(table, markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
 
 
@@ -88,21 +87,15 @@ def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, ke
         )
 
 
-def _names(markers: Markers | None) -> tuple[str, ...]:
-    """What people call the points; nothing where some have no name, or two the same."""
-    if markers is None:
-        return ()
-    names = tuple(" ".join(name.split()) for name in markers.names)
-    return names if all(names) and len({*names}) == len(names) == len(markers.points) else ()
-
-
-def _stated_names(
-    stated: Sequence[str], table: ObjectTable, markers: Markers | None
-) -> tuple[str, ...]:
+def _names(table: ObjectTable, markers: Markers | None) -> tuple[str, ...]:
+    """What people call the points; nothing where a file gives some no name, or two the same."""
+    given = markers.names if markers is not None and table.names is None else table.names or ()
+    names = tuple(" ".join(name.split()) for name in given)
+    count = 0 if markers is None else len(markers.points)
+    if table.names is None:
+        return names if all(names) and len({*names}) == len(names) == count else ()
     if table.file is not None:
         raise BadKeyError("stands beside file, which has names; allowed: one of the two", "names")
-    count = 0 if markers is None else len(markers.points)
-    names = tuple(" ".join(name.split()) for name in stated)
     if len(names) != count:
         text = f"found {len(names)} names for {count} points"
         raise BadKeyError(f"{text}; allowed: one per point", "names")

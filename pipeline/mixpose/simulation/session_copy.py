@@ -6,14 +6,13 @@ that leads out of its folder is changed, as the recording is to hold all that be
 
 from __future__ import annotations
 
-import copy
-import json
 import shutil
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
+
+import tomlkit
 
 from mixpose.errors import SessionError
 from mixpose.session import Session
@@ -46,18 +45,19 @@ def copy_session(session: Session) -> SessionCopy:
     """Read a session file for a recording; a `SessionError` if what it names cannot go along."""
     try:
         content = session.path.read_bytes()
-        data = tomllib.loads(content.decode("utf-8-sig"))
+        document = tomlkit.parse(content.decode("utf-8-sig"))
     except OSError as error:
         raise SessionError(f"{session.path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise SessionError(f"{session.path}: changed since it was read; try again") from error
-    moved = _moved(session, data)
-    new_data = copy.deepcopy(data)
+    moved = _moved(session, document)
     files: dict[str, Path] = {}
     times: dict[str, str] = {}
-    for container, key, role, owner in places_of(new_data):
-        old = container[key]
-        new = container[key] = moved.get(old, old)
+    for container, key, role, owner in places_of(document):
+        old = str(container[key])
+        new = moved.get(old, old)
+        if old in moved:
+            container[key] = new
         if role == "file":
             files[new] = session.folder / old
         elif role == "times":
@@ -67,8 +67,8 @@ def copy_session(session: Session) -> SessionCopy:
     names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
     files |= {n: session.folder / n for n in names if (session.folder / n).is_file()}
     if moved:
-        content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
-    sources = [sensor.get("source", "") for sensor in new_data["sensor"]]
+        content = str(tomlkit.dumps(document)).encode()
+    sources = [sensor.get("source", "") for sensor in document.unwrap()["sensor"]]
     sources = [f"camera:{s}" if isinstance(s, int) else s for s in sources]
     return SessionCopy(
         content=content,
@@ -78,11 +78,11 @@ def copy_session(session: Session) -> SessionCopy:
     )
 
 
-def _moved(session: Session, data: dict[str, Any]) -> dict[str, str]:
+def _moved(session: Session, document: Any) -> dict[str, str]:
     """New paths for those that lead out of the session's folder."""
     moved: dict[str, str] = {}
-    for container, key, role, owner in places_of(data):
-        old = container[key]
+    for container, key, role, owner in places_of(document):
+        old = str(container[key])
         path = PurePath(old)
         leads_out = path.is_absolute() or ".." in path.parts
         # a stream's address is no path; it is refused when files are chosen
@@ -96,22 +96,3 @@ def _moved(session: Session, data: dict[str, Any]) -> dict[str, str]:
             )
         moved[old] = new
     return moved
-
-
-def _rewritten(
-    session: Session, text: str, moved: dict[str, str], expected: dict[str, Any]
-) -> bytes:
-    """The session file with paths changed, and nothing else."""
-    for old, new in moved.items():
-        text = text.replace(json.dumps(old, ensure_ascii=False), json.dumps(new))
-        text = text.replace(f"'{old}'", json.dumps(new))
-    try:
-        is_as_meant = tomllib.loads(text) == expected
-    except ValueError:
-        is_as_meant = False
-    if not is_as_meant:
-        raise SessionError(
-            f"{session.path}: {', '.join(moved)} cannot be replaced by paths inside the "
-            "recording; use paths inside the session's folder"
-        )
-    return text.encode()
