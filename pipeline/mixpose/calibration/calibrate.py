@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from mixpose.calibration import result
 from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.recorded import held_back_with
-from mixpose.calibration.result import (
-    Calibration,
-    Residual,
-    explained_share,
-    met_share,
-    rms,
-    sights_of,
-    squared_residuals,
-)
 from mixpose.calibration.rig import Block, Rig, State, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import searched
 from mixpose.calibration.start import Start, start_from_cameras, starts_together
 from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats
 from mixpose.sensors import CalibrationError, RangeSensor
 from mixpose.threads import one_blas_thread
 
@@ -41,7 +33,7 @@ def calibrate(
     *,
     progress: Progress = silent,
     found: Known | None = None,
-) -> Calibration:
+) -> result.Calibration:
     """Calibrate sensors and body from what the sensors saw.
 
     `found` are hypotheses of single cameras that are known from before; new ones are added.
@@ -115,18 +107,6 @@ def _best(
     return None if best is None else best[1:]
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Some of the frames with their poses, and the rig."""
-
-    frames: tuple[SeenFrame, ...]
-    state: State
-
-    def only(self, mask: Mask) -> _Part:
-        frames = tuple(frame for frame, kept in zip(self.frames, mask, strict=True) if kept)
-        return _Part(frames, self.state._replace(poses=self.state.poses[mask]))
-
-
 class _Run:
     """One calibration from a start; what it `found` is without residuals."""
 
@@ -150,12 +130,12 @@ class _Run:
         body, length = self._task.body_free, _size_of(start)
         self._blocks = blocks_of(start.rig, free, body=body, length=length, interval=self._interval)
 
-    def _result(self) -> Calibration:
+    def _result(self) -> result.Calibration:
         """The calibration, but for its residuals."""
-        part = _Part(self._start.frames, self._start.state)
+        part = self._start
         self._progress("adjusting all sensors together", 0, _STAGES)
         adjusted = self._adjusted(part)
-        good = met_share(adjusted, part.frames, self._task) > self._rules.least_met
+        good = result.met_share(adjusted, part.frames, self._task) > self._rules.least_met
         part = replace(part, state=adjusted.state)
         bad: list[int] = []
         if good.any():  # else no sensor was placed yet
@@ -174,7 +154,7 @@ class _Run:
         self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
-    def residuals(self) -> dict[int, Residual]:
+    def residuals(self) -> dict[int, result.Residual]:
         """Residuals before and after, and of every frame by a rig that was adjusted without it.
 
         Matches are the same in all three, and poses are fitted to each rig.
@@ -183,8 +163,8 @@ class _Run:
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
         bundle = replace(self._bundle(part), blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
-        before = squared_residuals(bundle, self._task.rig, best)
-        after = squared_residuals(bundle, best.state.rig, best)
+        before = result.squared_residuals(bundle, self._task.rig, best)
+        after = result.squared_residuals(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
@@ -194,13 +174,16 @@ class _Run:
                 for block in self._blocks
                 if (fit.undetermined & ~best.undetermined)[block.place].any()
             }
-            found = squared_residuals(bundle, fit.state.rig, best)
+            found = result.squared_residuals(bundle, fit.state.rig, best)
             for s in sensors:
                 if s not in lost:
                     held[s].append(found[s][folds[best.weighted[s][0].pairs.frame] == fold])
-        return {s: Residual(rms([before[s]]), rms([after[s]]), rms(held[s])) for s in sensors}
+        return {
+            s: result.Residual(result.rms([before[s]]), result.rms([after[s]]), result.rms(held[s]))
+            for s in sensors
+        }
 
-    def _latecomers(self, part: _Part, noise: Floats) -> dict[int, Floats]:
+    def _latecomers(self, part: Start, noise: Floats) -> dict[int, Floats]:
         """T_sensor_world of cameras that could not be linked by what they see alone."""
         task, unlinked, found = self._task, self._unlinked, dict[int, Floats]()
         frames = self._whole(part)
@@ -211,21 +194,21 @@ class _Run:
                 found[sensor] = T
         return found
 
-    def _with_latecomers(self, part: _Part, late: dict[int, Floats]) -> _Part:
+    def _with_latecomers(self, part: Start, late: dict[int, Floats]) -> Start:
         """Frames with what the cameras that came late saw, and the rig with them."""
         self._lay_out([s for s in self._unlinked if s not in late])
         rig = part.state.rig
         for sensor, T in late.items():
             rig = rig.placed(sensor, T)
         frames = tuple(frame.without(self._unlinked) for frame in self._whole(part))
-        return _Part(frames, part.state._replace(rig=rig))
+        return replace(part, frames=frames, state=part.state._replace(rig=rig))
 
-    def _whole(self, part: _Part) -> tuple[SeenFrame, ...]:
+    def _whole(self, part: Start) -> tuple[SeenFrame, ...]:
         """The frames with all that sensors saw."""
         numbers = {frame.number: frame for frame in self._task.frames}
         return tuple(numbers[frame.number] for frame in part.frames)
 
-    def _bundle(self, part: _Part) -> Bundle:
+    def _bundle(self, part: Start) -> Bundle:
         task = self._task
 
         def gauge(rig: Rig) -> Floats:
@@ -238,12 +221,12 @@ class _Run:
     def _gauge(self, state: State) -> tuple[Floats, tuple[str, ...]]:
         return gauge_rows(state, self._blocks, self._pose_free, self._task.length)
 
-    def _adjusted(self, part: _Part, noise: Floats | None = None) -> Adjusted:
+    def _adjusted(self, part: Start, noise: Floats | None = None) -> Adjusted:
         """A part adjusted, from narrow blurs where the noise is known from before."""
         blurs = None if noise is None else 2 * self._rules.blur * noise
         return adjust(self._bundle(part), part.state, blurs=blurs)
 
-    def _moved_by_biases(self, part: _Part, adjusted: Adjusted) -> Floats:
+    def _moved_by_biases(self, part: Start, adjusted: Adjusted) -> Floats:
         """What biases as large as σ_ε would move (G,), of sensors of which nothing is stated."""
         task = self._task
         errors = {
@@ -256,11 +239,11 @@ class _Run:
             return np.zeros(sum(len(block.names) for block in self._blocks))
         return moved_by_held(replace(self._bundle(part), errors=errors), adjusted)
 
-    def _told(self, part: _Part, adjusted: Adjusted, bad: list[int]) -> Calibration:
+    def _told(self, part: Start, adjusted: Adjusted, bad: list[int]) -> result.Calibration:
         task, rig = self._task, adjusted.state.rig
         deviations, refused = _determined(self._blocks, adjusted, task.rig.names)
         numbers = [f.number for f in part.frames]
-        return Calibration(
+        return result.Calibration(
             before=task.rig,
             after=rig,
             blocks=self._blocks,
@@ -278,8 +261,8 @@ class _Run:
             inflation=adjusted.inflation,
             certainty=adjusted.certainty,
             moved_by_biases=self._moved_by_biases(part, adjusted),
-            explained=explained_share(adjusted, part.frames, task),
-            sights=sights_of(adjusted, numbers),
+            explained=result.explained_share(adjusted, part.frames, task),
+            sights=result.sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.state.poses, strict=True)),
         )
 

@@ -41,6 +41,11 @@ class Start:
     through: Mapping[int, tuple[int | None, int]]
     unlinked: tuple[int, ...]  # sensors that share no view with the others
 
+    def only(self, mask: Mask) -> Start:
+        """Some of the frames (K,)."""
+        frames = tuple(frame for frame, kept in zip(self.frames, mask, strict=True) if kept)
+        return replace(self, frames=frames, state=self.state._replace(poses=self.state.poses[mask]))
+
 
 def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Start:
     """Link cameras by what each sees alone, and choose a pose for every frame."""

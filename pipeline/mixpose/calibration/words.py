@@ -20,7 +20,6 @@ from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError, RangeSensor
 from mixpose.session.values import as_number
 
-ALLOWED = ", ".join(KINDS)
 _FREES: dict[Kind, tuple[str, ...]] = {
     "pose": ("rotation_deg", "position"),
     "position": ("position",),
@@ -73,7 +72,7 @@ def _kind(word: str, what: str) -> Kind:
         return what
     near = difflib.get_close_matches(what, KINDS, 1)
     hint = f"; did you mean {near[0]}?" if near else ""
-    raise SessionError(f"--free {word}: found {what!r}; allowed: {ALLOWED}, or body{hint}")
+    raise SessionError(f"--free {word}: found {what!r}; allowed: {', '.join(KINDS)}, or body{hint}")
 
 
 def _sensors(rig: Rig, word: str, name: str, kind: Kind, *, every: bool) -> list[int]:

@@ -9,15 +9,7 @@ from typing import Annotated
 
 import typer
 
-from mixpose.cli.app_after import (
-    AlignRequest,
-    ConvertRequest,
-    PivotRequest,
-    SmoothRequest,
-    evaluate,
-    report,
-    schema,
-)
+from mixpose.cli import app_after
 from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
 from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
@@ -198,15 +190,15 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": taking(InspectRequest, "inspect:inspect_frame"),
     "import": taking(ImportRequest, "importing:import_files"),
     "simulate": taking(SimulateRequest, "simulate:simulate_session"),
-    "evaluate": evaluate,
-    "convert": taking(ConvertRequest, "convert:convert_poses"),
-    "schema": schema,
-    "report": report,
+    "evaluate": app_after.evaluate,
+    "convert": taking(app_after.ConvertRequest, "convert:convert_poses"),
+    "schema": app_after.schema,
+    "report": app_after.report,
     "calibrate": taking(CalibrateRequest, "calibrate:calibrate_session"),
     "design": taking(DesignRequest, "design:design_sessions"),
-    "pivot": taking(PivotRequest, "pivot:pivot_poses"),
-    "align": taking(AlignRequest, "align:align_session"),
-    "smooth": taking(SmoothRequest, "smooth:smooth_poses"),
+    "pivot": taking(app_after.PivotRequest, "pivot:pivot_poses"),
+    "align": taking(app_after.AlignRequest, "align:align_session"),
+    "smooth": taking(app_after.SmoothRequest, "smooth:smooth_poses"),
     "learn": taking(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():

@@ -86,23 +86,16 @@ def check_session(
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     report.warnings += keys.shared_source_warnings(session, replaced) + _pairing_warnings(opened)
     sizes = {name: each.size for name, each in surveys.items()}
-    given = _of_geometry(placement.with_image_sizes(session, sizes))
     doubts = geometry.geometry_doubts(session, opened, surveys)
+    given = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
+    report.lines += given.lines
     if doubts.mended is None:
-        report.lines += given.lines
-        report.warnings = (
-            keys.told_apart(report.of_counts, len(session.sensors))
-            + report.warnings
-            + given.warnings
-        )
-        report.warnings += doubts.warnings
+        counts = keys.told_apart(report.of_counts, len(session.sensors))
+        report.warnings = [*counts, *report.warnings, *given.warnings, *doubts.warnings]
         if doubts.unexplained and not (report.of_counts or doubts.warnings):
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
-        report.warnings = [*doubts.warnings, *report.warnings]
-        mended = _of_geometry(placement.with_image_sizes(doubts.mended, sizes))
-        report.lines += mended.lines
-        report.warnings += mended.warnings
+        report.warnings = [*doubts.warnings, *report.warnings, *given.warnings]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
     report.write(doubts.tried or not_tried)

@@ -11,15 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.checking import with_image_sizes
+from mixpose.cli import output
 from mixpose.cli.app_before import DesignRequest
 from mixpose.cli.notices import say
-from mixpose.cli.output import (
-    print_lines,
-    refuse_stdout,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
@@ -60,16 +54,16 @@ def design_sessions(asked: DesignRequest) -> None:
     several = asked.workers if asked.workers > 1 else None
     with nullcontext() if alone else executor(asked.scheduler, several) as workers:
         found = study(list(zip(names, sessions, strict=True)), request, told, workers)
-    print_lines([study_text(found).removesuffix("\n")], asked.json)
+    output.print_lines([study_text(found).removesuffix("\n")], asked.json)
     if asked.json is not None:
-        write_text(asked.json, json.dumps(study_json(found), indent=1) + "\n", "--json")
+        output.write_text(asked.json, json.dumps(study_json(found), indent=1) + "\n", "--json")
     if asked.plot is not None:
         from mixpose.design.plot import draw_study  # noqa: PLC0415
 
         with appearing_whole(asked.plot) as draft:
             draw_study(found, draft)
             sign_figure(draft)
-    if written := [shown(path) for path in (asked.json, asked.plot) if path is not None]:
+    if written := [output.shown(path) for path in (asked.json, asked.plot) if path is not None]:
         say(f"{len(names)} system{'s' * (len(names) != 1)} -> {', '.join(written)}")
 
 
@@ -77,8 +71,8 @@ def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
     """See that what will be written is in nothing's way, before anything is computed."""
     if asked.json is not None:
         inputs = [*sessions] if asked.poses is None else [*sessions, asked.poses]
-        refuse_to_overwrite_but(asked.json, inputs, JSON_MARK, "--json")
-    refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
+        output.refuse_to_overwrite_but(asked.json, inputs, JSON_MARK, "--json")
+    output.refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
     if asked.plot is not None:
         from mixpose.design.plot import require_plots  # noqa: PLC0415
 

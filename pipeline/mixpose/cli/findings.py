@@ -6,7 +6,7 @@ Everything is kept as sums and stretches of frames, so that a run of any length 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
@@ -152,15 +152,11 @@ class Findings:
 
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
         """How many features sensors found that found far more than there are."""
-        counts = {
-            view.name: view.observation.found
-            for view in views
-            if view.name in self._flooded and view.observation.points is not None
-        }
+        seen = {one.name: one.observation for one in views if one.name in self._flooded}
         return {
-            name: count
-            for name, count in counts.items()
-            if judge(count, self._expected) == "too many"
+            name: each.found
+            for name, each in seen.items()
+            if each.points is not None and judge(each.found, self._expected) == "too many"
         }
 
     def add(self, estimate: Estimate) -> None:
@@ -188,9 +184,8 @@ class Findings:
             usual, off = self._usual[name], one.rms
             if off is None or not one.used:
                 continue
-            if off < _AT_LEAST * self._sigmas[name] or len(usual) < _FEWEST:
-                usual.append(off)
-            elif off > _FAR * median(usual):
+            counts = off >= _AT_LEAST * self._sigmas[name] and len(usual) >= _FEWEST
+            if counts and off > _FAR * median(usual):
                 self._far[name].add(estimate.frame, self._places)
             else:
                 usual.append(off)
@@ -318,30 +313,21 @@ class Findings:
 
     def _of_markers(self) -> list[str]:
         lines = []
-        bodies = {one.body.name: one.body for one in self._session.objects}
+        bodies = {label: one.body for one in self._session.objects for label in one.labels}
         for label, markers in self._markers.items():
-            names = [each for each in bodies if label == each or label.startswith(f"{each}-")]
-            if not names:
+            if label not in bodies:
                 continue
-            name = max(names, key=len)
             of = f" of {label!r}" if len(self._session.labels) > 1 else ""
-            typical, told = self._typical(markers), dict[str, list[int]]()
+            means = {i: one.squares / one.views for i, one in markers.items() if one.views}
+            others = {i: [each for j, each in means.items() if j != i] for i in means}
+            typical = {i: float(np.median(each)) for i, each in others.items() if len(each) > 1}
+            told = dict[str, list[int]]()
             for i, marker in sorted(markers.items()):
                 for text in _about(marker, typical.get(i, np.inf), self._session.unit):
                     told.setdefault(text, []).append(i)
-            labels = bodies[name].labels
+            labels = bodies[label].labels
             lines += [_of_some(text, some, labels, of) for text, some in told.items()]
         return lines
-
-    @staticmethod
-    def _typical(markers: Mapping[int, _Marker]) -> dict[int, float]:
-        """For each marker the median of the mean squared offsets of the others."""
-        means = {i: one.squares / one.views for i, one in markers.items() if one.views}
-        return {
-            i: float(np.median([each for j, each in means.items() if j != i]))
-            for i in means
-            if len(means) > 2
-        }
 
 
 def _of_some(text: str, numbers: Sequence[int], labels: Sequence[str], of: str) -> str:

@@ -59,8 +59,7 @@ def warn_of_sources(
     for warning in shared_source_warnings(session, replaced):
         warn(warning)
     for name, source in sources.items():
-        caution = source.caution()
-        if caution:
+        if caution := source.caution():
             warn(f"sensor {name!r}: {caution}")
 
 
@@ -189,7 +188,12 @@ class Summary:
             f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
             for (name, why), count in self.left_out.items()
         ]
-        far = self._far_off(apart)
+        offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
+        far = [
+            f"by {off:.2g} px in {name!r} (median; sigma is {self.sigmas[name]:g})"
+            for name, off in offs.items()
+            if off > _FAR_OFF * self.sigmas[name]
+        ]
         if far:
             found.append(
                 f"features are met far off, {' and '.join(far)}: is the size of [object], its "
@@ -214,15 +218,6 @@ class Summary:
                     f"delay = {told:.4f} in its [[sensor]] takes it off"
                 )
         return remarks
-
-    def _far_off(self, apart: set[str]) -> list[str]:
-        """By how much, for each camera, leaving out those that took no part."""
-        offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
-        return [
-            f"by {off:.2g} px in {name!r} (median; sigma is {self.sigmas[name]:g})"
-            for name, off in offs.items()
-            if off > _FAR_OFF * self.sigmas[name]
-        ]
 
     def _split_text(self) -> str:
         frames = f"in {self.split_frames} of {self.shared} frames with a pose"

@@ -110,14 +110,12 @@ def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | 
         ConstantOffset("object", of_object, *_rms(poses @ of_object, truth).tolist()),
         ConstantOffset("world", of_world, *_rms(of_world @ poses, truth).tolist()),
     ]
-    good = [each for each in found if _explains(before, each)]
+    good = []
+    for each in found:  # one kind of error nearly vanishes, and the other grows no larger
+        after = np.array([each.rotation_deg, each.translation])
+        if (after < _LEFT * before).any() and (after < 1.1 * before).all():
+            good.append(each)
     return min(good, key=lambda each: each.translation) if good else None
-
-
-def _explains(before: Floats, found: ConstantOffset) -> bool:
-    """Whether one kind of error nearly vanishes, and the other grows no larger."""
-    after = np.array([found.rotation_deg, found.translation])
-    return bool((after < _LEFT * before).any() and (after < 1.1 * before).all())
 
 
 def _mean(motions: Floats) -> Floats:

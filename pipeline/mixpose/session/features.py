@@ -96,9 +96,7 @@ def _names(table: ObjectTable, markers: Markers | None) -> tuple[str, ...]:
         return names if all(names) and len({*names}) == len(names) == count else ()
     if table.file is not None:
         raise BadKeyError("stands beside file, which has names; allowed: one of the two", "names")
-    if len(names) != count:
-        text = f"found {len(names)} names for {count} points"
-        raise BadKeyError(f"{text}; allowed: one per point", "names")
+    _require_count(len(names), "names", count, "points", "one per point", "names")
     for i, name in enumerate(names):
         if not name or name in names[:i]:
             raise BadKeyError(found(name, "a name of its own for each point"), "names", i)
@@ -120,9 +118,7 @@ def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) 
     with under("radius"):
         given = table.radius if isinstance(table.radius, list) else [table.radius] * points
         own = numbers(given, (None,), RADIUS_ALLOWED)
-        if len(own) != points:
-            text = f"found {len(own)} radii for {points} points"
-            raise BadKeyError(f"{text}; allowed: {RADIUS_ALLOWED}")
+        _require_count(len(own), "radii", points, "points", RADIUS_ALLOWED)
         if (own <= 0).any():
             raise BadKeyError(f"found {own.min():g}; allowed: {RADIUS_ALLOWED}, greater than 0")
     return np.concatenate([own, np.zeros(count - points)])
@@ -178,10 +174,13 @@ def covariances(sigma: Any, count: int) -> Floats:
         return np.repeat(_covariance(sigma)[None], count, axis=0)
     if not isinstance(sigma, list) or not sigma:
         raise BadKeyError(found(sigma, SIGMA_ALLOWED))
-    if len(sigma) != count:
-        text = f"found {len(sigma)} items for {count} features"
-        raise BadKeyError(f"{text}; allowed: {SIGMA_ALLOWED}")
+    _require_count(len(sigma), "items", count, "features", SIGMA_ALLOWED)
     return _one_each(sigma)
+
+
+def _require_count(own: int, what: str, count: int, of: str, allowed: str, *key: str) -> None:
+    if own != count:
+        raise BadKeyError(f"found {own} {what} for {count} {of}; allowed: {allowed}", *key)
 
 
 def _is_single(sigma: Any) -> bool:
@@ -252,12 +251,8 @@ def _normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats 
         normals = markers.normals if len(markers.normals) == count else None
     if normals is None:
         return None
-    if len(normals) != count:
-        raise BadKeyError(
-            f"found {len(normals)} normals for {count} features; allowed: one per feature, points "
-            "first and then segments",
-            "normals",
-        )
+    allowed = "one per feature, points first and then segments"
+    _require_count(len(normals), "normals", count, "features", allowed, "normals")
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     for i, length in enumerate(lengths):
         if not length > 0:
