@@ -8,8 +8,8 @@ _PAIRING = (
     Mutant(
         "frames-may-go-back-in-time",
         "frames/pairing.py",
-        "frame.time_s < last_s",
-        "frame.time_s < -math.inf",
+        "time_s < last[sensor]:",
+        "time_s < -math.inf:",
         "a table of times that goes back ends in a traceback",
         ("test_frames_pairing.py",),
     ),

@@ -126,9 +126,13 @@ class _Run:
         self._unlinked = tuple(unlinked)
         free = {s: kinds for s, kinds in self._asked.free.items() if s not in unlinked}
         self._task = replace(self._asked, free=free)
-        start = self._start.state
-        body, length = self._task.body_free, _size_of(start)
-        self._blocks = blocks_of(start.rig, free, body=body, length=length, interval=self._interval)
+        rig, poses = self._start.state
+        # median distance from sensors to the body
+        centres = np.array([centre_of(s) for s in rig.sensors])
+        places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
+        away = np.linalg.norm(places[:, None] - centres[None], axis=2)
+        body, length = self._task.body_free, float(max(np.median(away), 1e-9))
+        self._blocks = blocks_of(rig, free, body=body, length=length, interval=self._interval)
 
     def _result(self) -> result.Calibration:
         """The calibration, but for its residuals."""
@@ -265,15 +269,6 @@ class _Run:
             sights=result.sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.state.poses, strict=True)),
         )
-
-
-def _size_of(state: State) -> float:
-    """Median distance from sensors to the body, or from sensor to sensor if that is more."""
-    rig, poses = state
-    centres = np.array([centre_of(s) for s in rig.sensors])
-    places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
-    away = np.linalg.norm(places[:, None] - centres[None], axis=2)
-    return float(max(np.median(away), 1e-9))
 
 
 def _determined(

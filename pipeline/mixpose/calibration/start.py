@@ -19,7 +19,7 @@ from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import joint_poses
 from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Mask
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
@@ -217,7 +217,9 @@ def _agreed(told: Sequence[_Votes], T_expected: Floats, rules: CalibrationRules)
     T = votes[best]
     for _ in range(3):
         inside, distance = _inside(T, votes, away, rules)
-        chosen = _nearest_of_each(frame, distance, inside)
+        order = np.flatnonzero(inside)
+        order = order[np.argsort(distance[order], kind="stable")]
+        chosen = order[np.unique(frame[order], return_index=True)[1]]  # the nearest of each frame
         # the mean rotation and the median shift
         R = Rotation.from_matrix(votes[chosen, :3, :3]).mean().as_matrix()
         T = from_parts(R, np.median(votes[chosen, :3, 3], axis=0))
@@ -229,14 +231,6 @@ def _inside(T: Floats, votes: Floats, away: Floats, rules: CalibrationRules) -> 
     shift = np.linalg.norm(votes[:, :3, 3] - T[:3, 3], axis=1) / away
     distance = np.maximum(turn, shift)
     return distance < 1, distance
-
-
-def _nearest_of_each(frame: Indices, distance: Floats, inside: Mask) -> Indices:
-    """Of each frame the vote that is nearest, among those inside."""
-    order = np.flatnonzero(inside)
-    order = order[np.argsort(distance[order], kind="stable")]
-    _, first = np.unique(frame[order], return_index=True)
-    return np.asarray(order[first])
 
 
 def _pair_link(task: Task, seen: _Seen, a: int, b: int, rules: CalibrationRules) -> _Link | None:

@@ -192,23 +192,19 @@ def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doub
         causes = f": {CAUSES}" if doubt == APART else ""
         return replace(doubts, warnings=(f"{where}: {doubt}{causes}",))
     if is_ok or len(shown) == len(frames):
-        found = "" if is_ok else _not_sure(where, shown)
-        return replace(doubts, unexplained=_by_some(shown[-1]) or found)
+        least = min(estimate.confidence or 0.0 for estimate in shown)
+        found = (
+            f"{where}: the body is found, but not surely (confidence {least:.3g}): so few features "
+            "may as well be met by chance, or at another pose; more markers or another sensor "
+            "would tell"
+        )
+        return replace(doubts, unexplained=_by_some(shown[-1]) or ("" if is_ok else found))
     text = (
         f"{where}: the body is not found, by the session as it is or with any one change of it: is "
         "it in view, and are its markers found (mixpose inspect), or are several things wrong at "
         "once?"
     )
     return replace(doubts, unexplained=text)
-
-
-def _not_sure(where: str, shown: Sequence[Estimate]) -> str:
-    """Of poses that are ambiguous, in words."""
-    least = min(estimate.confidence or 0.0 for estimate in shown)
-    return (
-        f"{where}: the body is found, but not surely (confidence {least:.3g}): so few features may "
-        "as well be met by chance, or at another pose; more markers or another sensor would tell"
-    )
 
 
 def _by_some(estimate: Estimate) -> str:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from mixpose.cli.lines import LineFile, note_path
 from mixpose.cli.notices import say
+from mixpose.cli.request import RunRequest
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
 from mixpose.frames import Source, pair
@@ -86,14 +87,21 @@ class Continuation:
     is_done: bool = False  # whether nothing is left to do
 
 
-def continuation(
-    poses: Path, header: Header, wanted: Selection, opened: dict[str, Source]
-) -> Continuation:
+def continuation(request: RunRequest, header: Header, opened: dict[str, Source]) -> Continuation:
     """How a run goes on in a poses file.
 
-    Raises SessionError if the file is of another run, or another run writes to it. Raises
-    RecordingError if the file holds no poses, or the recording cannot be read.
+    Raises SessionError if there is none, it is of another run, another run writes to it, or a
+    sensor is live. Raises RecordingError if it holds no poses, or the recording cannot be read.
     """
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
+                "and name another file with -o"
+            )
+    poses, wanted = request.output, request.selection
+    if poses is None or request.format != "jsonl":
+        raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
     if not poses.is_file():
         return Continuation(None, wanted)
     file = LineFile(poses, afresh=False)  # from here on nobody else writes
@@ -154,10 +162,3 @@ def _note(poses: Path, version: str) -> Note | None:
     beginning = poses.read_bytes()[: note.size]
     fits = note.mixpose == version and len(beginning) == note.size > 0
     return note if fits and zlib.crc32(beginning) == note.checksum else None
-
-
-def require_file(output: Path | None, format_name: str) -> Path:
-    """The file that ``--resume`` goes on writing."""
-    if output is None or format_name != "jsonl":
-        raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
-    return output

@@ -39,7 +39,9 @@ def design_sessions(asked: DesignRequest) -> None:
                 f"{paths[0]}, to compare them"
             )
     _require_room(asked, paths)
-    names = _names(paths)
+    # of each its own, or that of its folder
+    stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
+    names = [s if stems.count(s) == 1 else f"{s} ({k + 1})" for k, s in enumerate(stems)]
     request = Request(
         poses=_poses(sessions[0], asked),
         tip=None if asked.tip is None else _three("--tip", asked.tip),
@@ -80,12 +82,6 @@ def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
         if not asked.plot.parent.is_dir():
             raise SessionError(f"--plot {asked.plot}: there is no folder {asked.plot.parent}")
         refuse_foreign(asked.plot, "--plot")
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each session: its own, or that of its folder."""
-    stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
-    return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
 
 def _poses(session: Session, asked: DesignRequest) -> Floats:

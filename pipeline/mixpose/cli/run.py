@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
+from mixpose.cli.continuation import Continuation, Notes, continuation
 from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
 from mixpose.cli.output import pose_output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
@@ -52,9 +52,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
             refuse_to_overwrite(each, _inputs(session))
     go_on = Continuation(None, request.selection)
     if request.resume:
-        _refuse_live(opened)
-        poses = require_file(request.output, request.format)
-        go_on = continuation(poses, header, request.selection, opened)
+        go_on = continuation(request, header, opened)
     if go_on.is_done:
         say(f"nothing left to do: {request.output} has all frames asked for already")
         return
@@ -233,15 +231,6 @@ def named_sources(named: Iterable[str]) -> dict[str, str]:
         is_camera = path.isdecimal() and not Path(path).exists()
         sources[name] = f"camera:{path}" if is_camera else path
     return sources
-
-
-def _refuse_live(opened: Mapping[str, Source]) -> None:
-    for name, source in opened.items():
-        if source.kind == "live":
-            raise SessionError(
-                f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
-                "and name another file with -o"
-            )
 
 
 def _with_progress(

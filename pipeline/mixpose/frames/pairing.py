@@ -85,21 +85,17 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
                 if head is not None and head.number == number
             }
             for sensor, head in frames.items():
-                _require_later(sensor, head, last[sensor])
-                last[sensor] = last[sensor] if head.time_s is None else head.time_s
+                time_s = last[sensor] if head.time_s is None else head.time_s
+                if time_s < last[sensor]:  # velocities would be anything
+                    raise RecordingError(
+                        f"sensor {sensor!r}: frame {head.number} is at {time_s:g} s and the frame "
+                        f"before it at {last[sensor]:g} s; allowed are times that do not go back"
+                    )
+                last[sensor] = time_s
             times = (frame.time_s for frame in frames.values() if frame.time_s is not None)
             yield FrameSet(number, next(times, None), frames)
             for sensor in frames:
                 heads[sensor] = next(streams[sensor], None)
-
-
-def _require_later(sensor: str, frame: RawFrame, last_s: float) -> None:
-    """Refuse a frame that was taken before the one before it: velocities would be anything."""
-    if frame.time_s is not None and frame.time_s < last_s:
-        raise RecordingError(
-            f"sensor {sensor!r}: frame {frame.number} is at {frame.time_s:g} s and the frame "
-            f"before it at {last_s:g} s; allowed are times that do not go back"
-        )
 
 
 def _more_ahead(frame: RawFrame) -> int:

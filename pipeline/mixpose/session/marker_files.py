@@ -236,7 +236,9 @@ def read_markers(path: Path) -> Markers:
     if not len(values):
         raise BadKeyError(f"{path.name}: found no markers below the header")
     names = tuple(row[0].strip() for _, row in rows[1:])
-    return Markers(values[:, :3], _sigma_of(values[:, 3:]), names)
+    spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
+    sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
+    return Markers(values[:, :3], sigma, names)
 
 
 def _check_header(header: list[str]) -> None:
@@ -265,10 +267,3 @@ def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:
             )
         values.append(value)
     return values
-
-
-def _sigma_of(columns: Floats) -> list[Any] | None:
-    if not columns.shape[1]:
-        return None
-    shape = {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}[columns.shape[1]]
-    return list(columns.reshape(shape).tolist())

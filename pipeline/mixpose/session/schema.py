@@ -25,11 +25,6 @@ MOST_ALIKE = 1000
 """Identical bodies that a session may have."""
 
 
-def as_list(value: Any) -> Any:
-    """One table as a list of tables."""
-    return [value] if isinstance(value, dict) else value
-
-
 class GravityTable(Table):
     """Features sag, each by itself, along one direction of the world, however the body is turned.
     It counts as `sigma` does: in what a pose is worth and how far off features may be met. The
@@ -178,9 +173,9 @@ class SessionTable(Table):
     """Unit of every length in this file, in the files of markers and recordings that it names,
     and in the poses.
     Example: `unit = "mm"`"""
-    object: Annotated[list[ObjectTable], BeforeValidator(as_list)] = Field(
-        min_length=1, description="a table [object], or [[object]] for each of several"
-    )
+    object: Annotated[
+        list[ObjectTable], BeforeValidator(lambda one: [one] if isinstance(one, dict) else one)
+    ] = Field(min_length=1, description="a table [object], or [[object]] for each of several")
     """See `[object]`; of several bodies `[[object]]`, one for each."""
     start: StartTable | None = Field(None, description="a table [start]")
     """See `[start]`."""
