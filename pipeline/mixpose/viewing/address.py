@@ -15,7 +15,6 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 from mixpose.errors import SessionError
@@ -142,8 +141,6 @@ def _is_loopback(host: str) -> bool:
 
 
 def _cookie(text: str, name: str) -> str:
-    try:
-        found = SimpleCookie(text).get(name)
-    except CookieError:
-        return ""
-    return "" if found is None else found.value
+    # `http.cookies` gives up all of them where one, of another service, is not as it should be
+    pairs = (part.partition("=") for part in text.split(";"))
+    return next((value.strip() for key, _, value in pairs if key.strip() == name), "")
