@@ -267,6 +267,23 @@ def test_pages_count_as_receivers_from_when_one_is_there() -> None:
         sender.close()
 
 
+def test_who_connects_and_speaks_no_http_is_not_worth_a_word(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    pytest.importorskip("websockets")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    sender = WebSocketSender(parse(f"ws://127.0.0.1:{port}", SENDERS), HEADER)
+    try:
+        with socket.create_connection(("127.0.0.1", port)) as stranger:
+            stranger.sendall(b"GET /a b HTTP/1.1\r\n\r\n")
+            while stranger.recv(1024):
+                pass
+    finally:
+        sender.close()
+    assert not caplog.records
+
+
 def test_a_message_of_open_sound_control_counts_as_sent_and_names_its_body() -> None:
     parsing = pytest.importorskip("pythonosc.osc_message")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:

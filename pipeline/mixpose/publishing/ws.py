@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import threading
 from collections import deque
@@ -20,6 +21,8 @@ from mixpose.publishing.sockets import keep_little
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
+
+_QUIET = logging.Logger("mixpose", logging.CRITICAL)  # who connects and then does not is no news
 
 
 @dataclass(eq=False)
@@ -99,6 +102,7 @@ class WebSocketSender(Sender):
             process_request=self._refuse_other_paths,
             compression=None,  # takes longer than the way
             close_timeout=PublishingRules.farewell_s,
+            logger=_QUIET,
         ):
             await self._end.wait()
             deadline = self._loop.time() + PublishingRules.farewell_s
