@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,21 @@ def test_a_single_frame_between_lost_ones_is_a_dot_in_a_long_run(tmp_path: Path)
     _, axes = blank()
     TimeAxes(axes, series).draw(series.position[:, 0])
     assert axes.lines[-1].get_markevery() == [101]
+
+
+@pytest.mark.parametrize("step_s", [0.04, 0.0])
+def test_times_since_1970_and_equal_ones_have_ticks_that_can_be_read(
+    tmp_path: Path, step_s: float
+) -> None:
+    series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", {})))
+    figure, axes = blank()
+    times = np.array([1.7e9 + step_s * k for k in range(len(series.x))])
+    TimeAxes(axes, replace(series, x=times)).frame()
+    figure.draw_without_rendering()
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    # some twelve characters are an inch, and a figure is four inches wide
+    assert 5 < sum(map(len, labels)) < 48
+    assert axes.xaxis.get_offset_text().get_text().startswith("+1.7")
 
 
 def test_errors_are_those_of_the_right_answer(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
+    "axes.formatter.offset_threshold": 6,  # digits alike; so many fit beside each other
     "axes.formatter.limits": (-4, 5),
     "grid.color": _RULE,
     "grid.linewidth": 0.4,
@@ -97,7 +97,7 @@ class TimeAxes:
         self._breaks = series.breaks if jumps is None else series.breaks | jumps
         self._as_pixels = len(series.x) > _MANY
         gaps = np.diff(series.x)
-        self._half_step = 0.5 * float(np.median(gaps)) if gaps.size else 0.5
+        self._half_step = 0.5 * float(np.median(gaps)) if gaps.any() else 0.5
 
     def frame(self) -> None:
         """Show all frames, those without a value too."""
