@@ -75,6 +75,14 @@ def test_the_session_itself_is_not_overwritten(bumped: Path) -> None:
     assert "is an input of this run" in done.stderr
 
 
+def test_a_calibration_and_its_report_do_not_go_to_one_file(bumped: Path) -> None:
+    for place in ("both.toml", "-"):
+        words = ("-o", place, "--report", place)
+        done = command("calibrate", bumped, *words, cwd=bumped.parent)
+        assert_one_line(done, 2, f"--report {place}: -o goes there, too; name another file")
+    assert not (bumped.parent / "both.toml").exists()
+
+
 def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: Path) -> None:
     for word in ("bodi@0", "body@77", "middle"):
         done = command("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--world", word)

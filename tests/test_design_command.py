@@ -104,6 +104,7 @@ def test_an_input_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["--turn", "200"], "--turn: found 200"),
         (["--tolerance", "nan"], "--tolerance: found nan; allowed"),
         (["--tolerance", "-1"], "--tolerance: found -1"),
+        (["--plot", "a.png", "--json", "a.png"], "--plot a.png: --json goes there, too"),
         (["--plot", "a.gif"], "--plot a.gif: found '.gif'"),
         (["--plot", "none/a.png"], "--plot none/a.png: there is no folder none"),
         (["--json", "none/a.json"], "--json none/a.json: there is no folder none"),

@@ -28,7 +28,14 @@ from mixpose.calibration.words import (
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import is_stdout, print_lines, refuse_to_overwrite_but, shown, write_text
+from mixpose.cli.output import (
+    is_stdout,
+    print_lines,
+    refuse_one_for_two,
+    refuse_to_overwrite_but,
+    shown,
+    write_text,
+)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -52,8 +59,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
     output = request.output
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
-    if is_stdout(output) and is_stdout(request.report):
-        raise SessionError("--report -: found -o - too; name a file for one of them")
+    refuse_one_for_two(request.report, "--report", output, "-o")
     if output is not None:
         refuse_lost_code(session, output)
         if request.world is not None:

@@ -75,6 +75,7 @@ def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
         inputs = [*sessions] if asked.poses is None else [*sessions, asked.poses]
         output.refuse_to_overwrite_but(asked.json, inputs, JSON_MARK, "--json")
     output.refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
+    output.refuse_one_for_two(asked.plot, "--plot", asked.json, "--json")
     if asked.plot is not None:
         from mixpose.design.plot import require_plots  # noqa: PLC0415
 

@@ -220,6 +220,12 @@ def refuse_stdout(named: Path | None, option: str, what: str, instead: str) -> N
         raise SessionError(f"{option} -: {what} cannot go to standard output; name {instead}")
 
 
+def refuse_one_for_two(named: Path | None, option: str, other: Path | None, before: str) -> None:
+    """Raise a SessionError where two options name one place, as only the last would be there."""
+    if named is not None and other is not None and named.resolve() == other.resolve():
+        raise SessionError(f"{option} {named}: {before} goes there, too; name another file")
+
+
 def shown(named: Path) -> str:
     """What messages call a place that is written to."""
     return "standard output" if is_stdout(named) else str(named)
