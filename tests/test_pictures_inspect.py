@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -175,6 +176,23 @@ def test_other_peoples_files_are_not_overwritten(
     assert "sheet.png holds something that mixpose did not write" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
     assert (tmp_path / "sheet.png").read_bytes() == b"holiday"
+
+
+@pytest.mark.parametrize(("source", "place"), [("left*.png", "."), ("left", "left")])
+def test_pictures_do_not_go_among_the_frames_of_the_recording(
+    source: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / place
+    folder.mkdir(exist_ok=True)
+    for path in TWO_CAMERAS.parent.glob("*0005.png"):
+        shutil.copy(path, folder if path.name.startswith("left") else tmp_path)
+    text = TWO_CAMERAS.read_text(encoding="utf-8").replace("left*.png", source)
+    (tmp_path / "session.toml").write_text(text, encoding="utf-8")
+    assert command("inspect", tmp_path / "session.toml", "-o", folder) == 2
+    told = ".png would be taken for a frame of the sensor 'left'; name another folder"
+    assert told in capsys.readouterr().err
+    assert not list(folder.glob("*_*.png"))
+    assert command("inspect", tmp_path / "session.toml", "-o", folder / "seen") == 0
 
 
 def test_without_matplotlib_the_error_says_what_to_install(

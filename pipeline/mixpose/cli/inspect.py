@@ -85,7 +85,16 @@ def _check_folder(folder: Path, session: Session) -> None:
     if not folder.parent.is_dir():
         raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
     for name in possible_names(session):
+        path = (folder / name).resolve()
         refuse_foreign(folder / name, "-o")
+        for setup in session.sensors:
+            sources = (setup.source,) if isinstance(setup.source, str) else setup.source
+            places = [(session.folder / each).resolve() for each in sources]
+            if path.parent in places or any(path.match(str(place)) for place in places):
+                raise SessionError(
+                    f"-o {folder}: {name} would be taken for a frame of the sensor "
+                    f"{setup.name!r}; name another folder"
+                )
 
 
 def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
