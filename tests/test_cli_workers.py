@@ -213,6 +213,57 @@ def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_onc
         assert without_latency(poses) == without_latency(alone)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="nothing is locked there")
+def test_a_second_run_into_the_folder_leaves_alone_what_the_first_one_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mixpose.cli.lines.PATIENCE_S", 0.0)
+    sessions, folder = long_ranges(tmp_path, "ab"), tmp_path / "poses"
+    words = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
+    begun = folder / ".a.unfinished" / "poses.jsonl"
+    with started(words, stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: has_written(begun), by=process)
+        request = RunRequest(folder, "jsonl", (), Selection(), resume=False)
+        assert run_sessions(sessions[:1], request, workers=1) == 2
+        assert begun.exists()
+        assert not (folder / "a").exists()
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert f"-o {folder / 'a'}: another run is writing there" in summary["results"][0]["reason"]
+
+
+def test_an_unfinished_recording_stays_when_one_whose_name_begins_its_own_is_done(
+    tmp_path: Path,
+) -> None:
+    begun = tmp_path / ".range_profiles.1.unfinished" / "poses.jsonl"
+    left = tmp_path / f".range_profiles.{'0' * 32}"  # by a worker that was killed
+    for folder in (begun.parent, left):
+        folder.mkdir()
+    begun.touch()
+    request = RunRequest(tmp_path, "jsonl", (), Selection(stop=1), resume=False)
+    assert run_sessions([RANGES], request, workers=1) == 0
+    assert begun.exists()
+    assert not left.exists()
+
+
+def test_recordings_of_another_place_and_the_same_name_are_neither_taken_nor_replaced(
+    tmp_path: Path,
+) -> None:
+    days = [tmp_path / day / "ranges" / "session.toml" for day in ("monday", "tuesday")]
+    for session in days:
+        shutil.copytree(RANGES.parent, session.parent)
+    folder = tmp_path / "poses"
+    request = RunRequest(folder, "jsonl", (), Selection(stop=1), resume=False)
+    assert run_sessions(days[:1], request, workers=1) == 0
+    told = refusal(days[1], output=folder)
+    assert told.startswith(f"-o {folder}: ranges in it is of {days[0]}, not of {days[1]}")
+    (folder / "ranges").rename(folder / ".ranges.unfinished")  # as after an interrupt
+    assert f"{folder}: .ranges.unfinished in it is of {days[0]}" in refusal(days[1], output=folder)
+    (folder / ".ranges.unfinished").rename(folder / "ranges")
+    assert status_of(folder / "ranges")["session"] == str(days[0])
+    roundabout = tmp_path / "poses" / ".." / "monday" / "ranges" / "session.toml"
+    assert run_sessions([roundabout], request, workers=1) == 0
+
+
 def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None:
     assert "-o DIR: missing" in refusal(RANGES, BEAMS, output=None)
     file = tmp_path / "poses.jsonl"

@@ -127,7 +127,7 @@ def test_what_another_run_knew_is_not_believed(tmp_path: Path) -> None:
 def test_two_runs_never_write_to_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lines, "PATIENCE_S", 0.0)
     first = LineFile(tmp_path / "poses.jsonl")
-    with pytest.raises(SessionError, match="another run is writing to this file"):
+    with pytest.raises(SessionError, match="another run is writing there"):
         LineFile(tmp_path / "poses.jsonl")
     first.close()
     LineFile(tmp_path / "poses.jsonl").close()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import zlib
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mixpose.errors import SessionError
@@ -83,6 +85,23 @@ class LineFile:
         os.close(self._file)
 
 
+@contextmanager
+def held(folder: Path, called: Path) -> Iterator[None]:
+    """Keep other runs from a folder, as far as the system can; messages call it `called`.
+
+    Raises SessionError if another run holds it.
+    """
+    if sys.platform == "win32":  # which opens no folder
+        yield
+        return
+    file = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(file, called)
+        yield
+    finally:
+        os.close(file)
+
+
 def _lock(file: int, path: Path) -> None:
     """Keep other runs from a file until it is closed; the lock ends with the process."""
     try:
@@ -96,8 +115,7 @@ def _lock(file: int, path: Path) -> None:
         except BlockingIOError as error:
             if time.monotonic() > deadline:
                 raise SessionError(
-                    f"-o {path}: another run is writing to this file; wait for it, or name "
-                    "another file"
+                    f"-o {path}: another run is writing there; wait for it, or name another place"
                 ) from error
             time.sleep(0.05)
         except OSError:

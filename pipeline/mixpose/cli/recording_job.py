@@ -22,11 +22,13 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from mixpose.cli.lines import note_path
+from mixpose.cli.lines import held, note_path
 from mixpose.cli.notices import told_frames
+from mixpose.errors import SessionError
 
 STATUS = "status.json"
 LOG = "log.txt"
+UNFINISHED = "unfinished"
 DONE, FAILED, INTERRUPTED = "done", "failed", "interrupted"
 
 _INTERRUPTED_STATUS = 130
@@ -110,12 +112,19 @@ class Running:
                     process.send_signal(signal.SIGTERM)
 
 
+def told(folder: Path) -> Outcome | None:
+    """What the status file in a folder says, if there is one."""
+    try:
+        said = json.loads((folder / STATUS).read_bytes())
+        return Outcome(**{**said, "options": tuple(said["options"])})
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
 def finished(job: Job) -> Outcome | None:
     """How a job ended before, if it is done and nothing about it has changed."""
-    try:
-        said = json.loads((Path(job.folder) / job.name / STATUS).read_bytes())
-        outcome = Outcome(**{**said, "options": tuple(said["options"])})
-    except (OSError, ValueError, TypeError, KeyError):
+    outcome = told(Path(job.folder) / job.name)
+    if outcome is None:
         return None
     same = (outcome.session_sha256, outcome.options, outcome.mixpose, outcome.state)
     return outcome if same == (job.session_sha256, job.options, job.mixpose, DONE) else None
@@ -123,18 +132,18 @@ def finished(job: Job) -> Outcome | None:
 
 def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
     """Do a job, if it is not done yet; an interrupt reaches its process through `running`."""
-    before = finished(job)
-    if before is not None:
-        return before
     missing = _not_shared(job)
     if missing is not None:
         return missing
-    token = uuid.uuid4().hex if job.shared else "unfinished"
-    part = Path(job.folder) / f".{job.name}.{token}"
+    part = Path(job.folder) / f".{job.name}.{uuid.uuid4().hex if job.shared else UNFINISHED}"
     try:
-        outcome = _run_in(part, job, running or Running(), threads)
-        if outcome.state != INTERRUPTED:
-            outcome = _put_in_place(part, job, outcome)
+        part.mkdir(exist_ok=True)
+        with held(part, Path(job.folder) / job.name):
+            outcome = finished(job) or _run_in(part, job, running or Running(), threads)
+            if outcome.state != INTERRUPTED:
+                outcome = _put_in_place(part, job, outcome)
+    except SessionError as error:
+        outcome = replace(outcome_of(job, FAILED, 2), reason=str(error))
     except OSError as error:
         reason = f"{error.filename or part}: cannot be written: {error.strerror}"
         outcome = replace(outcome_of(job, FAILED, 2), reason=reason)

@@ -25,12 +25,14 @@ from mixpose.cli.recording_job import (
     DONE,
     FAILED,
     INTERRUPTED,
+    UNFINISHED,
     Job,
     Outcome,
     Running,
     finished,
     outcome_of,
     run_job,
+    told,
 )
 from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError, reporting
@@ -108,6 +110,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
             )
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)
+    _refuse_others(folder, jobs)
     outcomes = {k: outcome for k, job in enumerate(jobs) if (outcome := finished(job)) is not None}
     if outcomes:
         say(f"{len(outcomes)} of {len(jobs)} recordings are done already")
@@ -121,9 +124,9 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     finally:
         ended = [outcomes[k] for k in sorted(outcomes)]
         # what killed workers left of recordings that others did after them
-        for name in (glob.escape(one.name) for one in ended if one.state == DONE):
-            for part in folder.glob(f".{name}.*"):
-                shutil.rmtree(part, ignore_errors=True)
+        done = {f".{one.name}" for one in ended if one.state == DONE}
+        for part in [each for each in folder.glob(".*.*") if each.stem in done]:
+            shutil.rmtree(part, ignore_errors=True)
         _write_summary(folder, ended, len(jobs))
     return _say_all(folder, ended)
 
@@ -233,6 +236,18 @@ def _folder(folder: Path | None, count: int) -> Path:
     with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
     return folder
+
+
+def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
+    """Raise a SessionError where what is there under the name of a job is of another session."""
+    for job in jobs:
+        for name in (job.name, f".{job.name}.{UNFINISHED}"):
+            there = told(folder / name)
+            if there is not None and Path(there.session).resolve() != Path(job.session).resolve():
+                raise SessionError(
+                    f"-o {folder}: {name} in it is of {there.session}, not of {job.session}; name "
+                    "another folder, or remove that one"
+                )
 
 
 def _line(outcome: Outcome) -> str:
