@@ -239,6 +239,17 @@ def test_a_run_never_goes_on_in_a_file_of_another_run(tmp_path: Path) -> None:
             resume_point(path, other)
 
 
+def test_a_run_never_goes_on_in_a_file_of_a_session_alike_in_another_folder(tmp_path: Path) -> None:
+    path, monday = tmp_path / "poses.jsonl", tmp_path / "monday.toml"
+    path.write_text(written("jsonl", GOOD).replace("rig/session.toml", monday.as_posix()))
+    assert resume_point(path, HEADER) is not None  # moved since
+    monday.touch()
+    with pytest.raises(SessionError, match=r"poses of .*monday\.toml, this run is of"):
+        resume_point(path, HEADER)
+    roundabout = tmp_path / "x" / ".." / "monday.toml"
+    assert resume_point(path, replace(HEADER, session=str(roundabout))) is not None
+
+
 @pytest.mark.parametrize("content", [b"\x89PNG\r\n\x1a\n\x00", b"notes", b"unit = 1\nhalf"])
 def test_resuming_leaves_a_file_that_holds_no_poses_alone(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "poses.jsonl"

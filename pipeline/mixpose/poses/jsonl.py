@@ -246,6 +246,13 @@ def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | N
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:
     line = header_line(wanted)
+    # where it is gone, recording and poses were moved
+    named = Path(str(found.get("session", "")))
+    if named.is_file() and named.resolve() != Path(wanted.session or "").resolve():
+        raise SessionError(
+            f"--resume: {path} has poses of {named}, this run is of {wanted.session}; name another "
+            "file with -o"
+        )
     if found.get("session_sha256") != line["session_sha256"]:
         raise SessionError(
             f"--resume: the session has changed since {path} was written; leave out --resume to "
