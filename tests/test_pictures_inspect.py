@@ -322,6 +322,19 @@ def test_unsharp_spots_have_a_picture_of_the_response(recording: Path, tmp_path:
     assert (shown.max(axis=-1) < 30).mean() > 0.9
 
 
+def test_no_sigma_is_advised_where_a_told_delay_puts_features_off(
+    recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    session, pose = recording / "session.toml", pose_of_frame_6.copy()
+    pose[:3, 3] += 2.0  # as far as the body goes in the time that the camera is late
+    assert "raise sigma" in advice_for(session, 6, pose)
+    text = session.read_text(encoding="utf-8").replace("fps = 25", "fps = 25\ndelay = 0.02")
+    session.write_text(text, encoding="utf-8")
+    told = advice_for(session, 6, pose)
+    assert "raise sigma" not in told
+    assert "the sensor is late or rolling, and the pose is of the frame's own moment" in told
+
+
 def test_small_clutter_is_told_by_its_area(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:

@@ -305,6 +305,11 @@ def _about_sigma(finding: Finding) -> list[str]:
     expected = finding.expectation
     if expected is None or expected.rms is None or expected.rms < _LOOSE_RMS * finding.sigma:
         return []
+    if finding.setup.delay or finding.setup.readout:
+        return [
+            "met features are off, as the sensor is late or rolling, and the pose is of the "
+            "frame's own moment: one frame does not show how it moves; see the residuals of the run"
+        ]
     return [
         f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
         f"sigma in {finding.setup.table_of('sigma')} to about {expected.rms:.2g}, where markers "
