@@ -66,7 +66,7 @@ def test_a_calibrated_session_is_printed_and_its_changes_are_told_aside(tmp_path
     assert told.startswith("# Calibrated by mixpose")
     assert len(tomllib.loads(told)["sensor"]) == 2
     assert_one_line(
-        command(*words, "-", "--report", "-", cwd=tmp_path), 2, "--report -: found -o -"
+        command(*words, "-", "--report", "-", cwd=tmp_path), 2, "--report -: -o goes there, too"
     )
 
 
