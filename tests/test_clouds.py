@@ -225,6 +225,17 @@ def test_a_report_tells_how_far_off_a_cloud_is_in_lengths(seven: Recording, tmp_
     assert row.endswith(" mm</td></tr>")
 
 
+def test_a_cloud_that_errs_by_more_than_its_session_says_is_in_doubt_to_the_end(
+    seven: Recording, tmp_path: Path
+) -> None:
+    tight = tmp_path / "tight.toml"
+    words = seven.session.read_text().replace("cloud.csv", str(seven.session.parent / "cloud.csv"))
+    tight.write_text(words + "[sensor.extract]\nsigma = 0.15\n")  # half of what points err by
+    said = run("run", tight, "-o", tmp_path / "poses.jsonl", "--stop", "12")
+    assert "12 frames:" in said
+    assert len((tmp_path / "poses.jsonl").read_text().splitlines()) == 13
+
+
 def test_a_simulated_cloud_is_found_again(seven: Recording, tmp_path: Path) -> None:
     given = ("--frames", "12", "--clutter", "3", "--hidden", "0.1", "--range-noise", "0.2")
     run("simulate", seven.session, "-o", tmp_path / "try", *given)

@@ -276,11 +276,7 @@ def observe(
     views = []
     frames = frame_set.frames
     for setup, observation in _observations(session, session.sensors, frames, windows or {}):
-        view = _view(setup, observation, frame_set, frames[setup.name])
-        if isinstance(setup.sensor, CloudSensor):
-            views += plane_views(view.name, setup.sensor, observation, view.delay)
-        else:
-            views.append(view)
+        views += plane_views(_view(setup, observation, frame_set, frames[setup.name]))
     return views
 
 

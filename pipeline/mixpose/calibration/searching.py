@@ -44,9 +44,7 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
     view = _view(task, sensor, points, 1.0)
     # the world is put where the camera is, so that poses are relative to it
     own = view.sensor.moved(inverse(view.sensor.T_sensor_world))  # type: ignore[attr-defined]
-    views = [View(view.name, own, view.observation)]
-    if isinstance(own, CloudSensor):
-        views = plane_views(view.name, own, view.observation, 0.0)
+    views = plane_views(View(view.name, own, view.observation))
     tracker = Tracker.create(task.body, EstimatorOptions())
     ranked = tracker.explain(tracker.data(tracker.begin(), 0, None, views))
     best = ranked[0].log_evidence if ranked else 0.0

@@ -20,7 +20,7 @@ from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
-from mixpose.tracking import CHANGED, TWICE
+from mixpose.tracking import CHANGED, TWICE, plane_views
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -148,7 +148,8 @@ class Findings:
         is_lost = estimate.status == "lost"
         tells = (bool(seen) and not flooded) if is_lost else len(seen) > 1
         if estimate.status != "ok" and len(self._frames) < _KEPT and tells:
-            self._frames.append((frame_set.number, list(views)))
+            known = [one for view in views for one in plane_views(view)]
+            self._frames.append((frame_set.number, known))
 
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
         """How many features sensors found that found far more than there are."""

@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 
-from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Offsets, PointPattern, SensorReport
 from mixpose.sensors import PLANES, CloudSensor
@@ -22,18 +21,22 @@ def plane_names(name: str) -> list[str]:
     return [f"{name}/{axes}" for axes, _ in PLANES]
 
 
-def plane_views(name: str, sensor: CloudSensor, seen: Observation, delay: float) -> list[View]:
-    """The three views of a cloud that was observed."""
-    pattern = seen.pattern
+def plane_views(view: View) -> list[View]:
+    """What an objective knows of a view: three images of a cloud, of others the view itself."""
+    if not isinstance(view.sensor, CloudSensor):
+        return [view]
+    seen, pattern = view.observation, view.observation.pattern
     assert isinstance(pattern, PointPattern)
     return [
         View(
             called,
             plane,
             replace(seen, pattern=replace(pattern, points=pattern.points[:, axes])),
-            delay,
+            view.delay,
         )
-        for called, plane, (_, axes) in zip(plane_names(name), sensor.planes, PLANES, strict=True)
+        for called, plane, (_, axes) in zip(
+            plane_names(view.name), view.sensor.planes, PLANES, strict=True
+        )
     ]
 
 
