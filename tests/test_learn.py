@@ -128,6 +128,37 @@ def test_two_congruent_bodies_are_one_of_which_there_are_two() -> None:
     assert [(len(one.points), one.count) for one in lesson.bodies] == [(4, 2)]
 
 
+def test_mirror_images_are_two_bodies_though_their_triangles_are_congruent() -> None:
+    # four markers, as of a left and a right hand; any three of one lie like three of the other
+    points, poses = moving(4, 8)
+    mirrored = points * [-1, 1, 1]
+    rng = np.random.default_rng(9)
+    lesson = lesson_of([(points, poses), (mirrored, motion(SHORT, rng))])
+    assert [(len(one.points), one.count) for one in lesson.bodies] == [(4, 1), (4, 1)]
+    errors = [
+        min(np.abs(aligned_errors(one.points, each)).max() for one in lesson.bodies)
+        for each in (points, mirrored)
+    ]
+    assert max(errors) < 0.15
+
+
+def test_a_triangle_that_another_body_has_nearly_alike_is_no_copy() -> None:
+    first, (points, poses) = moving(5, 3), moving(4, 8)
+    points[:3] = first[0][:3] + np.array([[0.4, 0, 0], [0, -0.4, 0], [0, 0, 0.4]])
+    lesson = lesson_of([first, (points, poses)])
+    assert [(len(one.points), one.count) for one in lesson.bodies] == [(5, 1), (4, 1)]
+    # 0.4 mm are within the error of a frame's triangulation, and mixed up would be 0.2 mm off
+    assert np.abs(aligned_errors(lesson.bodies[0].points, first[0])).max() < 0.12
+
+
+def test_bodies_that_move_together_for_half_of_the_time_are_two() -> None:
+    first, (points, poses) = moving(6, 3), moving(4, 8)
+    half = SHORT.frames // 2
+    poses[:half] = first[1][:half] @ np.linalg.inv(first[1][half]) @ poses[half]
+    lesson = lesson_of([first, (points, poses)])
+    assert [(len(one.points), one.count) for one in lesson.bodies] == [(6, 1), (4, 1)]
+
+
 def test_a_body_that_never_moves_is_refused_with_what_is_missing() -> None:
     points, poses = moving(5, 3)
     with pytest.raises(RecordingError, match=r"9 of which never move; .*turn it by 30 degrees"):

@@ -10,7 +10,7 @@ import pytest
 from mixpose.calibration import SeenFrame
 from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.bodies import _is_chance
+from mixpose.learning.copies import is_chance
 from mixpose.learning.growing import Found, least_met
 from mixpose.learning.placing import Placement, Shape
 from mixpose.learning.points import _supported
@@ -119,15 +119,15 @@ def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> Non
     assert [least_met(points) for points in (3, 4, 5, 9)] == [3, 3, 4, 4]
 
 
-@pytest.mark.parametrize(("more", "is_chance"), [(-1, True), (0, False)])
+@pytest.mark.parametrize(("more", "expected"), [(-1, True), (0, False)])
 def test_four_points_that_no_other_size_has_are_a_body_from_twice_the_least_frames(
-    more: int, is_chance: bool
+    more: int, expected: bool
 ) -> None:
     rules, points = LearningRules(), np.vstack([np.zeros(3), 50 * np.eye(3)])
     one = Placement(np.eye(4), np.arange(4), 0.5)
     places = [(k, one) for k in range(2 * rules.least_frames + more)]
     body = Found(Shape(points, np.full(4, 0.1)), tuple(places))
-    assert _is_chance(body, [], rules) == is_chance
+    assert is_chance(body, [], rules) == expected
 
 
 def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:

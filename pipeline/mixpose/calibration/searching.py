@@ -20,7 +20,6 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import TWIST_NAMES, inverse
-from mixpose.sensors import CloudSensor
 from mixpose.tracking import Tracker, plane_views
 
 _LEAST = 4  # detections: three leave four poses of any triangle

@@ -13,15 +13,14 @@ from scipy.spatial import cKDTree
 
 from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.calibration.task import Progress, silent
-from mixpose.learning.growing import Found, averaged, grown, placed
-from mixpose.learning.placing import FEWEST, Shape, triples_of
+from mixpose.learning.copies import is_chance, left_by, with_copies
+from mixpose.learning.growing import Found, grown, placed
+from mixpose.learning.placing import FEWEST, Placement, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 
-_OF_COPY = 0.6  # of the points of a shape that another one of it must show
-_DECOYS = (0.8, 0.87, 0.93, 1.08, 1.16, 1.25)  # sizes of shapes that are not there
 _TRIED = 8  # seeds that may fail one after the other
 _OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those that show this
 
@@ -71,66 +70,31 @@ def _loose_enough(
     shape: Shape, least: float, clouds: Sequence[Cloud], rules: LearningRules
 ) -> Found | None:
     """The body of a shape, as rigid as it can be without losing points in many frames."""
-    best: Found | None = None
+    best, frames = None, 0
     for loose in rules.looser[rules.looser.index(least) :]:
         looser = [cloud.loosened(loose) for cloud in clouds]
         body = grown(shape, looser, rules)
-        if body is None or _is_chance(body, looser, rules):
+        if body is None or is_chance(body, looser, rules):
             break
-        if best is not None and len(body.places) < rules.worth * len(best.places):
+        if best is not None and len(body.places) < rules.worth * frames:
             break
-        best = replace(_with_copies(body, looser, rules), loose=loose)
+        best = replace(with_copies(body, looser, rules), loose=loose)
+        # with as few points as a looser shape is met by, where it has other bodies' among them
+        frames = len(placed(best.shape, looser, rules, best.count, FEWEST))
     return best
 
 
-def _is_chance(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> bool:
-    """Whether shapes of other sizes, which are not there, are found about as often."""
-    if len(body.shape) > FEWEST + 1:
-        return False
-    middle = body.shape.points.mean(axis=0)
-    counts = []
-    for size in _DECOYS:
-        shape = Shape(middle + size * (body.shape.points - middle), body.shape.reach)
-        counts.append(len(placed(shape, clouds, rules)))
-    expected = float(np.mean(counts))
-    # the best of very many shapes recurs more often than one of them
-    most = rules.by_chance * (expected + np.sqrt(expected))
-    return bool(len(body.places) < 2 * rules.least_frames + most)
-
-
-def _with_copies(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> Found:
-    """All bodies of a shape, where others are seen beside the first in some frames."""
-    least = max(FEWEST, int(np.ceil(_OF_COPY * len(body.shape))))
-    again = placed(body.shape, _left(clouds, body), rules, least=least)
-    if len(again) < _often(len(body.places), rules):
-        return body
-    places = placed(body.shape, clouds, rules, rules.most_bodies, least)
-    per_frame = np.bincount([k for k, _ in places], minlength=len(clouds))
-    often = _often(int((per_frame > 0).sum()), rules)
-    count = max(n for n in range(1, rules.most_bodies) if n == 1 or (per_frame >= n).sum() >= often)
-    shape = averaged(body.shape, places, clouds, rules)
-    return Found(shape, tuple(places), count)
-
-
-def _often(frames: int, rules: LearningRules) -> float:
-    """Frames in which something is seen that is no accident."""
-    return max(rules.least_frames, 2 * rules.least_share * frames)
-
-
-def _left(clouds: Sequence[Cloud], body: Found) -> list[Cloud]:
-    """Clouds without the points of a body, and without ghosts that its detections make."""
-    left = list(clouds)
-    for k, one in body.places:
-        left[k] = left[k].without(clouds[k].detections[one.there])
-    return left
-
-
 def _without(clouds: Sequence[Cloud], body: Found, rules: LearningRules) -> list[Cloud]:
-    """The same, also where too few points of the body are seen for a frame to count."""
-    left = _left(clouds, body)
+    """Clouds without a body, also where too few of its points are seen for a frame to count."""
+    left = left_by(body.places, clouds)
     looser = [cloud.loosened(body.loose) for cloud in left]
-    rest = placed(body.shape, looser, rules, body.count, FEWEST)
-    return _left(left, replace(body, places=tuple(rest)))
+    missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(clouds))
+    rest = list[tuple[int, Placement]]()
+    for k, one in placed(body.shape, looser, rules, body.count, FEWEST):
+        if missing[k] > 0:
+            rest.append((k, one))
+            missing[k] -= 1
+    return left_by(rest, left)
 
 
 def _shapes(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Shape]:
