@@ -91,6 +91,20 @@ def test_poses_that_are_wrong_are_left_out_and_a_tip_that_slips_is_told() -> Non
     assert tip.scale > 4  # by which it is told; of tips that stay it is 1 ± 0.08
 
 
+def test_a_point_that_moves_on_slowly_is_in_the_deviation_of_the_tip() -> None:
+    squared = []
+    for seed in range(20):
+        pivoting = run_of(seed)
+        poses = pivoting.poses.copy()
+        poses[:, :2, 3] += np.linspace(-1, 1, len(poses))[:, None]  # 2 mm along x and y
+        tip = find_tip(pivoting._replace(poses=poses))
+        assert tip.lasting > 1
+        error = tip.place - TIP
+        squared.append(error @ np.linalg.solve(tip.covariance, error) / 3)
+    # right is 1; by residuals alone, as if those of a hundred frames were independent, 19
+    assert np.mean(squared) < 2.5
+
+
 @pytest.mark.parametrize(("share", "left_out"), [(0.93, 0), (1.07, 1)])
 def test_a_pose_is_left_out_from_the_residual_that_rules_say(share: float, left_out: int) -> None:
     n, sigma = 100, 0.1

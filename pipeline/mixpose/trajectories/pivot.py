@@ -34,6 +34,9 @@ class PivotRules:
     steps: int = constant(20, "of weighing: weights change with the place of the tip; 4 are enough")
     foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
     parts: int = constant(5, "of the recording that are held out in turn")
+    accident: float = constant(
+        1e-3, "chance of parts that disagree as much: errors last, and more poses tell no more"
+    )
     uneven: float = constant(
         3.0, "ratio of deviations from which a direction is said to lack turns"
     )
@@ -66,6 +69,9 @@ class Tip:
     held_out: float  # and of poses that were held out
     # squared residuals by their covariances; what is above 1 is in the covariance of the tip
     scale: float
+    # variance of the tip by parts of the recording that are held out, against that by residuals;
+    # above 1 where errors last, and then in the covariance, too
+    lasting: float
     frames: int  # poses that count
     left_out: int  # those that lie too far off
     turns_deg: Floats  # (3,): root mean square turns across the three directions, least first
@@ -99,14 +105,17 @@ def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
     rest = _residuals(some, x)
     expected = _covariances(some, x)
     scale = float(squared[kept].sum() / (3 * len(rest) - 6))
+    covariance = covariance[:3, :3] * max(1.0, scale)
+    held_out, lasting = _held_out(some, x[:3], covariance, max(1.0, scale), rules)
     return Tip(
         place=x[:3],
-        covariance=covariance[:3, :3] * max(1.0, scale),
+        covariance=covariance * lasting,
         pivot=x[3:],
         residual=_rms(rest),
         expected=float(np.sqrt(np.trace(expected, axis1=1, axis2=2).mean())),
-        held_out=_held_out(some, rules),
+        held_out=held_out,
         scale=scale,
+        lasting=lasting,
         frames=int(kept.sum()),
         left_out=int((~kept).sum()),
         turns_deg=np.degrees(turns),
@@ -182,15 +191,26 @@ def _covariances(some: Pivoting, x: Floats) -> Floats:
     return np.asarray(both + least * np.eye(3))
 
 
-def _held_out(some: Pivoting, rules: PivotRules) -> float:
-    """RMS residual of parts of the recording, each by a tip that was found without it."""
-    rest = []
+def _held_out(
+    some: Pivoting, tip: Floats, covariance: Floats, scale: float, rules: PivotRules
+) -> tuple[float, float]:
+    """RMS residual of parts of the recording, each by a tip that was found without it.
+
+    And the squared distance of these tips from that of all, against what it would be if errors of
+    all frames were independent; 1 unless it is surely more.
+    """
+    rest, squared = [], 0.0
     for part in np.array_split(np.arange(len(some.poses)), rules.parts):
         others = np.ones(len(some.poses), bool)
         others[part] = False
-        x, *_ = _solved(some.part(others), some, rules)
+        x, own, _ = _solved(some.part(others), some, rules)
         rest.append(_residuals(some, x)[part])
-    return _rms(np.concatenate(rest))
+        away = x[:3] - tip
+        # of nested least squares the covariance of a difference is that of covariances
+        squared += float(away @ np.linalg.pinv(scale * own[:3, :3] - covariance) @ away)
+    freedom = 3 * (rules.parts - 1)  # all of them differ from their own mean
+    is_more = squared > chdtri(freedom, rules.accident)
+    return _rms(np.concatenate(rest)), squared / freedom if is_more else 1.0
 
 
 def _rms(rest: Floats) -> float:
