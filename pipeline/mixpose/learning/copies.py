@@ -16,7 +16,7 @@ from mixpose.learning.growing import Found, Places, averaged, placed
 from mixpose.learning.placing import FEWEST, Placement, Shape
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Indices, Mask
 
 _OF_COPY = 0.6  # of the points of a shape that another one of it must show
 _SELDOM = 0.34  # of the times that are to be expected: something keeps the points apart
@@ -31,6 +31,9 @@ def with_copies(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> F
     if len(placed(shape, left, rules, least=least)) < seen_often(len(body.places), rules):
         return _in_one_piece(body, clouds, left, rules)
     places = placed(shape, clouds, rules, rules.most_bodies, least)
+    # seldom two at a time: the one body, also where it shows fewer points
+    if np.sum(_per_frame(places, clouds) > 1) < seen_often(len({k for k, _ in places}), rules):
+        return Found(averaged(shape, places, clouds, rules), tuple(places))
     count = _count(shape, places, clouds, rules)
     strange = _is_strange(shape, places, count)
     others = _never_with(shape, places, strange)
@@ -105,14 +108,17 @@ def _count(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: Learnin
 
     In some of them all must show more than the three points that a mirror image has alike.
     """
-    full = [k for k, one in places if one.count > min(FEWEST, len(shape) - 1)]
-    per_frame = np.bincount([k for k, _ in places], minlength=len(clouds))
-    full_per_frame = np.bincount(full, minlength=len(clouds))
+    full = [(k, one) for k, one in places if one.count > min(FEWEST, len(shape) - 1)]
+    per_frame, full_per_frame = _per_frame(places, clouds), _per_frame(full, clouds)
     often = seen_often(int((per_frame > 0).sum()), rules)
     count = 1
     while (per_frame > count).sum() >= often and (full_per_frame > count).sum() >= often / 2:
         count += 1
     return count
+
+
+def _per_frame(places: Places, clouds: Sequence[Cloud]) -> Indices:
+    return np.bincount([k for k, _ in places], minlength=len(clouds))
 
 
 def _is_strange(shape: Shape, places: Places, count: int) -> Mask:
