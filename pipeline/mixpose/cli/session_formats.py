@@ -53,7 +53,7 @@ def write_markers(
     """
     output, measured = request.output, request.measured
     if format_name == "c3d":
-        _require_c3d(output)
+        _place(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
     if output is not None:
         begins, mark = MARKS[format_name]
         refuse_to_overwrite_but(output, [poses.path, session.path], mark, begins=begins)
@@ -171,14 +171,16 @@ def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
     return rate
 
 
-def _require_c3d(output: Path | None) -> None:
+def _place(output: Path | None, name: str, suffix: str, package: str, more: str = "") -> Path:
+    """Where a format goes that is no text, and takes a package."""
     if output is None:
-        raise SessionError("--format c3d: needs -o FILE.c3d, it is no text")
-    if find_spec("ezc3d") is None:
+        raise SessionError(f"--format {name}: needs -o FILE.{suffix}, it is no text")
+    if find_spec(package.removesuffix("-sdk")) is None:
         raise SessionError(
-            "--format c3d: needs the package ezc3d; install it with: "
-            "python -m pip install 'mixpose[c3d]'; .trc needs none"
+            f"--format {name}: needs the package {package}; install it with: "
+            f"python -m pip install 'mixpose[{name}]'{more}"
         )
+    return output
 
 
 def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequest) -> None:
@@ -187,14 +189,7 @@ def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequ
     Raises SessionError if the viewer's package is missing, or the session is not found or not that
     of the poses. Raises RecordingError if the recording cannot be read.
     """
-    output = request.output
-    if output is None:
-        raise SessionError("--format rerun: needs -o FILE.rrd, it is no text")
-    if find_spec("rerun") is None:
-        raise SessionError(
-            "--format rerun: needs the package rerun-sdk; install it with: "
-            "python -m pip install 'mixpose[rerun]'"
-        )
+    output = _place(request.output, "rerun", "rrd", "rerun-sdk")
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - only where it is written
 
     session = session_of(poses, request.session, allow_code=request.allow_code)

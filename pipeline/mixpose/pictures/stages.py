@@ -268,7 +268,7 @@ def panels_of(
             # as the objectives that draw samples have it: around these, and 0 elsewhere
             samples = body.sample(options.samples, seed=options.seed)
             terms = sampled_terms([view], samples, [sigma], T)
-            word, look = "g sampled", _of_samples(terms[0]) if terms else _nothing
+            word, look = "g sampled", _of_samples(terms)
         values = _largest(look, sigma, points, part, size)
         observed.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
     for sigma in judged:
@@ -278,16 +278,14 @@ def panels_of(
     return [observed, twice]
 
 
-def _of_samples(term: SampledTerm) -> Look:
-    return lambda places: term.density.sample(places)[..., 0]
+def _of_samples(terms: Sequence[SampledTerm]) -> Look:
+    if not terms:
+        return lambda places: np.zeros(places.shape[:-1])
+    return lambda places: terms[0].density.sample(places)[..., 0]
 
 
 def _of_atlas(atlas: Atlas) -> Look:
     return lambda places: atlas.look_up(places[None])[0, ..., 0]
-
-
-def _nothing(places: Floats) -> Floats:
-    return np.zeros(places.shape[:-1])
 
 
 def _largest(look: Look, sigma: float, points: Floats, part: Part, size: Size) -> Floats:

@@ -17,7 +17,7 @@ from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
 from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
-from mixpose.records import Estimate, Floats, Label, MeasuredPoint
+from mixpose.records import Estimate, Floats, Label
 
 _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
 
@@ -69,6 +69,10 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
     T = pose_of(estimate)
     covariance = estimate.covariance if T is not None else None
     turn = None if T is None else rigid.quaternion_xyzw(T)
+    points = {
+        name: {"at": plain(point.at), "residual": float(f"{point.residual:.4g}")}
+        for name, point in estimate.points.items()
+    }
     return {
         "type": "pose",
         "frame": int(estimate.frame),  # NumPy integers are no JSON
@@ -93,7 +97,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
             }
             for name, report in estimate.sensors.items()
         },
-        **({"points": _points(estimate.points)} if estimate.points else {}),
+        **({"points": points} if points else {}),
         "hypotheses": [
             {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
@@ -126,13 +130,6 @@ def _labels(labels: Mapping[str, Label]) -> dict[str, Any]:
             **({} if label.detection is None else {"detection": label.detection}),
         }
         for name, label in labels.items()
-    }
-
-
-def _points(points: Mapping[str, MeasuredPoint]) -> dict[str, Any]:
-    return {
-        name: {"at": plain(point.at), "residual": float(f"{point.residual:.4g}")}
-        for name, point in points.items()
     }
 
 
