@@ -129,7 +129,7 @@ def seen_from(*twists: Floats, noise: float) -> ScoredPose:
 
 
 # what one sees is not asked here
-SENSORS = {str(k): ParallelBeam(1.0, np.zeros(2)) for k in range(2)}
+SENSORS = {str(k): ParallelBeam(1.0, np.zeros(2)) for k in range(3)}
 
 
 def mistakes_in(pose: ScoredPose) -> dict[str, float]:
@@ -143,6 +143,15 @@ def test_sensors_that_see_the_body_at_two_poses_contradict_each_other_and_at_one
     # far beyond the 17 nats that 2 in 10,000 sessions and 1 in 1,000 frames leave
     assert apart[APART] > 20
     assert mistakes_in(seen_from(0 * away, 0 * away, noise=0.05)) == {}
+
+
+def test_a_sensor_that_stands_otherwise_harms_no_pose_that_the_others_draw() -> None:
+    away = np.array([0.4, -0.3, 0.3, 0.0, 0.0, 0.0])
+    pose = seen_from(0 * away, 0 * away, away, noise=0.05)
+    assert mistakes_in(pose)[APART] > 20
+    # of twenty times the noise it has a share of 1/800 in the pose
+    hardly = mistakes_in(replace(pose, variances=0.05**2 * np.array([1.0, 1.0, 400.0])))
+    assert hardly.get(APART, 0.0) < 1
 
 
 def test_a_single_feature_that_is_far_off_is_no_contradiction() -> None:

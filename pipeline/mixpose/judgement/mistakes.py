@@ -94,6 +94,9 @@ def possible_mistakes(
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = evidence_of(usual, *given)[0]
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
+    # the pose was drawn by each sensor as exact as that is
+    exact = np.repeat(pose.variances.min() / pose.variances, 2 * found.shares.shape[1])[:, None]
+    moves = inverted(J.T @ (exact * J)) @ (exact * J).T @ columns
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         asked = slice(None) if names[k] in (SIZE, LENS) else slice(len(usual) // 2)
