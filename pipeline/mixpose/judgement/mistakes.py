@@ -94,9 +94,9 @@ def possible_mistakes(
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = evidence_of(usual, *given)[0]
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
-    # the pose was drawn by each sensor as exact as that is
+    # each sensor draws the pose as far as it is exact, which matters where one is wrong and not all
     exact = np.repeat(pose.variances.min() / pose.variances, 2 * found.shares.shape[1])[:, None]
-    moves = inverted(J.T @ (exact * J)) @ (exact * J).T @ columns
+    moves[2:-1] = inverted(J.T @ (exact * J)) @ (exact * J).T @ columns[2:-1]
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         asked = slice(None) if names[k] in (SIZE, LENS) else slice(len(usual) // 2)
