@@ -84,16 +84,15 @@ def _check_folder(folder: Path, session: Session) -> None:
         raise SessionError(f"-o {folder}: is a file; name a folder for the pictures")
     if not folder.parent.is_dir():
         raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
+    places = [(s.name, (session.folder / e).resolve()) for s in session.sensors for e in s.sources]
     for name in possible_names(session):
         path = (folder / name).resolve()
         refuse_foreign(folder / name, "-o")
-        for setup in session.sensors:
-            sources = (setup.source,) if isinstance(setup.source, str) else setup.source
-            places = [(session.folder / each).resolve() for each in sources]
-            if path.parent in places or any(path.match(str(place)) for place in places):
+        for sensor, place in places:
+            if path.parent == place or path.match(str(place)):
                 raise SessionError(
-                    f"-o {folder}: {name} would be taken for a frame of the sensor "
-                    f"{setup.name!r}; name another folder"
+                    f"-o {folder}: {name} would be taken for a frame of the sensor {sensor!r}; "
+                    "name another folder"
                 )
 
 

@@ -39,11 +39,8 @@ def learn_session(request: LearnRequest) -> None:
             f"-o -: found {len(bodies)} bodies, each of which gets a table of its own; name a "
             "file, as -o body.csv"
         )
-    first = request.output
-    others = [
-        first.with_name(f"{first.stem}-{k + 2}{first.suffix}") for k in range(len(bodies) - 1)
-    ]
-    files = [first, *others]
+    first, more = request.output, range(2, len(bodies) + 1)
+    files = [first, *(first.with_name(f"{first.stem}-{k}{first.suffix}") for k in more)]
     for file, body in zip(files, bodies, strict=True):
         refuse_to_overwrite_but(file, inputs, MARK)
         write_text(file, table_text(body), "-o")

@@ -191,8 +191,7 @@ def _inputs(session: Session) -> Iterator[Path]:
     """Files that a run reads."""
     yield session.path
     for setup in session.sensors:
-        names = (setup.source,) if isinstance(setup.source, str) else setup.source
-        for name in names:
+        for name in setup.sources:
             yield session.folder / name
             if isinstance(setup.source, str) and "://" not in name:
                 # as its frames are found: Path.glob takes other patterns

@@ -352,10 +352,11 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
         part.whole = part.whole or [_hull_blob(contour)]
     if scene.judged:
         apart = come_apart(scene, contour, patch, inside, level, rules.spots)
+        has_core = peak >= rules.core_ratio * typical
         # what is brighter than half of a core is not what it lights
-        lit = rules.core_ratio / 2 * typical if peak >= rules.core_ratio * typical else 0.0
-        higher = max(rules.level_ratio * level, lit)
-        clear = stands_out and peak < rules.core_ratio * typical
+        half = rules.core_ratio / 2 * typical if has_core else 0.0
+        higher = max(rules.level_ratio * level, half)
+        clear = stands_out and not has_core
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]
         part.inner = [

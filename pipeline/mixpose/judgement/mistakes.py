@@ -96,7 +96,8 @@ def possible_mistakes(
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
     # each sensor draws the pose as far as it is exact, which matters where one is wrong and not all
     exact = np.repeat(pose.variances.min() / pose.variances, 2 * found.shares.shape[1])[:, None]
-    moves[2:-1] = inverted(J.T @ (exact * J)) @ (exact * J).T @ columns[2:-1]
+    pulls = (exact * J).T
+    moves[2:-1] = inverted(pulls @ J) @ pulls @ columns[2:-1]
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         asked = slice(None) if names[k] in (SIZE, LENS) else slice(len(usual) // 2)

@@ -69,6 +69,11 @@ class SensorSetup:
     calibration_error: CalibrationError | None = None
     own: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets, whatever ``[extract]``
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Its source as a list, as the file may have it."""
+        return (self.source,) if isinstance(self.source, str) else self.source
+
     def table_of(self, key: str) -> str:
         """The table of the session file in which a key of extraction takes effect, in words."""
         return "its own [sensor.extract]" if key in self.own else "[extract]"
