@@ -2,12 +2,13 @@
 
 Points where rays of several cameras meet are those of all bodies.  Triangles of them that are no
 larger than a body are its features', as `from_point_triples` has it; and what is found goes to the
-set of poses of which no two have the same detections, the more evident having what both meet.
+set of poses of which no two have the same detections, the likelier having what both meet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ class _Candidates(NamedTuple):
 
     poses: Floats  # (K, 4, 4)
     evidence: Floats  # (K,) log odds against clutter, if they had not been chosen to fit
+    gains: Floats  # (K,) nats that what is known before the frame adds to them
     numbers: Indices  # (K, L N) detections of all cameras that they meet; -1 for none
 
 
@@ -59,10 +61,12 @@ def search_copies(
     free: Mask,
     rules: JudgementRules = JudgementRules(),
     budget: SearchBudget = THOROUGH,
+    known: Callable[[int, Floats], Floats] = lambda kind, poses: np.zeros(len(poses)),
 ) -> list[Copy]:
     """Find poses of bodies, any number of each, that explain a frame together; most evident first.
 
-    By detections of two cameras or more that meet in space; there are none without.
+    By detections of two cameras or more that meet in space; there are none without.  What is
+    `known` of a kind's poses (K, 4, 4) before the frame are nats (K,) that they gain.
     """
     detections = sensor_detections(views, bodies[0])
     problems = [SearchProblem(detections, body, free, np.eye(4), rules, budget) for body in bodies]
@@ -82,16 +86,24 @@ def search_copies(
         of_triples(problem, points, own, triples)
         for problem, own in zip(problems, triangles, strict=True)
     ]
-    found = [_candidates(*case, images) for case in zip(problems, poses, strict=True)]
+    found = [
+        _candidates(problem, some, images, partial(known, kind))
+        for kind, (problem, some) in enumerate(zip(problems, poses, strict=True))
+    ]
     return _shared_out(found, bodies, budget)
 
 
-def _candidates(problem: SearchProblem, poses: Floats, images: Sequence[LabelImage]) -> _Candidates:
+def _candidates(
+    problem: SearchProblem,
+    poses: Floats,
+    images: Sequence[LabelImage],
+    known: Callable[[Floats], Floats],
+) -> _Candidates:
     """Of poses (K, 4, 4) of one body those that may be, and what they meet."""
     body, budget = problem.body, problem.budget
     poses = poses[unlike(body, poses, budget.alike)]
     if not len(poses):
-        return _Candidates(poses, np.zeros(0), np.zeros((0, 1), dtype=np.intp))
+        return _Candidates(poses, np.zeros(0), np.zeros(0), np.zeros((0, 1), dtype=np.intp))
     counts, near = count_inliers(images, body, poses)
     ranks = counts.sum(axis=0) + 0.1 * near
     poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]
@@ -102,7 +114,8 @@ def _candidates(problem: SearchProblem, poses: Floats, images: Sequence[LabelIma
     odds = odds_at(problem, matches)
     # against each other they are as free to fit
     possible = paid_by_count(odds, matches, problem.free) > budget.hopeless
-    return _Candidates(poses[possible], (odds[0] + odds[1])[possible], numbers[possible])
+    poses, evidence = poses[possible], (odds[0] + odds[1])[possible]
+    return _Candidates(poses, evidence, known(poses), numbers[possible])
 
 
 def _near_triples(points: TriangulatedPoints, longest: float, most: int) -> Indices:
@@ -132,13 +145,14 @@ def _are_alike(body: Body, a: Floats, b: Floats, budget: SearchBudget) -> bool:
 def _shared_out(
     found: Sequence[_Candidates], bodies: Sequence[Body], budget: SearchBudget
 ) -> list[Copy]:
-    """The poses of which no two have the same detections, the most evident first."""
+    """The poses of which no two have the same detections, the likeliest first."""
     kinds = np.repeat(np.arange(len(found)), [len(one.poses) for one in found]).tolist()
     poses = np.concatenate([one.poses for one in found])
     evidence = np.concatenate([one.evidence for one in found])
+    likely = evidence + np.concatenate([one.gains for one in found])
     rows = [row[row >= 0].tolist() for one in found for row in one.numbers]
     owners, rivals = dict[int, int](), dict[int, int]()
-    order = np.argsort(-evidence, kind="stable")
+    order = np.argsort(-likely, kind="stable")
     kept = list[int]()
     for k in order.tolist():
         others = [owners[number] for number in rows[k] if number in owners]
@@ -147,7 +161,7 @@ def _shared_out(
             owners = dict.fromkeys(rows[k], k) | owners
             continue
         for j in set(others) - set(rivals):
-            is_near = kinds[j] == kinds[k] and evidence[k] > evidence[j] - budget.outdone
+            is_near = kinds[j] == kinds[k] and likely[k] > likely[j] - budget.outdone
             if is_near and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
                 rivals[j] = k
     return [

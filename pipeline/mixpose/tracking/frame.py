@@ -190,6 +190,18 @@ class Frame(Setup):
             near.append(one.log_density(there, self.free, self.rules.motion))
         return np.asarray(np.max(near, axis=0))
 
+    def gains(self, poses: Floats) -> Floats:
+        """How much likelier (K,) its own track makes poses (K, 4, 4), or that it is elsewhere.
+
+        One that may be another body's tells nothing of which of the two is there.
+        """
+        doubt = max(self.track.alike.values(), default=-math.inf)
+        if not self.predictions or doubt > self.rules.acceptance.log_doubt:
+            return np.zeros(len(poses))
+        surprise = min(self.rules.motion.surprise * (1 + self.track.misses), 1.0)
+        near = np.log(max(1 - surprise, 1e-12)) + self.nearness([*poses]) - self.anywhere[0]
+        return np.asarray(np.logaddexp(math.log(surprise), near))
+
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""
         return self.seen_otherwise(

@@ -13,7 +13,7 @@ Images are looked at where tracks expect the bodies: a frame is sure of them the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
@@ -78,15 +78,19 @@ class Scene:
         sure, after, estimates = [k for k in told if told[k].status == "ok"], [], []
         for k, tracked in enumerate(self.bodies):
             data, verdict = found[k].frame, found[finders[k]].verdict
-            if told[k].status == "ok" and verdict.best:
+            alike: Mapping[str, float] = data.track.alike
+            if verdict.best and verdict.best.log_evidence > 0:
                 # another body that is not surely elsewhere, or its own markers where they repeat
                 # themselves: then it may be turned another way
                 away = [
                     j for j in found if j not in sure and self.bodies[j].body is not tracked.body
                 ]
                 others = [found[j].frame for j in (k, *away)]
-                verdict = told[k] = verdict.doubted(look_alikes_of(data, verdict.best, others))
-            after.append(replace(followed(data, verdict), distances=apart.get(k)))
+                against = _since(alike, look_alikes_of(data, verdict.best, others))
+                against.sort(key=lambda one: one.log_odds)
+                alike = {one.what: one.log_odds for one in against}
+                verdict, told[k] = verdict.doubted(against), told[k].doubted(against)
+            after.append(replace(followed(data, verdict), distances=apart.get(k), alike=alike))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, estimates), estimates
 
@@ -111,6 +115,16 @@ def _places(found: Sequence[Explanation]) -> Floats:
     """Where bodies are (n, 3); NaN of those without a pose."""
     bests = [one.verdict.best for one in found]
     return np.array([np.full(3, np.nan) if T is None else T.T_world_object[:3, 3] for T in bests])
+
+
+def _since(before: Mapping[str, float], now: Iterable[Alternative]) -> list[Alternative]:
+    """What else a body may be, at least by the odds `before`: what is followed stays what it is.
+
+    Where it goes tells as little of that as features that are hidden for one more frame.
+    """
+    return [
+        one._replace(log_odds=max(one.log_odds, before.get(one.what, -math.inf))) for one in now
+    ]
 
 
 def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:

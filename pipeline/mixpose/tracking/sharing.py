@@ -105,12 +105,18 @@ class Sharing:
             return {}
         seen, rules = [view for view in views if not view.observation.is_empty], kinds[0].rules
         bodies, self.looked = [one.body for one in kinds], len(seen) > 1
-        copies = search_copies(seen, bodies, kinds[0].free, rules.judgement, rules.search)
+        groups = [[k for k in waiting if self.bodies[k].body is body] for body in bodies]
+        data = {k: self._frame(k, self._nobody.left(k)) for k in waiting}
+
+        def known(kind: int, poses: Floats) -> Floats:
+            """What the likeliest of identical bodies lets expect."""
+            return np.asarray(np.max([data[k].gains(poses) for k in groups[kind]], axis=0))
+
+        copies = search_copies(seen, bodies, kinds[0].free, rules.judgement, rules.search, known)
         found = dict[int, Starts]()
-        for number, body in enumerate(bodies):
+        for number, group in enumerate(groups):
             some = [one for one in copies if one.kind == number]
-            group = [k for k in waiting if self.bodies[k].body is body]
-            frames = [self._frame(k, self._nobody.left(k)) for k in group]
+            frames = [data[k] for k in group]
             evidence = np.array([one.evidence for one in some])
             there = [one.T_world_object for one in some]
             likely = np.array([evidence + one.nearness(there) for one in frames])

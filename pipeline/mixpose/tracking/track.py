@@ -142,6 +142,8 @@ class Track:
     twice: float = -math.inf  # log odds that a second body is there, of those beside `branches[0]`
     # log odds of mistakes in the session, by name; of the others nothing is known
     mistaken: Mapping[str, float] = field(default_factory=dict)
+    # log odds that what is followed is another body, or turned, by the reasons for it
+    alike: Mapping[str, float] = field(default_factory=dict)
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
     distances: Distances | None = None  # between identical bodies, of which this is the first
