@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
 
+import numpy as np
 import pytest
 from bodies_in_view import TOOL, at, body, off, scene_of, views_of
 
@@ -50,3 +53,49 @@ def test_a_body_that_may_be_a_part_of_another_is_in_doubt_for_as_long_as_nothing
         "ok",
         "lost",
     ]
+
+
+def test_two_bodies_of_which_only_what_they_share_is_seen_may_have_changed_places() -> None:
+    one = body("one", np.vstack([TOOL[:4], [[70.0, 60.0, 50.0]]]))
+    other = body("other", np.vstack([TOOL[:4], [[-60.0, -40.0, 50.0]]]))
+    scene, places = scene_of(one, other), [at(-80, 10), at(90, -20, 30, 1.1)]
+    tracks, found = scene.begin(), []
+    for frame, seen in enumerate([[PART] * 2] * 2 + [[one, other]] * 5 + [[PART] * 2]):
+        views = views_of(seen, places, frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        found.append(estimates)
+    for estimates in found[:2]:
+        assert [estimate.status for estimate in estimates] == ["ambiguous"] * 2
+        # clutter is as dense for either
+        assert [estimate.confidence for estimate in estimates] == pytest.approx([0.5, 0.5], abs=0.1)
+    # seen whole, each is where it is, and stays there
+    for estimates in found[2:]:
+        assert [estimate.status for estimate in estimates] == ["ok"] * 2
+        for estimate, T in zip(estimates, places, strict=True):
+            assert off(estimate, T)[0] < 2.0
+
+
+def test_a_body_goes_on_from_a_pose_that_an_identical_one_found_by_other_sensors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one = body("rod", TOOL)
+    scene = scene_of(one, one)
+    tracks, estimates = scene.begin(), list[Estimate]()
+    for frame in range(7):
+        there = at(-140 + 5 * frame, 10), at(150 - 4 * frame, turn=1.0)
+        # the second is hidden from the right camera in the last frame, and nothing else is there
+        most = 2 - frame // 6
+        seen = [views_of([one] * n, there[:n], frame) for n in (2, most)]
+        views = [
+            replace(
+                view,
+                observation=view.observation.only(np.abs(view.observation.points[:, 0] - 30) > 2),
+            )
+            for view in (seen[0][0], seen[1][1])
+        ]
+        if frame == 6:
+            scenes = import_module("mixpose.tracking.scene")
+            monkeypatch.setattr(scenes, "identify", lambda *_: ({0: 1, 1: 0}, {}))
+        tracks, estimates = scene.advance(tracks, frame, frame / 50, views)
+    x = [estimate.T_world_object[0, 3] for estimate in estimates]  # type: ignore[index]
+    assert x == pytest.approx([126, -110], abs=5)

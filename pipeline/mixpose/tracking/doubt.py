@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mixpose.body import like_features, mirror_image, thickness, tolerance_of
+from mixpose.body import mirror_image, thickness
 from mixpose.judgement import (
     APART,
     Alternative,
@@ -33,7 +33,7 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
+from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat
 
 FEW = "few markers are met, which other things may have alike"
@@ -192,23 +192,6 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
     rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
     found = (_evidence(mirror, start) - own for start in starts_at(mirror, rivals))
     return next((odds for odds in found if odds > likely), near if asked else -math.inf)
-
-
-def look_alikes_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> Iterator[Alternative]:
-    """Parts of other bodies, or of its own, that all that a pose meets might be as well.
-
-    `others` are the frames of the bodies in question.
-    """
-    met = met_features(best)
-    for other in others:
-        rules = other.rules
-        tolerance = tolerance_of(data.body, other.body, rules.look_alikes.alike)
-        seen = other.seen_otherwise(views=data.views, still=data.still)
-        for part in like_features(data.body, met, other.body, tolerance):
-            if len(part.features) == len(met):
-                T = best.T_world_object @ part.T_body_other
-                start = other.rival(best, T, other.close, left_out=best.left_out)
-                yield Alternative(part.reason, _evidence(seen, start) - best.log_evidence)
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:

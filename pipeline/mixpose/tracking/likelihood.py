@@ -100,6 +100,19 @@ class MatchedLikelihood:
             judged = replace(judged, by_count=0.0)
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
 
+    def density(self, fit: Fit, start: Start, beside: Matches) -> float:
+        """Log density of a pose, of clutter that is as dense as around what another one meets.
+
+        To bodies of other sizes clutter beside the same detections seems to be as dense as they
+        are large.
+        """
+        frame, _ = _as_moving(self.frame, fit)
+        T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+        seen = replace(matches_at(frame, T), crowd=beside.crowd, others=beside.others)
+        case = frame.finest, T, frame.track.residuals, frame.prior(T), seen, None
+        (judged,) = judge_together([case], frame.free, frame.rules.judgement, start.left_out)
+        return judged.log_density
+
 
 def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
     """The frame as of the common time, and how the body moves, where sensors see moments."""
@@ -295,6 +308,10 @@ class AssociationLikelihood:
             noise=before.followed(RANGES, noise, before.moments, before.biases, before.fields),
             spread=np.sqrt(np.diag(covariance)),
         )
+
+    def density(self, fit: Fit, start: Start, beside: Matches) -> float:
+        """As of `MatchedLikelihood`; clutter is as dense for all bodies already."""
+        return self.judge(fit, start).log_density
 
     def _posterior(self, start: Start, noise: float) -> Sum:
         """Likelihood and prior, of ranges that err by so much in σ_ε."""

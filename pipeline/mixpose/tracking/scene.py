@@ -13,7 +13,7 @@ Images are looked at where tracks expect the bodies: a frame is sure of them the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
@@ -28,7 +28,8 @@ from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
 from mixpose.sensors import Sensor
-from mixpose.tracking.doubt import look_alikes_of
+from mixpose.tracking.confusion import since, taken_for
+from mixpose.tracking.frame import Frame
 from mixpose.tracking.identity import Rivals, identify
 from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
@@ -75,22 +76,17 @@ class Scene:
             places = _places([found[given[k]] for k in group])
             apart[group[0]] = before.after(places, motion)
         told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
-        sure, after, estimates = [k for k in told if told[k].status == "ok"], [], []
+        frames = {k: _seen_by(one.frame, found[finders[k]].frame) for k, one in found.items()}
+        alike = taken_for(frames, told)
+        after, estimates = list[Track](), list[Estimate]()
         for k, tracked in enumerate(self.bodies):
-            data, verdict = found[k].frame, found[finders[k]].verdict
-            alike: Mapping[str, float] = data.track.alike
-            if verdict.best and verdict.best.log_evidence > 0:
-                # another body that is not surely elsewhere, or its own markers where they repeat
-                # themselves: then it may be turned another way
-                away = [
-                    j for j in found if j not in sure and self.bodies[j].body is not tracked.body
-                ]
-                others = [found[j].frame for j in (k, *away)]
-                against = _since(alike, look_alikes_of(data, verdict.best, others))
-                against.sort(key=lambda one: one.log_odds)
-                alike = {one.what: one.log_odds for one in against}
+            data, verdict = frames[k], found[finders[k]].verdict
+            odds = data.track.alike
+            if k in alike:
+                against = since(odds, alike[k])
+                odds = {one.what: one.log_odds for one in against}
                 verdict, told[k] = verdict.doubted(against), told[k].doubted(against)
-            after.append(replace(followed(data, verdict), distances=apart.get(k), alike=alike))
+            after.append(replace(followed(data, verdict), distances=apart.get(k), alike=odds))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, estimates), estimates
 
@@ -117,14 +113,11 @@ def _places(found: Sequence[Explanation]) -> Floats:
     return np.array([np.full(3, np.nan) if T is None else T.T_world_object[:3, 3] for T in bests])
 
 
-def _since(before: Mapping[str, float], now: Iterable[Alternative]) -> list[Alternative]:
-    """What else a body may be, at least by the odds `before`: what is followed stays what it is.
-
-    Where it goes tells as little of that as features that are hidden for one more frame.
-    """
-    return [
-        one._replace(log_odds=max(one.log_odds, before.get(one.what, -math.inf))) for one in now
-    ]
+def _seen_by(data: Frame, finder: Frame) -> Frame:
+    """The frame of a body, with what is left for an identical one that found its pose."""
+    if data is finder:
+        return data
+    return data.seen_otherwise(views=finder.views, still=finder.still)
 
 
 def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
