@@ -102,3 +102,20 @@ def test_bodies_that_move_together_farther_than_they_are_apart_keep_their_number
         numbers.append([int(np.argmin([off(one, T)[0] for T in poses])) for one in found])
         assert all(off(one, poses[k])[0] < 2.0 for one, k in zip(found, numbers[-1], strict=True))
     assert numbers == [[0, 1, 2]] * 8
+
+
+def test_a_body_that_comes_as_an_identical_one_goes_has_a_number_of_its_own() -> None:
+    tool = body("tool", TOOL)
+    scene = scene_of(*[tool] * 5)
+    tracks, carried = scene.begin(), dict[int, int]()
+    # a belt, 200 apart, on which one leaves the view on the right as another enters on the left
+    for frame in range(12):
+        row = {k: at(300 - 200 * k + 20 * frame) for k in range(5)}
+        row = {k: T for k, T in row.items() if -310 < T[0, 3] < 310}
+        views = views_of([tool] * len(row), [*row.values()], frame)
+        tracks, found = scene.advance(tracks, frame, None, views)
+        told = {one.instance: one for one in found if one.status == "ok"}
+        now = {i: k for i, one in told.items() for k, T in row.items() if off(one, T)[0] < 2.0}
+        assert len(now) == len(told) >= len(row) - 1
+        assert all(carried.get(i, k) == k for i, k in now.items() if i is not None)
+        carried |= {i: k for i, k in now.items() if i is not None}

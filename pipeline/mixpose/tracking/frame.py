@@ -178,29 +178,27 @@ class Frame(Setup):
         own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
         return Start(T_world_object, wide, least=float(own) - self.rules.look_alikes.behind, **rest)
 
-    def nearness(self, poses: Sequence[Floats]) -> Floats:
-        """Log densities (K,) of poses (4, 4) where the body moved on; 0 where nothing is known.
-
-        Nothing tells identical bodies apart but that, however unlikely the motion.
-        """
-        near = [np.zeros(len(poses))] if not self.predictions else []
+    def expectation(self, poses: Sequence[Floats]) -> Floats:
+        """Log densities (K,) of poses (4, 4) by the body's own track, or that it is elsewhere."""
+        logs = np.full(len(poses), self.anywhere[0])
+        surprise = min(self.rules.motion.surprise * (1 + self.track.misses), 1.0)
+        logs += math.log(surprise) if self.predictions else 0.0
         for one in self.predictions:
             alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
             there = np.reshape(alike, (-1, 4, 4))
-            near.append(one.log_density(there, self.free, self.rules.motion))
-        return np.asarray(np.max(near, axis=0))
+            near = one.log_density(there, self.free, self.rules.motion)
+            logs = np.logaddexp(logs, math.log(max(1 - surprise, 1e-12)) + near)
+        return logs
 
     def gains(self, poses: Floats) -> Floats:
-        """How much likelier (K,) its own track makes poses (K, 4, 4), or that it is elsewhere.
+        """How much likelier (K,) its own track makes poses (K, 4, 4) than any other.
 
         One that may be another body's tells nothing of which of the two is there.
         """
         doubt = max(self.track.alike.values(), default=-math.inf)
-        if not self.predictions or doubt > self.rules.acceptance.log_doubt:
+        if doubt > self.rules.acceptance.log_doubt:
             return np.zeros(len(poses))
-        surprise = min(self.rules.motion.surprise * (1 + self.track.misses), 1.0)
-        near = np.log(max(1 - surprise, 1e-12)) + self.nearness([*poses]) - self.anywhere[0]
-        return np.asarray(np.logaddexp(math.log(surprise), near))
+        return self.expectation([*poses]) - self.anywhere[0]
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

@@ -8,8 +8,10 @@ are given to bodies by the assignment a of the largest
 
 of Student's t, as velocities and changes of distance are of few frames.  Bodies that were not seen
 for m frames have distances that may have changed by m + 1 times as much, and pairs never seen
-together any up to where bodies may be.  It is found from that of the first sum by exchanges of two;
-what one more exchange leaves of the odds is how far two bodies are in doubt.
+together any up to where bodies may be.  Bodies that nobody saw yet may be anywhere, and seldom are
+in view; others are elsewhere than expected as seldom.  The assignment is found from that of the
+first sum by exchanges of two; what one more exchange leaves of the odds is how far two bodies are
+in doubt.
 """
 
 from __future__ import annotations
@@ -89,38 +91,38 @@ def identify(
     """
     bests = {k: best for k in group if (best := found[k].verdict.best) is not None}
     finders = sorted(bests, key=lambda k: tuple(np.round(bests[k].T_world_object[:3, 3], 6)))
-    poses, known = [bests[k] for k in finders], [k for k in group if found[k].frame.predictions]
-    data = [found[k].frame for k in known]
+    poses, data = [bests[k] for k in finders], [found[k].frame for k in group]
     # by body (rows) and pose; in the last column none, as it is of one in view now and then
-    rules, rows = found[group[0]].frame.rules, list[list[float]]()
+    rules, rows = data[0].rules, list[list[float]]()
     there = [pose.T_world_object for pose in poses]
     for one in data:
         hidden = 0.5 if one.track.misses else rules.motion.hidden
-        logs = math.log1p(-hidden) + one.nearness(there)
-        rows.append([*logs.tolist(), math.log(hidden)])
+        # one that nobody saw yet is as seldom in view as one that was is somewhere else
+        hidden = hidden if one.predictions else 1 - rules.motion.surprise
+        rows.append([*(math.log1p(-hidden) + one.expectation(there)).tolist(), math.log(hidden)])
     places = np.array([*(pose.T_world_object[:3, 3] for pose in poses), np.full(3, np.nan)])
-    chosen = [group.index(k) for k in known]
     assignment = Assignment(
-        np.reshape(rows, (len(known), len(poses) + 1)),
-        before.of(chosen),
+        np.array(rows),
+        before,
         np.linalg.norm(places[:, None] - places, axis=2),
         rules.motion.known_from,
         rules.judgement.detection.room * found[group[0]].frame.body.radius,
     )
-    given = assignment.best()
-    pose_of = {k: j for k, j in zip(known, given.tolist()) if j < len(poses)}
-    spare = [j for j in range(len(poses)) if j not in pose_of.values()]
-    pose_of |= dict(zip([k for k in group if k not in known], spare, strict=False))
+    given, is_new = assignment.best(), np.array([not one.predictions for one in data])
+    # those that nobody saw yet in the order of their poses
+    given[is_new] = np.sort(given[is_new])
+    pose_of = {k: j for k, j in zip(group, given.tolist()) if j < len(poses)}
     without = iter([k for k in group if k not in bests])
     assigned = {k: finders[pose_of[k]] if k in pose_of else next(without) for k in group}
     odds = assignment.exchanged(given)
     # no velocity is believed any more: they may have changed places, wherever they were before
-    lost = np.array([one.track.misses > one.rules.motion.coasting for one in data], np.bool_)
+    lost = ~is_new & [one.track.misses > one.rules.motion.coasting for one in data]
     odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
+    odds[is_new & is_new[:, None]] = -np.inf
     rivals, limit = dict[int, Rivals](), rules.acceptance.log_doubt
     for i, j in zip(*np.nonzero(odds > limit), strict=True):
-        if i != j and known[i] in pose_of:
-            other = pose_of.get(known[j], pose_of[known[i]])
+        if i != j and group[i] in pose_of:
+            other = pose_of.get(group[j], pose_of[group[i]])
             share = float(np.exp(min(odds[i, j], 0.0)))
-            rivals.setdefault(known[i], []).append((poses[other], share))
+            rivals.setdefault(group[i], []).append((poses[other], share))
     return assigned, rivals

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
@@ -133,10 +132,6 @@ class Distances(NamedTuple):
             np.where(is_change, rules.recall * self.numbers + 1, self.numbers),
             np.where(is_seen, 0.0, self.missed + 1),
         )
-
-    def of(self, chosen: Sequence[int]) -> Distances:
-        """Those of some of the bodies."""
-        return Distances(*[one[np.ix_(chosen, chosen)] for one in self])
 
 
 class Expected(NamedTuple):

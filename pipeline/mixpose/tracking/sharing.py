@@ -119,7 +119,7 @@ class Sharing:
             frames = [data[k] for k in group]
             evidence = np.array([one.evidence for one in some])
             there = [one.T_world_object for one in some]
-            likely = np.array([evidence + one.nearness(there) for one in frames])
+            likely = np.array([evidence + one.expectation(there) for one in frames])
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 poses = some[j].T_world_object, some[j].rival
                 found[group[i]] = tuple([Start(T, frames[i].close) for T in poses if T is not None])
