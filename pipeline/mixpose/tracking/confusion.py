@@ -2,7 +2,8 @@
 
 Of two bodies that meet the same detections only what each misses, and what was known before, tells
 which of the two it is: clutter is as dense for either.  What is followed stays what it is, so that
-frames in which nothing new is seen tell nothing more.
+where it goes tells nothing more.  Features that are hidden in one frame are in the next, so that of
+all frames the one counts that tells most, and not their product.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, permutations
+from typing import NamedTuple
 
 from mixpose.body import like_features, tolerance_of
 from mixpose.fit import Fit
@@ -19,7 +21,51 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import met_features
 
 
-def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Alternative]:
+class Confusion(NamedTuple):
+    """What else all that a body meets may be."""
+
+    what: str  # in words
+    log_odds: float
+    alone: float  # log odds by this frame alone
+
+    def since(self, before: Mapping[str, float]) -> Alternative:
+        """By the frames before as well, of which the odds are known, by reasons."""
+        kept = min(before.get(self.what, -math.inf), self.alone)
+        return Alternative(self.what, max(self.log_odds, kept))
+
+
+def taken_for(
+    frames: Mapping[int, Frame], told: Mapping[int, Verdict]
+) -> dict[int, list[Confusion]]:
+    """What else all that bodies meet may be, by body, of those that meet something.
+
+    Another body that is not surely elsewhere, its own markers where they repeat themselves, so that
+    it may be turned another way, or one that is elsewhere, if that may be this one.
+    """
+    bests = {k: one.best for k, one in told.items() if one.best and one.best.log_evidence > 0}
+    sure = [k for k, one in told.items() if one.status == "ok"]
+
+    def instead(k: int, j: int) -> list[Confusion]:
+        against = look_alikes_of(frames[k], bests[k], frames[j])
+        return sorted(against, key=lambda one: one.log_odds)
+
+    found = {k: instead(k, k) for k in bests}
+    for k, j in permutations(frames, 2):
+        if k in bests and j not in sure and frames[k].body is not frames[j].body:
+            found[k] += _as_lost(instead(k, j), frames[k], frames[j])
+    for pair in combinations(sure, 2):
+        # what meets more is seldom the other
+        k, j = sorted(pair, key=lambda one: -bests[one].features[0])
+        if frames[k].body is frames[j].body or not (there := instead(k, j)):
+            continue
+        if there[-1].log_odds > -frames[k].rules.look_alikes.behind and (here := instead(j, k)):
+            both = there[-1].log_odds + here[-1].log_odds, there[-1].alone + here[-1].alone
+            for one, what in ((k, there[-1].what), (j, here[-1].what)):
+                found[one] += _as_lost([Confusion(what, *both)], frames[k], frames[j])
+    return found
+
+
+def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
     """Parts of another body, or of its own, that all that a pose meets might be as well."""
     met, T = met_features(best), best.T_world_object
     tolerance = tolerance_of(data.body, other.body, other.rules.look_alikes.alike)
@@ -32,52 +78,18 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Alte
     likelihood = likelihood_of(other.seen_otherwise(views=data.views, still=data.still))
     for part in parts:
         T_other = T @ part.T_body_other
-        start = other.rival(best, T_other, other.close, left_out=best.left_out)
-        there = likelihood.density(likelihood.fit(start), start, best.matches)
-        yield Alternative(part.reason, there - own)
+        there = likelihood.density(Fit(T_other), here, best.matches)
+        if there - own > -2 * other.rules.look_alikes.behind:  # else it is none, however fitted
+            start = other.rival(best, T_other, other.close, left_out=best.left_out)
+            there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
+        known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
+        yield Confusion(part.reason, there - own, there - own - known)
 
 
-def taken_for(
-    frames: Mapping[int, Frame], told: Mapping[int, Verdict]
-) -> dict[int, list[Alternative]]:
-    """What else all that bodies meet may be, by body, of those that meet something.
-
-    Another body that is not surely elsewhere, its own markers where they repeat themselves, so that
-    it may be turned another way, or one that is elsewhere, if that may be this one.
-    """
-    bests = {k: one.best for k, one in told.items() if one.best and one.best.log_evidence > 0}
-    sure = [k for k, one in told.items() if one.status == "ok"]
-
-    def instead(k: int, j: int) -> list[Alternative]:
-        against = look_alikes_of(frames[k], bests[k], frames[j])
-        return sorted(against, key=lambda one: one.log_odds)
-
-    found = {k: instead(k, k) for k in bests}
-    for k, j in permutations(frames, 2):
-        if k in bests and j not in sure and frames[k].body is not frames[j].body:
-            found[k] += _as_lost(instead(k, j), frames[k], frames[j])
-    for pair in combinations(sure, 2):
-        # what meets more is seldom the other
-        k, j = sorted(pair, key=lambda one: -bests[one].features[0])
-        are_alike = frames[k].body is frames[j].body
-        if not are_alike and (there := instead(k, j)) and (here := instead(j, k)):
-            odds = there[-1].log_odds + here[-1].log_odds
-            both = [one[-1]._replace(log_odds=odds) for one in (there, here)]
-            both = _as_lost(both, frames[k], frames[j])
-            found[k].append(both[0])
-            found[j].append(both[1])
-    return found
-
-
-def _as_lost(against: Sequence[Alternative], one: Frame, other: Frame) -> list[Alternative]:
+def _as_lost(against: Sequence[Confusion], one: Frame, other: Frame) -> list[Confusion]:
     """Odds of two bodies of which the one may be the other, even where both were lost."""
-    lost = [data.predictions and data.track.misses > data.rules.motion.coasting
-            for data in (one, other)]  # fmt: skip
+    lost = [
+        data.predictions and data.track.misses > data.rules.motion.coasting for data in (one, other)
+    ]
     least = math.log(0.5) if all(lost) else -math.inf
     return [each._replace(log_odds=max(each.log_odds, least)) for each in against]
-
-
-def since(before: Mapping[str, float], now: Sequence[Alternative]) -> list[Alternative]:
-    """What else a body may be, by the odds `before` at least."""
-    odds = [max(one.log_odds, before.get(one.what, -math.inf)) for one in now]
-    return [one._replace(log_odds=at_least) for one, at_least in zip(now, odds, strict=True)]

@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
+from operator import itemgetter
 from typing import TypeAlias
 
 import numpy as np
@@ -28,7 +29,7 @@ from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
 from mixpose.sensors import Sensor
-from mixpose.tracking.confusion import since, taken_for
+from mixpose.tracking.confusion import taken_for
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.identity import Rivals, identify
 from mixpose.tracking.motion import Distances
@@ -83,8 +84,8 @@ class Scene:
             data, verdict = frames[k], found[finders[k]].verdict
             odds = data.track.alike
             if k in alike:
-                against = since(odds, alike[k])
-                odds = {one.what: one.log_odds for one in against}
+                against = [one.since(odds) for one in alike[k]]
+                odds = dict(sorted(against, key=itemgetter(1)))
                 verdict, told[k] = verdict.doubted(against), told[k].doubted(against)
             after.append(replace(followed(data, verdict), distances=apart.get(k), alike=odds))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
