@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, permutations
 from typing import NamedTuple
 
 from mixpose.body import like_features, tolerance_of
 from mixpose.fit import Fit
 from mixpose.judgement import Alternative, ScoredPose, Verdict
+from mixpose.objective import project_body
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import met_features
@@ -75,11 +77,15 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Conf
         return
     here = Start(T, left_out=best.left_out)
     own = likelihood_of(data).density(Fit(T), here, best.matches)
-    likelihood = likelihood_of(other.seen_otherwise(views=data.views, still=data.still))
+    seen = other.seen_otherwise(views=data.views, still=data.still)
+    likelihood = likelihood_of(seen)
+    # what a pose meets does not depend on what is drawn
+    drawn = replace(data.finest, projection=project_body(data.finest.projection.sensors, seen.body))
+    as_it_stands = likelihood_of(replace(seen, drawn=drawn))
     for part in parts:
         T_other = T @ part.T_body_other
-        there = likelihood.density(Fit(T_other), here, best.matches)
-        if there - own > -2 * other.rules.look_alikes.behind:  # else it is none, however fitted
+        there = as_it_stands.density(Fit(T_other), here, best.matches)
+        if there - own > -other.rules.look_alikes.behind:  # else it is none, however fitted
             start = other.rival(best, T_other, other.close, left_out=best.left_out)
             there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
         known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
