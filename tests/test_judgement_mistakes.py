@@ -14,7 +14,14 @@ from scipy.stats import multivariate_normal
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import APART, NoiseModel, ScoredPose, possible_mistakes
+from mixpose.judgement import (
+    APART,
+    Mistake,
+    NoiseModel,
+    ScoredPose,
+    odds_of_each,
+    possible_mistakes,
+)
 from mixpose.judgement.mistakes import LENS, SIZE, evidence_of
 from mixpose.records import Estimate
 from mixpose.rigid import from_rotation_vector
@@ -105,14 +112,15 @@ def test_evidence_is_the_marginal_likelihood_over_sizes_and_noise() -> None:
     rng = np.random.default_rng(2)
     X, r = rng.normal(size=(2, 9, 3)), rng.normal(size=9)
     s2 = np.array([0.1, 1.0])
-    found, second = evidence_of(X, r, 9.0, s2)
+    found, means, spreads = evidence_of(X, r, 9.0, s2)
     for k in range(2):
         each = [multivariate_normal(cov=X[k] @ X[k].T + one * np.eye(9)).logpdf(r) for one in s2]
         assert found[k] == pytest.approx(logsumexp(each) + 4.5 * np.log(2 * np.pi))
         best = s2[int(np.argmax(each))]
         S = np.linalg.inv(X[k].T @ X[k] / best + np.eye(3))
         mean = S @ X[k].T @ r / best
-        np.testing.assert_allclose(second[k], S + np.outer(mean, mean), rtol=1e-9)
+        np.testing.assert_allclose(means[k], mean, rtol=1e-9)
+        np.testing.assert_allclose(spreads[k], S, rtol=1e-9)
 
 
 def seen_from(*twists: Floats, noise: float) -> ScoredPose:
@@ -123,39 +131,65 @@ def seen_from(*twists: Floats, noise: float) -> ScoredPose:
         J = rng.normal(size=(10, 2, 6))
         offsets = J @ twist + noise * rng.normal(size=(10, 2))
         sensors.append(Seen(J, str(k), offsets, places=rng.uniform(-200.0, 200.0, (10, 2))))
-    pose = scored(TRUTH, *sensors)
     # as residuals tell it
-    return replace(pose, variances=np.full(len(sensors), max(noise**2, 1e-4)))
+    return of_noise(scored(TRUTH, *sensors), *[max(noise**2, 1e-4)] * len(sensors))
+
+
+def of_noise(pose: ScoredPose, *variances: float) -> ScoredPose:
+    """The same by sensors of other noise."""
+    rows = pose.matches.J / np.sqrt(variances)[:, None, None, None]
+    covariance = np.linalg.inv(np.einsum("lnij,lnik->jk", rows, rows))
+    return replace(pose, variances=np.array(variances), covariance=covariance)
 
 
 # what one sees is not asked here
 SENSORS = {str(k): ParallelBeam(1.0, np.zeros(2)) for k in range(3)}
 
 
-def mistakes_in(pose: ScoredPose) -> dict[str, float]:
+# log odds of 0.999, up to which a pose is ok
+DOUBT = np.log(999.0)
+
+
+def against(pose: ScoredPose) -> float:
+    """Log odds that sensors stand otherwise and put the pose elsewhere, one in 5000 sessions."""
     found = possible_mistakes(pose, body(), ALL_FREE, NoiseModel(), SENSORS, {})
-    return {one.what: one.log_odds for one in found if one.log_harm > np.log(0.4)}
+    some = [one for one in found if one.what == APART]
+    return float(logsumexp([-np.inf, *odds_of_each(some, [2e-4] * len(some))]))
 
 
 def test_sensors_that_see_the_body_at_two_poses_contradict_each_other_and_at_one_do_not() -> None:
     away = np.array([0.4, -0.3, 0.3, 0.0, 0.0, 0.0])
-    apart = mistakes_in(seen_from(-away, away, noise=0.05))
-    # far beyond the 17 nats that 2 in 10,000 sessions and 1 in 1,000 frames leave
-    assert apart[APART] > 20
-    assert mistakes_in(seen_from(0 * away, 0 * away, noise=0.05)) == {}
+    assert against(seen_from(-away, away, noise=0.05)) > DOUBT
+    assert against(seen_from(0 * away, 0 * away, noise=0.05)) < -DOUBT
 
 
 def test_a_sensor_that_stands_otherwise_harms_no_pose_that_the_others_draw() -> None:
     away = np.array([0.4, -0.3, 0.3, 0.0, 0.0, 0.0])
-    pose = seen_from(0 * away, 0 * away, away, noise=0.05)
-    assert mistakes_in(pose)[APART] > 20
-    # of twenty times the noise it has a share of 1/800 in the pose
-    hardly = mistakes_in(replace(pose, variances=0.05**2 * np.array([1.0, 1.0, 400.0])))
-    assert hardly.get(APART, 0.0) < 1
+    by_two, by_all = (
+        seen_from(-share * away, -share * away, (1 - share) * away, noise=0.05)
+        for share in (0.0, 1 / 3)
+    )
+    # of two that agree neither is likely to stand otherwise, as the third does
+    assert against(by_two) < -DOUBT
+    for noise in (0.1, 0.2, 0.3):
+        assert against(of_noise(by_two, *[noise**2] * 3)) < -DOUBT
+        assert against(of_noise(by_all, *[noise**2] * 3)) > DOUBT
+
+
+def test_a_likelier_mistake_that_leaves_the_pose_in_place_tells_against_others() -> None:
+    harmful, harmless = Mistake("a", APART, 20.0, 0.0), Mistake("b", APART, 40.0, -np.inf)
+    (alone,) = odds_of_each([harmful], [2e-4])
+    assert alone == pytest.approx(20 + np.log(2e-4))
+    both = odds_of_each([harmful, harmless], [2e-4, 2e-4])
+    # e²⁰ against e⁴⁰, whatever sessions are like
+    assert both == [pytest.approx(-20.0, abs=1e-6), -np.inf]
+    # which says nothing of the size of the body
+    of_size = odds_of_each([Mistake("a", SIZE, 40.0, np.log(0.01)), harmless], [2e-4, 2e-4])
+    assert of_size == [pytest.approx(40 + np.log(2e-4 * 0.01)), -np.inf]
 
 
 def test_a_single_feature_that_is_far_off_is_no_contradiction() -> None:
     pose = seen_from(np.zeros(6), np.zeros(6), noise=0.05)
     offsets = pose.matches.offsets.copy()
     offsets[0, 3] += 0.5
-    assert mistakes_in(replace(pose, matches=replace(pose.matches, offsets=offsets))) == {}
+    assert against(replace(pose, matches=replace(pose.matches, offsets=offsets))) < -DOUBT

@@ -194,6 +194,22 @@ _MISTAKES = (
         "what may explain anything is likelier than what is told",
         ("test_judgement_mistakes.py",),
     ),
+    Mutant(
+        "judgement-mistakes-put-poses-off-that-do-not-give-way-to-them",
+        "judgement/mistakes.py",
+        "there - moved @ means",
+        "0 * there - moved @ means",
+        "frames are in doubt for a camera that two others outvote",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-any-number-of-mistakes-may-be-made",
+        "judgement/mistakes.py",
+        "np.logaddexp.reduce([0.0, *others])",
+        "0.0",
+        "a camera that agrees is doubted as much as the one that is off",
+        ("test_judgement_mistakes.py",),
+    ),
 )
 
 _EVIDENCE = (

@@ -39,6 +39,7 @@ from mixpose.judgement.information import (
 from mixpose.judgement.mistakes import (
     APART as APART,
     Mistake as Mistake,
+    odds_of_each as odds_of_each,
     possible_mistakes as possible_mistakes,
 )
 from mixpose.judgement.noise import (

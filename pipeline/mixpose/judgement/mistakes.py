@@ -8,9 +8,10 @@ and z = UᵀXᵀr, in ν directions,
     ln p(r | s) = −½ ν ln s² − ½ (|r|² − Σ z² / (λ + s²)) / s² − ½ Σ ln (1 + λ / s²),
 
 of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts as often
-as the pose, with its noise, is then outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes
-γ that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  Sensors always stand a
-little otherwise than told: that counts where n + E is outside.
+as the pose, with its noise, is then outside its ellipsoid: it is δ = (JᵀJ)⁻¹ Jᵀ (r − C γ) off, of
+sizes γ that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  Sensors always stand
+a little otherwise than told: that counts where n + E is outside.  One of them does so by far, at
+the most: one of which that leaves the pose in place tells against the others.
 
 What one frame tells of a session holds in those that follow, which may not tell it themselves: log
 odds add up from frame to frame, and never fall below those of a session of which nothing is known
@@ -20,7 +21,7 @@ odds add up from frame to frame, and never fall below those of a session of whic
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +50,24 @@ class Mistake(NamedTuple):
     log_harm: float  # of the probability that it puts this pose outside its ellipsoid
 
 
+def odds_of_each(mistakes: Sequence[Mistake], likely: Sequence[float]) -> list[float]:
+    """Log odds of each mistake against the pose; of a kind a session has one at the most.
+
+    They are so `likely` before any frame.  Another that leaves the pose in place tells against it.
+    """
+    believed = [math.log(p) + one.log_odds for p, one in zip(likely, mistakes, strict=True)]
+    harmless = [math.log(max(-math.expm1(one.log_harm), 1e-300)) for one in mistakes]
+    odds = []
+    for own, one in zip(believed, mistakes, strict=True):
+        others = [
+            sum(each)
+            for *each, other in zip(believed, harmless, mistakes, strict=True)
+            if other.what == one.what and other is not one
+        ]
+        odds.append(own + one.log_harm - float(np.logaddexp.reduce([0.0, *others])))
+    return odds
+
+
 def possible_mistakes(
     pose: ScoredPose,
     body: Body,
@@ -73,7 +92,8 @@ def possible_mistakes(
     r, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
     drawn = inverted(J.T @ J) @ J.T
-    r = r - J @ (drawn @ r)
+    # where these rows alone would put the pose
+    r = r - J @ (there := drawn @ r)
     # noise from a hundredth of σ_ε to twice that
     s2 = np.asarray(1e-4 * 1.6 ** np.arange(24))
     given = r, float(met @ found.dimensions) - len(chosen), s2
@@ -94,22 +114,18 @@ def possible_mistakes(
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = evidence_of(usual, *given)[0]
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
-    # each sensor draws the pose as far as it is exact, which matters where one is wrong and not all
-    exact = np.repeat(pose.variances.min() / pose.variances, 2 * found.shares.shape[1])[:, None]
-    pulls = (exact * J).T
-    moves[2:-1] = inverted(pulls @ J) @ pulls @ columns[2:-1]
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
-        asked = slice(None) if names[k] in (SIZE, LENS) else slice(len(usual) // 2)
-        cases, second = evidence_of(_beside(usual[asked], left[k + 1]), *given)
-        mistaken, width = moves[k + 1], columns.shape[2]
-        by_mistake = mistaken @ second[cases.argmax(), -width:, -width:] @ mistaken.T
-        gained = float(np.logaddexp.reduce(cases) - np.logaddexp.reduce(others[asked]))
+        is_sensor = names[k] not in (SIZE, LENS)
+        asked = slice(len(usual) // 2 if is_sensor else None)
+        logs, means, spreads = evidence_of(_beside(usual[asked], left[k + 1]), *given)
+        best, moved, width = logs.argmax(), moves[k + 1], columns.shape[2]
+        off = there - moved @ means[best, -width:]
+        by_mistake = moved @ spreads[best, -width:, -width:] @ moved.T + np.outer(off, off)
+        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[asked]))
         outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
-        if names[k] in (SIZE, LENS):
-            yield Mistake(names[k], names[k], known[k] + gained, outside[0])
-        else:
-            yield Mistake(names[k], APART, known[k] + gained, outside[1])
+        what = APART if is_sensor else names[k]
+        yield Mistake(names[k], what, known[k] + gained, outside[is_sensor])
 
 
 def _outside(squared: float, directions: int, chance: float) -> tuple[float, float]:
@@ -200,8 +216,8 @@ def _beside(X: Floats, others: Floats) -> Floats:
     return both
 
 
-def evidence_of(X: Floats, r: Floats, degrees: float, s2: Floats) -> tuple[Floats, Floats]:
-    """Log evidence (K,) of columns X (K, R, p), of deviation 1; second moments of their sizes.
+def evidence_of(X: Floats, r: Floats, degrees: float, s2: Floats) -> tuple[Floats, Floats, Floats]:
+    """Log evidence (K,) of columns X (K, R, p), of deviation 1; means, covariances of their sizes.
 
     For residuals r (R,) of so many degrees of freedom, and noise of any of the variances s2.
     """
@@ -212,5 +228,4 @@ def evidence_of(X: Floats, r: Floats, degrees: float, s2: Floats) -> tuple[Float
     logs = -0.5 * (degrees * np.log(s2) + left / s2 + np.log(wide / s2).sum(axis=1))
     k = np.arange(len(X))[:, None], np.arange(U.shape[2]), logs.argmax(axis=1)[:, None]
     mean, S = (U * (z[..., 0] / wide[k])[:, None]).sum(axis=2), U * (s2[k[2]] / wide[k])[:, None]
-    second = S @ U.swapaxes(1, 2) + mean[:, :, None] * mean[:, None]
-    return np.logaddexp.reduce(logs, axis=1), second
+    return np.logaddexp.reduce(logs, axis=1), mean, S @ U.swapaxes(1, 2)

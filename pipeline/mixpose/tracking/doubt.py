@@ -27,6 +27,7 @@ from mixpose.judgement import (
     is_far_off,
     is_open,
     is_sure,
+    odds_of_each,
     one_misses,
     possible_mistakes,
 )
@@ -75,7 +76,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
 
 
 def _alternatives(
-    data: Frame, best: ScoredPose, mistakes: Iterable[Mistake]
+    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake]
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
@@ -83,10 +84,10 @@ def _alternatives(
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(UNSURE, _of_chance_that_lasts(data, best))
-    for one in mistakes:
-        # of a scene with mirrors nobody knows which side a frame shows
-        likely = 0.5 if one.name == MIRRORED and data.options.mirrors else rules.mistaken
-        yield Alternative(one.what, math.log(likely) + one.log_odds + one.log_harm)
+    # of a scene with mirrors nobody knows which side a frame shows
+    mirrored = 0.5 if data.options.mirrors else rules.mistaken
+    likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
+    yield from map(Alternative, (one.what for one in mistakes), odds_of_each(mistakes, likely))
     if one_misses(best, _noise_before(data, best), track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
