@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.words import in_length, in_world, known_length
 from mixpose.errors import SessionError
+from mixpose.objective.projection import BodyProjection
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
@@ -54,6 +56,52 @@ def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> No
     assert (np.abs(off)[known] < 3 * told[known] + 0.02).all()  # beside what stays as it was
     assert found.residuals[1].held < 0.03  # of 0.02 px in two coordinates
     assert all("s1:distortion" in text for text in found.refused)
+
+
+def test_cameras_that_read_row_after_row_are_no_worse() -> None:
+    readout, sensors = 0.02, cameras(2)
+
+    def look(sensor: Any, time: float) -> tuple[Floats, Floats]:
+        after = np.zeros(len(POINTS))
+        for _ in range(8):  # a row is read when its marker is there
+            world = [transform(motion(time + s), p[None])[0] for s, p in zip(after, POINTS)]
+            y, visible = sensor.project(np.array(world))
+            after = readout * (y[:, 1] - 255.5) / 511
+        return y, visible
+
+    frames = recording(sensors, 40, 0.02, look=look)
+    task = task_of(sensors, frames)
+    task = replace(task, rig=replace(task.rig, readouts=np.full(2, readout)))
+    found = calibrate(task, found=alone(sensors, frames))
+    # as if all rows were read at once; without readouts 0.38 px are left
+    assert (found.noise < 0.022).all()
+    off = centre_of(found.after.sensors[1]) - centre_of(sensors[1])
+    assert np.linalg.norm(off) < 3 * np.linalg.norm(found.deviations[:3])
+
+
+def test_images_of_large_spheres_move_no_camera() -> None:
+    true = cameras(2)
+    large = Body("large", tuple(map(PointFeature, POINTS)), shape="sphere", radii=np.full(6, 18.0))
+
+    def look(sensor: Any, time: float) -> tuple[Floats, Floats]:
+        shown = BodyProjection((sensor,), (large,)).project(motion(time)[None])
+        return shown.y[0, 0], shown.seen[0, 0]
+
+    frames = recording(true, 40, 0.02, look=look)
+    task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large), body=large)
+    found = calibrate(task, found=alone(true, frames))
+    off = centre_of(found.after.sensors[1]) - centre_of(true[1])
+    # as points they would move it by 0.4 mm, nine standard deviations
+    assert np.linalg.norm(off) < 3 * np.linalg.norm(found.deviations[:3])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_that_is_sought_does_not_make_frames_differ(seed: int) -> None:
+    # 24 unknowns of 40 frames: errors of detections alone were told as 1.5 times their variance
+    sensors = cameras(3)
+    frames = recording(sensors, 40, 0.05, seed=seed)
+    task = task_of(sensors, frames, body_free=True)
+    assert calibrate(task, found=alone(sensors, frames)).inflation == 1
 
 
 def test_a_clock_that_is_late_and_runs_slow_is_found() -> None:
