@@ -138,6 +138,13 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
             f"{', '.join(unsized)}: the files do not say how large images are; see that recordings "
             "have the size that was calibrated"
         )
+    lenses = {camera.name: camera.intrinsics for camera in cameras}
+    four = [name for name, k in lenses.items() if k.model is None and k.distortion.size == 4]
+    if four:
+        warnings.append(
+            f"{', '.join(four)}: four coefficients of distortion are a pinhole's or a fisheye's, "
+            'and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
+        )
     for camera in cameras:
         warnings += _outside(camera)
     for a, b in combinations(cameras, 2):
