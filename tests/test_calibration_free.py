@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 from rounding import rounding
-from simulated_rigs import FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
+from scipy.spatial.transform import Rotation
+from simulated_rigs import BODY, FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, calibrate
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
-from mixpose.calibration.words import in_length, in_world, known_length
+from mixpose.calibration.rig import moved as rig_moved
+from mixpose.calibration.words import free_parameters, in_length, in_world, known_length
 from mixpose.errors import SessionError
 from mixpose.objective.projection import BodyProjection
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
@@ -162,6 +164,32 @@ def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None
     for words in ("s7", "body@99", "body"):
         with pytest.raises(SessionError, match="allowed: s0, s1, or the body in a frame"):
             in_world(found, words)
+
+
+def test_deviations_in_the_frame_of_a_sensor_know_how_that_errs() -> None:
+    sensors = [*cameras(2), RangeSensor(np.array([400.0, -300, 200]))]
+    poses = {k: motion(k / FPS) for k in range(20)}
+    frames = recording(sensors, 20, 0.05)
+    free: Any = {0: ("pose",), 1: ("pose",), 2: ("position",)}
+    known = alone(sensors[:2], [frame.without({2}) for frame in frames])  # type: ignore[arg-type]
+    found = calibrate(task_of(sensors, frames, free=free, known=poses), found=known)
+    step = 1e-3 * np.random.default_rng(3).normal(0, 1, 15) * np.repeat([1, 1e-3, 1, 1e-3, 1], 3)
+    told = in_world(replace(found, covariance=np.outer(step, step)), "s1").deviations
+    off = in_world(replace(found, after=rig_moved(found.after, found.blocks, step)), "s1").after
+    here = in_world(found, "s1").after
+    a, b = (rig.sensors[0].T_sensor_world for rig in (off, here))  # type: ignore[attr-defined]
+    change = a @ inverse(b)
+    twist = [*change[:3, 3], *Rotation.from_matrix(change[:3, :3]).as_rotvec()]
+    np.testing.assert_allclose(told[:6], np.abs(twist), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(told[6:12], 0, atol=1e-12)  # it is the frame itself
+    place = centre_of(off.sensors[2]) - centre_of(here.sensors[2])
+    np.testing.assert_allclose(told[12:], np.abs(place), rtol=1e-3)
+
+
+def test_the_camera_whose_frame_is_the_worlds_is_the_one_that_stays() -> None:
+    rig = Rig.of(("a", "b", "c"), cameras(3), BODY)
+    assert [*free_parameters(rig, (), poses_known=False)[0]] == [1, 2]
+    assert [*free_parameters(rig, (), poses_known=False, world="b")[0]] == [0, 2]
 
 
 def test_a_camera_that_shares_no_view_with_the_first_is_linked_through_another() -> None:

@@ -117,7 +117,9 @@ def task_of(
     known = None if request.poses is None else known_poses(request.poses, session)
     # one word of --free may hold several
     free_words = [part for word in request.free or () for part in word.split()]
-    free, body = free_parameters(rig, free_words, poses_known=known is not None)
+    free, body = free_parameters(
+        rig, free_words, poses_known=known is not None, world=request.world
+    )
     pair = None if request.length is None else known_length(rig, request.length)[0]
     if pair is not None and known is not None:
         raise SessionError("--length: stands beside --poses, which give the scale; drop one")
