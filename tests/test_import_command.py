@@ -63,6 +63,14 @@ def test_r_and_t_lead_from_the_first_camera_wherever_it_stands(tmp_path: Path) -
     assert any("four coefficients" in warning for warning in found.warnings)
 
 
+def test_images_of_colmap_may_have_blanks_in_their_names(tmp_path: Path) -> None:
+    paths = texts.colmap(tmp_path, with_rig=False)
+    named = paths[1].read_text(encoding="utf-8").replace("view/", "my view/")
+    paths[1].write_text(named, encoding="utf-8")
+    names = [camera.name for camera in gather(paths, "m", "m").cameras]
+    assert names == ["my view_0", "my view_1"]
+
+
 def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
     """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
     chain = texts.kalibr()
