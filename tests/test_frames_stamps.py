@@ -82,3 +82,11 @@ def test_a_quick_check_tells_that_frames_do_not_pair(
     check_session(session, quick=True)
     said = capsys.readouterr().out
     assert "sensor 'left': 0 of its 40 frames pair with those of other sensors" in said
+
+
+def test_times_beyond_all_clocks_pair_too(tmp_path: Path) -> None:
+    sources = {}
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("time_s,u,v\n0,1,1\n1e305,1,1\n", encoding="utf-8")
+        sources[name] = open_source(SourceSpec(name, f"{name}.csv", tmp_path, "camera"))
+    assert [len(each.frames) for each in pair(paired_by_stamp(sources))] == [2, 2]

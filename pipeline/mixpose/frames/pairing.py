@@ -13,7 +13,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
-from statistics import median
+from statistics import median_low
 
 import numpy as np
 
@@ -31,7 +31,7 @@ READY_BYTES = 2**24
 MOST_MORE = 13
 """Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
 
-_SHARE = 0.5  # of the usual distance of frames: farther apart they belong to different moments
+_PART = 2  # of the usual distance of frames a half: farther apart they are different moments
 
 
 def pair(
@@ -116,7 +116,7 @@ def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
         return dict(sources)
     numbers, known = dict[str, list[int]](), list[int]()
     steps = [[b - a for a, b in pairwise(stamps)] for stamps in stamped.values()]
-    reach = _SHARE * min((median(each) for each in steps if each), default=math.inf)
+    reach = min((median_low(each) // _PART for each in steps if each), default=math.inf)
     for name, stamps in stamped.items():
         numbers[name] = _nearest(stamps, known, reach)
         known = sorted({*known, *numbers[name]})

@@ -112,7 +112,7 @@ class DetectionTable(Source):
         """Its moments in nanoseconds, ascending, where they are all that its frames go by."""
         if self._is_numbered or self.clock is not None:
             return []
-        return [round(key * 1e9) for key in self._keys()]
+        return [int(key // 1) * 10**9 + round(key % 1 * 1e9) for key in self._keys()]
 
     def numbers(self) -> list[int]:
         """Frame numbers, ascending, up to the first row that cannot be read."""
