@@ -167,11 +167,11 @@ def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None
 
 
 def test_deviations_in_the_frame_of_a_sensor_know_how_that_errs() -> None:
-    sensors = [*cameras(2), RangeSensor(np.array([400.0, -300, 200]))]
+    sensors: list[Any] = [*cameras(2), RangeSensor(np.array([400.0, -300, 200]))]
     poses = {k: motion(k / FPS) for k in range(20)}
     frames = recording(sensors, 20, 0.05)
     free: Any = {0: ("pose",), 1: ("pose",), 2: ("position",)}
-    known = alone(sensors[:2], [frame.without({2}) for frame in frames])  # type: ignore[arg-type]
+    known = alone(sensors[:2], [frame.without({2}) for frame in frames])
     found = calibrate(task_of(sensors, frames, free=free, known=poses), found=known)
     step = 1e-3 * np.random.default_rng(3).normal(0, 1, 15) * np.repeat([1, 1e-3, 1, 1e-3, 1], 3)
     told = in_world(replace(found, covariance=np.outer(step, step)), "s1").deviations

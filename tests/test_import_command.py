@@ -58,7 +58,9 @@ def test_r_and_t_lead_from_the_first_camera_wherever_it_stands(tmp_path: Path) -
     storage.release()
     found = gather([path], "m", "m")
     assert [camera.name for camera in found.cameras] == ["left", "right"]
-    np.testing.assert_allclose(found.cameras[1].T_camera_rig, T, atol=1e-12)
+    second = found.cameras[1].T_camera_rig
+    assert second is not None
+    np.testing.assert_allclose(second, T, atol=1e-12)
     # of a pinhole camera or of a fisheye: nothing in the file says which
     assert any("four coefficients" in warning for warning in found.warnings)
 

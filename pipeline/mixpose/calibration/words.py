@@ -188,15 +188,15 @@ def in_world(found: Calibration, words: str) -> Calibration:
     else:
         T_new_world = inverse(found.poses[number])
     moved = tuple(sensor.moved(inverse(T_new_world)) for sensor in found.after.sensors)
-    placed = [b for b in found.blocks if b.sensor is not None and b.kind in ("pose", "position")]
-    by_old = np.eye(len(found.deviations))
-    for block in placed:
+    by_old, names = np.eye(len(found.deviations)), found.after.names
+    placed = [(b.sensor, b) for b in found.blocks if b.kind in ("pose", "position")]
+    own = next((b for s, b in placed if s is not None and names[s] == words), None)
+    for sensor, block in placed:
         if block.kind == "position":
             by_old[block.place, block.place] = T_new_world[:3, :3]
-        for own in placed:  # the others move as the sensor errs that is the world's
-            if found.after.names[own.sensor] == words:
-                change = sensor_change(moved[block.sensor])[:, :6]
-                by_old[block.place, own.place] = change if block is not own else 0.0
+        if own is not None and sensor is not None:  # the others move as this one errs
+            change = sensor_change(moved[sensor])[:, :6]
+            by_old[block.place, own.place] = change if block is not own else 0.0
     covariance = by_old @ found.covariance @ by_old.T
     told = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     return replace(
