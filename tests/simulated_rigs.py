@@ -50,17 +50,24 @@ def recording(
     noise: float,
     late: float | Callable[[float], float] = 0.0,
     points: Floats = POINTS,
+    look: Callable[..., tuple[Floats, Floats]] | None = None,
+    seed: int = 1,
 ) -> tuple[SeenFrame, ...]:
-    """Shuffled detections; the second sensor takes its frames `late` seconds later."""
-    rng = np.random.default_rng(1)
+    """Shuffled detections; the second sensor takes its frames `late` seconds later.
+
+    `look` tells what a sensor sees at a time and which of it is in view, in place of points.
+    """
+    rng = np.random.default_rng(seed)
     frames = []
     for k in range(count):
         time = k / FPS
         seen = {}
         for index, sensor in enumerate(sensors):
             after = late(time) if callable(late) else late
-            T = motion(time + (after if index == 1 else 0.0))
-            y, visible = sensor.project(transform(T, points))
+            at = time + (after if index == 1 else 0.0)
+            y, visible = (
+                sensor.project(transform(motion(at), points)) if look is None else look(sensor, at)
+            )
             y = y[visible] + rng.normal(0, noise, y[visible].shape)
             seen[index] = rng.permutation(y)
         frames.append(SeenFrame(k, time, seen, dict.fromkeys(seen, time)))

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from rounding import rounding
-from simulated_rigs import FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
+from scipy.spatial.transform import Rotation
+from simulated_rigs import BODY, FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, calibrate
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
-from mixpose.calibration.words import in_length, in_world, known_length
+from mixpose.calibration.rig import moved as rig_moved
+from mixpose.calibration.words import free_parameters, in_length, in_world, known_length
 from mixpose.errors import SessionError
+from mixpose.objective.projection import BodyProjection
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
@@ -54,6 +58,52 @@ def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> No
     assert (np.abs(off)[known] < 3 * told[known] + 0.02).all()  # beside what stays as it was
     assert found.residuals[1].held < 0.03  # of 0.02 px in two coordinates
     assert all("s1:distortion" in text for text in found.refused)
+
+
+def test_cameras_that_read_row_after_row_are_no_worse() -> None:
+    readout, sensors = 0.02, cameras(2)
+
+    def look(sensor: Any, time: float) -> tuple[Floats, Floats]:
+        after = np.zeros(len(POINTS))
+        for _ in range(8):  # a row is read when its marker is there
+            world = [transform(motion(time + s), p[None])[0] for s, p in zip(after, POINTS)]
+            y, visible = sensor.project(np.array(world))
+            after = readout * (y[:, 1] - 255.5) / 511
+        return y, visible
+
+    frames = recording(sensors, 40, 0.02, look=look)
+    task = task_of(sensors, frames)
+    task = replace(task, rig=replace(task.rig, readouts=np.full(2, readout)))
+    found = calibrate(task, found=alone(sensors, frames))
+    # as if all rows were read at once; without readouts 0.38 px are left
+    assert (found.noise < 0.022).all()
+    off = centre_of(found.after.sensors[1]) - centre_of(sensors[1])
+    assert np.linalg.norm(off) < 3 * np.linalg.norm(found.deviations[:3])
+
+
+def test_images_of_large_spheres_move_no_camera() -> None:
+    true = cameras(2)
+    large = Body("large", tuple(map(PointFeature, POINTS)), shape="sphere", radii=np.full(6, 18.0))
+
+    def look(sensor: Any, time: float) -> tuple[Floats, Floats]:
+        shown = BodyProjection((sensor,), (large,)).project(motion(time)[None])
+        return shown.y[0, 0], shown.seen[0, 0]
+
+    frames = recording(true, 40, 0.02, look=look)
+    task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large), body=large)
+    found = calibrate(task, found=alone(true, frames))
+    off = centre_of(found.after.sensors[1]) - centre_of(true[1])
+    # as points they would move it by 0.4 mm, nine standard deviations
+    assert np.linalg.norm(off) < 3 * np.linalg.norm(found.deviations[:3])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_that_is_sought_does_not_make_frames_differ(seed: int) -> None:
+    # 24 unknowns of 40 frames: errors of detections alone were told as 1.5 times their variance
+    sensors = cameras(3)
+    frames = recording(sensors, 40, 0.05, seed=seed)
+    task = task_of(sensors, frames, body_free=True)
+    assert calibrate(task, found=alone(sensors, frames)).inflation == 1
 
 
 def test_a_clock_that_is_late_and_runs_slow_is_found() -> None:
@@ -114,6 +164,32 @@ def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None
     for words in ("s7", "body@99", "body"):
         with pytest.raises(SessionError, match="allowed: s0, s1, or the body in a frame"):
             in_world(found, words)
+
+
+def test_deviations_in_the_frame_of_a_sensor_know_how_that_errs() -> None:
+    sensors: list[Any] = [*cameras(2), RangeSensor(np.array([400.0, -300, 200]))]
+    poses = {k: motion(k / FPS) for k in range(20)}
+    frames = recording(sensors, 20, 0.05)
+    free: Any = {0: ("pose",), 1: ("pose",), 2: ("position",)}
+    known = alone(sensors[:2], [frame.without({2}) for frame in frames])
+    found = calibrate(task_of(sensors, frames, free=free, known=poses), found=known)
+    step = 1e-3 * np.random.default_rng(3).normal(0, 1, 15) * np.repeat([1, 1e-3, 1, 1e-3, 1], 3)
+    told = in_world(replace(found, covariance=np.outer(step, step)), "s1").deviations
+    off = in_world(replace(found, after=rig_moved(found.after, found.blocks, step)), "s1").after
+    here = in_world(found, "s1").after
+    a, b = (rig.sensors[0].T_sensor_world for rig in (off, here))  # type: ignore[attr-defined]
+    change = a @ inverse(b)
+    twist = [*change[:3, 3], *Rotation.from_matrix(change[:3, :3]).as_rotvec()]
+    np.testing.assert_allclose(told[:6], np.abs(twist), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(told[6:12], 0, atol=1e-12)  # it is the frame itself
+    place = centre_of(off.sensors[2]) - centre_of(here.sensors[2])
+    np.testing.assert_allclose(told[12:], np.abs(place), rtol=1e-3)
+
+
+def test_the_camera_whose_frame_is_the_worlds_is_the_one_that_stays() -> None:
+    rig = Rig.of(("a", "b", "c"), cameras(3), BODY)
+    assert [*free_parameters(rig, (), poses_known=False)[0]] == [1, 2]
+    assert [*free_parameters(rig, (), poses_known=False, world="b")[0]] == [0, 2]
 
 
 def test_a_camera_that_shares_no_view_with_the_first_is_linked_through_another() -> None:

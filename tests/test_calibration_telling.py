@@ -95,7 +95,8 @@ def test_residuals_of_frames_and_features_on_the_page_are_root_mean_squares(
 
 
 def test_a_feature_on_the_page_may_be_called_by_what_would_be_a_formula(late: Calibration) -> None:
-    named = replace(late.after, labels=(r"$\q$", *late.after.labels[1:]))
+    body = late.after.body
+    named = replace(late.after, body=replace(body, names=(r"$\q$", *body.labels[1:])))
     assert r">$\q$<" in render_calibration(replace(late, after=named), "two", "mm", "0")
 
 

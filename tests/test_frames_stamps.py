@@ -30,6 +30,26 @@ def test_stamps_are_times_whatever_fps_says(tmp_path: Path) -> None:
     assert camera(tmp_path, "b", [FIRST, FIRST + STEP]).caution() is None
 
 
+def test_tables_of_times_alone_are_paired_by_them_where_one_lacks_a_moment(tmp_path: Path) -> None:
+    sources = {}
+    for name, times in (("a", [0.1, 0.2, 0.3, 0.5]), ("b", [0.199, 0.301, 0.4, 0.5])):
+        rows = "".join(f"{time},1,1\n" for time in times)
+        (tmp_path / f"{name}.csv").write_text(f"time_s,u,v\n{rows}", encoding="utf-8")
+        sources[name] = open_source(SourceSpec(name, f"{name}.csv", tmp_path, "camera"))
+    paired = paired_by_stamp(sources)
+    sets = [(each.number, each.time_s, list(each.frames)) for each in pair(paired)]
+    assert sets == [
+        (0, 0.1, ["a"]),
+        (1, 0.2, ["a", "b"]),
+        (2, 0.3, ["a", "b"]),
+        (3, 0.4, ["b"]),
+        (4, 0.5, ["a", "b"]),
+    ]
+    assert (paired["b"].first, paired["a"].length) == (1, 4)
+    assert "frames 0-4 with gaps" in paired["a"].describe()
+    assert [frame.number for frame in paired["b"].frames(2, 4)] == [2, 3]
+
+
 def test_numbers_of_frames_are_no_stamps(tmp_path: Path) -> None:
     source = camera(tmp_path, "a", [0, 10**16], fps=10.0)
     assert [frame.time_s for frame in source.frames()] == [0.0, 1e15]
@@ -62,3 +82,11 @@ def test_a_quick_check_tells_that_frames_do_not_pair(
     check_session(session, quick=True)
     said = capsys.readouterr().out
     assert "sensor 'left': 0 of its 40 frames pair with those of other sensors" in said
+
+
+def test_times_beyond_all_clocks_pair_too(tmp_path: Path) -> None:
+    sources = {}
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("time_s,u,v\n0,1,1\n1e305,1,1\n", encoding="utf-8")
+        sources[name] = open_source(SourceSpec(name, f"{name}.csv", tmp_path, "camera"))
+    assert [len(each.frames) for each in pair(paired_by_stamp(sources))] == [2, 2]

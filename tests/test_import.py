@@ -363,7 +363,7 @@ def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
         (tmp_path / folder / "marks.csv").write_text(table, encoding="utf-8")
     paths = [tmp_path / "chain.yaml", tmp_path / "a" / "marks.csv", tmp_path / "b" / "marks.csv"]
     session = imported(paths, "mm", None, tmp_path / "s.toml")
-    assert [one.body.name for one in session.objects] == ["marks_1", "marks_2"]
+    assert [one.body.name for one in session.objects] == ["marks", "marks_2"]
     assert [one.body.means[1, 0] for one in session.objects] == [5, 7]
 
 

@@ -34,6 +34,45 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     assert "is there already" in again.stderr
 
 
+def test_cameras_of_a_chain_go_by_their_numbers_not_by_their_places(tmp_path: Path) -> None:
+    first, step = texts.kalibr().split("cam1:")
+    links = {f"cam{n}": f"cam{n}:{step}" for n in range(1, 12)}
+    # as YAML's writers sort keys: cam1, cam10, cam11, cam2
+    chain = "".join([first, *(links[name] for name in sorted(links))])
+    (tmp_path / "chain.yaml").write_text(chain, encoding="utf-8")
+    cameras = gather([tmp_path / "chain.yaml"], "m", None).cameras
+    assert [camera.name for camera in cameras] == [f"cam{n}" for n in range(12)]
+    third = cameras[2].T_camera_rig
+    assert third is not None
+    two_steps = texts.T_second_first() @ texts.T_second_first()
+    np.testing.assert_allclose(third, two_steps, atol=1e-12)
+
+
+def test_r_and_t_lead_from_the_first_camera_wherever_it_stands(tmp_path: Path) -> None:
+    path = tmp_path / "stereo.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    lens, T = np.array([[0.1, 0.01, 0.0, 0.0]]), texts.T_second_first()
+    named = {"K_right": texts.K2, "D_right": lens, "K_left": texts.K1, "D_left": lens}
+    for name, matrix in {**named, "R": T[:3, :3], "T": T[:3, 3]}.items():
+        storage.write(name, matrix)
+    storage.release()
+    found = gather([path], "m", "m")
+    assert [camera.name for camera in found.cameras] == ["left", "right"]
+    second = found.cameras[1].T_camera_rig
+    assert second is not None
+    np.testing.assert_allclose(second, T, atol=1e-12)
+    # of a pinhole camera or of a fisheye: nothing in the file says which
+    assert any("four coefficients" in warning for warning in found.warnings)
+
+
+def test_images_of_colmap_may_have_blanks_in_their_names(tmp_path: Path) -> None:
+    paths = texts.colmap(tmp_path, with_rig=False)
+    named = paths[1].read_text(encoding="utf-8").replace("view/", "my view/")
+    paths[1].write_text(named, encoding="utf-8")
+    names = [camera.name for camera in gather(paths, "m", "m").cameras]
+    assert names == ["my view_0", "my view_1"]
+
+
 def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
     """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
     chain = texts.kalibr()
@@ -93,7 +132,7 @@ def imported(folder: Path, *bodies: str) -> list[str]:
 def test_bodies_whose_files_are_called_like_numbers_of_others_have_names_of_their_own(
     tmp_path: Path,
 ) -> None:
-    assert imported(tmp_path, "s1/a.csv", "s2/a.csv", "a_1.csv") == ["a_2", "a_3", "a_1"]
+    assert imported(tmp_path, "s1/a.csv", "s2/a.csv", "a_1.csv") == ["a", "a_2", "a_1"]
 
 
 def test_a_session_that_cannot_be_read_again_does_not_block_the_next_try(

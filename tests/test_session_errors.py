@@ -123,6 +123,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"start": "[start]"}, ["start.T_world_object: missing", "quaternion_xyzw"]),
     ({"start": "[start]\nrotation_vector = [0, 0, 0]"}, ["start.translation: missing"]),
     (
+        {"start": "[start]\nrotation_vector = [0, 0, 45]\ntranslation = [0, 0, 0]"},  # in degrees
+        ["start.rotation_vector: found an angle of 45 radians", "at most a full turn"],
+    ),
+    (
         {"start": "[start]\ntranslation = [0, 0, 0]"},
         ["start.translation: stands without a rotation", "euler_xyz_deg"],
     ),

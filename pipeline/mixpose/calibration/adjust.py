@@ -214,18 +214,28 @@ def _of_cauchy(dimension: float, tail: float) -> float:
 
 def _inflation(bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats) -> float:
     """By how much frames differ more than independent errors of detections would let them."""
-    # each frame's pull on the rig has the covariance of its information; a common error of its
-    # detections, as of a sensor out of step, makes it larger
-    if not bundle.count:
-        return 1.0
-    pulls = np.zeros((len(bundle.frames), bundle.count))
+    # each frame's pull on the rig has the covariance of its information S; a common error of its
+    # detections, as of a sensor out of step, makes it larger. The fit takes S C S of it away
+    rank, seen, spent = float(np.linalg.matrix_rank(covariance)), 0.0, 0.0
+    for frame in range(len(bundle.frames)):
+        r, A, B = _of_frame(bundle, weighted, frame)
+        A = A - B @ np.linalg.lstsq(B, A, rcond=None)[0]
+        pull, share = A.T @ r, covariance @ (A.T @ A)
+        seen += float(pull @ covariance @ pull)
+        spent += float((share * share.T).sum())
+    return seen / (rank - spent) if seen > 1.3 * (rank - spent) and spent < rank / 2 else 1.0
+
+
+def _of_frame(
+    bundle: Bundle, weighted: Sequence[Weighted], frame: int
+) -> tuple[Floats, Floats, Floats]:
+    """Residuals (n,) of a frame, by the rig (n, G) and by its pose (n, d), in deviations."""
+    parts = []
     for rows, weight in weighted:
-        pull = np.einsum("nmk,nm->nk", rows.by_rig, rows.residual * weight[:, None])
-        np.add.at(pulls, rows.pairs.frame, pull)
-    active = int(np.count_nonzero(pulls.any(axis=1)))
-    rank = int(np.linalg.matrix_rank(covariance))
-    if active <= rank + 2 or not rank:
-        return 1.0
-    seen = float(np.einsum("ki,ij,kj->", pulls, covariance, pulls)) / rank
-    seen *= active / (active - rank)
-    return seen if seen > 1.3 else 1.0
+        own = rows.pairs.frame == frame
+        root = np.sqrt(weight[own])[:, None, None]
+        by_pose = rows.by_pose[own][:, :, bundle.pose_free]
+        each = (rows.residual[own][..., None], rows.by_rig[own], by_pose)
+        parts.append(np.concatenate([root * one for one in each], axis=2))
+    told = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
+    return told[:, 0], told[:, 1 : 1 + bundle.count], told[:, 1 + bundle.count :]

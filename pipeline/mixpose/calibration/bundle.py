@@ -76,7 +76,7 @@ Weighted: TypeAlias = tuple[Rows, Floats]
 def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
     """Residuals and Jacobians of one sensor."""
     rig, clock, frame = state.rig, bundle.clock, pairs.frame
-    eye, tau = rig.sensors[sensor], bundle.clock.tau(rig, sensor, frame)
+    eye, tau = rig.sensors[sensor], clock.tau(rig, sensor, frame, pairs.y)
     at, n = state.poses[frame], len(tau)
     timed = any(b.sensor == sensor and b.kind in ("delay", "drift") for b in bundle.blocks)
     rate, shares, known = np.zeros((n, 6)), np.eye(1, 4).repeat(n, axis=0), np.ones(n, np.bool_)
@@ -87,6 +87,7 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
     arms = np.einsum("nij,nj->ni", at[:, :3, :3], rig.points[pairs.feature])
     world = arms + at[:, :3, 3]
     y, by_world, visible = eye.linearise(world)
+    y = y + rig.beside(sensor, state.poses)[frame, pairs.feature]
     by_pose = pose_jacobian(by_world, arms)
     by_rig = np.zeros((*y.shape, bundle.count))
     for block in bundle.blocks:

@@ -60,7 +60,7 @@ def _generators(
 
     for index, sensor in enumerate(state.rig.sensors):
         kind: Kind = "position" if isinstance(sensor, RangeSensor) else "pose"
-        told(place.get((index, kind)), _sensor_change(sensor))
+        told(place.get((index, kind)), sensor_change(sensor))
         if not hasattr(sensor, "camera_matrix"):
             held.append(np.eye(_GENERATORS)[12:])  # it measures lengths
     told(place.get((None, "body")), _body_change(state.rig.points))
@@ -76,7 +76,7 @@ def _by_motion(points: Floats) -> Floats:
     return pose_jacobian(np.broadcast_to(np.eye(3), (len(points), 3, 3)), points)
 
 
-def _sensor_change(sensor: Any) -> Floats:
+def sensor_change(sensor: Any) -> Floats:
     """Change of a sensor's pose in its axes, or of a position, by all generators."""
     centre = centre_of(sensor)
     moved = np.zeros((3, _GENERATORS))

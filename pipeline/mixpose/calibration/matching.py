@@ -22,8 +22,10 @@ from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.task import SeenFrame
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, twist_between
+from mixpose.sensors.moving import moments, rows_apart
 
 _NODES = 4  # frames that motion is interpolated through
+_STEP = 1e-3  # of a readout: motion in an image is told over it
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +37,11 @@ class Clock:
     late: Floats  # (L, K): seconds from a frame's common time to a sensor's; 0 where not known
     since: Floats  # (L, K): seconds from the middle of the recording
 
-    def tau(self, rig: Rig, sensor: int, frame: Indices) -> Floats:
-        """Seconds from the common time of frames (n,) to when a sensor took them."""
+    def tau(self, rig: Rig, sensor: int, frame: Indices, y: Floats | None = None) -> Floats:
+        """Seconds from the common time of frames (n,) to when a sensor took them, or read y."""
         late = self.late[sensor, frame] + rig.delays[sensor]
-        return np.asarray(late + rig.drifts[sensor] * self.since[sensor, frame])
+        late = late + rig.drifts[sensor] * self.since[sensor, frame]
+        return late if y is None else moments(rig.sensors[sensor], y, late, rig.readouts[sensor])
 
 
 def clock_of(frames: Sequence[SeenFrame], sensors: int, gap: float) -> Clock:
@@ -161,6 +164,14 @@ def _seen(
     if tau.any():
         poses = perturb(poses, interpolate(clock, poses, frame, tau).twist)
     y, visible = state.rig.seen(sensor, poses)
+    readout = state.rig.readouts[sensor]
+    if readout:  # to the first order: a row is read when the body is a little further
+        step = _STEP * readout
+        ahead = perturb(state.poses, interpolate(clock, state.poses, frame, tau + step).twist)
+        y_ahead, there = state.rig.seen(sensor, ahead)
+        rate, eye = (y_ahead - y) / step, state.rig.sensors[sensor]
+        after = moments(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / rows_apart(eye))
+        y, visible = y + rate * after[..., None], visible & there
     for k, each in enumerate(frames):
         points = each.points.get(sensor)
         if points is not None and len(points) and visible[k].any():

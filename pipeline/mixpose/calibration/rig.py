@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
-from mixpose.objective.projection import pose_jacobian
+from mixpose.objective.projection import BodyProjection, pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.rigid import from_parts, inverse, transform
 from mixpose.sensors import CloudSensor, FisheyeCamera, RangeSensor, Sensor, facing
@@ -39,17 +39,22 @@ class Rig:
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
     points: Floats  # (N, 3): features of the body, in its frame
-    normals: Floats | None  # (N, 3)
     delays: Floats  # (L,): seconds by which a sensor's frames are taken later than their times say
     drifts: Floats  # (L,): seconds per second by which that grows
-    labels: tuple[str, ...]  # what the features are called in messages
+    readouts: Floats  # (L,): seconds from a sensor's first row to its last
+    body: Body  # as the session has it: its features' names, normals and sizes
     scale: float = 1.0  # of all lengths, against those that the session says
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:
         """The rig as a session has it."""
         none = np.zeros(len(names))
-        return cls(tuple(names), tuple(sensors), body.means, body.normals, none, none, body.labels)
+        return cls(tuple(names), tuple(sensors), body.means, none, none, none, body)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether sensors look at other moments than the times of their frames."""
+        return bool(np.any([self.delays, self.drifts, self.readouts]))
 
     def placed(self, index: int, T_sensor_world: Floats) -> Rig:
         """The rig with a camera elsewhere."""
@@ -66,7 +71,18 @@ class Rig:
         """Where a sensor sees the features (K, N, m) at poses (K, 4, 4), and which are in view."""
         eye, world = self.sensors[sensor], transform(poses, self.points)
         y, visible = eye.project(world)
-        return y, visible & facing(eye, poses, world, self.normals)
+        return y + self.beside(sensor, poses), visible & facing(
+            eye, poses, world, self.body.normals
+        )
+
+    def beside(self, sensor: int, poses: Floats) -> Floats:
+        """How far images of spheres and disks (K, N, m) are beside those of their centres."""
+        eye, body = self.sensors[sensor], self.body
+        if body.radii is None or eye.dimension == 1:
+            return np.zeros((len(poses), len(self.points), eye.dimension))
+        shown = BodyProjection((eye,), (body,)).project(poses)
+        centres, _ = eye.project(transform(poses, body.means))
+        return np.where(shown.seen[0, ..., None], shown.y[0] - centres, 0.0)
 
 
 class State(NamedTuple):
@@ -129,7 +145,7 @@ def blocks_of(
         blocks.append(Block(kind, index, start, names, units, scales))
         start += len(names)
     if body:
-        names = tuple(f"{label}.{axis}" for label in rig.labels for axis in "xyz")
+        names = tuple(f"{label}.{axis}" for label in rig.body.labels for axis in "xyz")
         radius = float(np.linalg.norm(rig.points - rig.points.mean(axis=0), axis=1).max())
         units, scales = ("length",) * len(names), (radius,) * len(names)
         blocks.append(Block("body", None, start, names, units, scales))

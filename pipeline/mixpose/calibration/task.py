@@ -87,4 +87,4 @@ class Task:
             for frame in self.frames
             for time in frame.times.values()
         )
-        return late or bool(kinds & {"delay", "drift"}) or bool(self.rig.delays.any())
+        return late or bool(kinds & {"delay", "drift"}) or self.rig.is_late

@@ -138,7 +138,7 @@ def _body_lines(found: Calibration, unit: str) -> list[str]:
     deviation = found.deviations[block.place].reshape(-1, 3)
     shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
     lines = []
-    for label, moved, each in zip(found.after.labels, shift, deviation, strict=True):
+    for label, moved, each in zip(found.after.body.labels, shift, deviation, strict=True):
         said = _plus_minus(np.sqrt((each**2).sum()), unit)
         lines.append(f"{f'body feature {label}':<28}moved by {moved:.4g} {said}")
     return lines
@@ -161,7 +161,7 @@ def _worst_lines(found: Calibration) -> list[str]:
     lines = []
     for kind in ("frame", "feature"):
         keys, rms = residuals_by(found, kind)
-        called = found.after.labels if kind == "feature" else dict(zip(keys, keys.astype(str)))
+        called = found.after.body.labels if kind == "feature" else dict(zip(keys, keys.astype(str)))
         typical = np.median(rms) if len(rms) else 1.0
         worst = np.lexsort((keys, -rms))[:_WORST]
         told = ", ".join(f"{called[keys[k]]} ({rms[k] / typical:.2g})" for k in worst)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mixpose.calibration.gauge import sensor_change
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import KINDS, Kind, Rig, centre_of, kinds_of
 from mixpose.errors import SessionError
@@ -30,16 +31,16 @@ _FREES: dict[Kind, tuple[str, ...]] = {
 
 
 def free_parameters(
-    rig: Rig, words: Sequence[str], *, poses_known: bool
+    rig: Rig, words: Sequence[str], *, poses_known: bool, world: str | None = None
 ) -> tuple[dict[int, tuple[Kind, ...]], bool]:
     """Kinds that are free, by sensor, and whether the body is.
 
-    Without words: where all cameras but the first stand, or all where poses are known, and
-    positions of range sensors.  Raises a SessionError if a word names no sensor, or nothing that
-    the sensor has.
+    Without words: where all cameras but the first, or that of the world, stand, or all where poses
+    are known, and positions of range sensors.  Raises a SessionError if a word names no sensor, or
+    nothing that the sensor has.
     """
     if not words:
-        return _default(rig, poses_known=poses_known), False
+        return _default(rig, poses_known, world), False
     found: dict[int, list[Kind]] = {}
     body = False
     for word in words:
@@ -56,9 +57,10 @@ def free_parameters(
     return {index: tuple(kinds) for index, kinds in sorted(found.items())}, body
 
 
-def _default(rig: Rig, *, poses_known: bool) -> dict[int, tuple[Kind, ...]]:
+def _default(rig: Rig, poses_known: bool, world: str | None) -> dict[int, tuple[Kind, ...]]:
     free: dict[int, tuple[Kind, ...]] = {}
     posed = [k for k, sensor in enumerate(rig.sensors) if "pose" in kinds_of(sensor)]
+    posed.sort(key=lambda k: rig.names[k] != world)
     for index, sensor in enumerate(rig.sensors):
         if isinstance(sensor, RangeSensor):
             free[index] = ("position",)
@@ -186,8 +188,21 @@ def in_world(found: Calibration, words: str) -> Calibration:
     else:
         T_new_world = inverse(found.poses[number])
     moved = tuple(sensor.moved(inverse(T_new_world)) for sensor in found.after.sensors)
+    by_old, names = np.eye(len(found.deviations)), found.after.names
+    placed = [(b.sensor, b) for b in found.blocks if b.kind in ("pose", "position")]
+    own = next((b for s, b in placed if s is not None and names[s] == words), None)
+    for sensor, block in placed:
+        if block.kind == "position":
+            by_old[block.place, block.place] = T_new_world[:3, :3]
+        if own is not None and sensor is not None:  # the others move as this one errs
+            change = sensor_change(moved[sensor])[:, :6]
+            by_old[block.place, own.place] = change if block is not own else 0.0
+    covariance = by_old @ found.covariance @ by_old.T
+    told = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     return replace(
         found,
+        covariance=covariance,
+        deviations=np.where(np.isfinite(found.deviations), told, np.inf),
         after=replace(found.after, sensors=moved),
         poses={number: T_new_world @ T for number, T in found.poses.items()},
         gauge=(*found.gauge, f"the world is that of {words}"),

@@ -112,16 +112,19 @@ def task_of(
     setups = session.sensors
     rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
     late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
-    rig = replace(rig, delays=np.array(late, dtype=np.float64))
+    readouts = np.array([one.readout for one in setups], dtype=np.float64)
+    rig = replace(rig, delays=np.array(late, dtype=np.float64), readouts=readouts)
     known = None if request.poses is None else known_poses(request.poses, session)
     # one word of --free may hold several
     free_words = [part for word in request.free or () for part in word.split()]
-    free, body = free_parameters(rig, free_words, poses_known=known is not None)
+    free, body = free_parameters(
+        rig, free_words, poses_known=known is not None, world=request.world
+    )
     pair = None if request.length is None else known_length(rig, request.length)[0]
     if pair is not None and known is not None:
         raise SessionError("--length: stands beside --poses, which give the scale; drop one")
     kinds = {kind for each in free.values() for kind in each}
-    runs = bool(kinds & {"delay", "drift"})
+    runs = bool(kinds & {"delay", "drift"}) or rig.is_late
     frames = read_frames(
         session, named_sources(request.source or ()), rules, progress, runs=runs, known=known
     )

@@ -1,8 +1,8 @@
-"""Frames of several sensors, joined by their numbers, or by the stamps that images are named after.
+"""Frames of several sensors, joined by their numbers, or by the stamps that they go by.
 
 Robots' recorders name images after the nanosecond they were taken in.  The names then say when, and
 cameras that were triggered together differ by some microseconds: their frames are paired by the
-nearest stamp instead of by equal numbers.
+nearest stamp instead of by equal numbers.  So are those of tables that have times and no numbers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
-from statistics import median
+from statistics import median_low
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from mixpose.frames.images import ImageSequence
 from mixpose.frames.live import LiveSource, join_live
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Source, selection
+from mixpose.frames.tables import DetectionTable
 from mixpose.records import FrameSet, RawFrame
 
 READY_BYTES = 2**24
@@ -30,7 +31,7 @@ READY_BYTES = 2**24
 MOST_MORE = 13
 """Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
 
-_SHARE = 0.5  # of the usual distance of frames: farther apart they belong to different moments
+_PART = 2  # of the usual distance of frames a half: farther apart they are different moments
 
 
 def pair(
@@ -105,27 +106,35 @@ def _more_ahead(frame: RawFrame) -> int:
 
 
 def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
-    """Sources of which those named by stamps count frames alike; each keeps its own times.
+    """Sources of which those that go by stamps count frames alike; each keeps its own times.
 
     A frame gets the number of the nearest one of the sensors before, if that is nearer than half
     the usual distance between frames and has no nearer one of the same sensor.
     """
-    stamped = {
-        name: source
-        for name, source in sources.items()
-        if isinstance(source, ImageSequence) and source.is_stamped
-    }
+    stamped = {name: found for name, source in sources.items() if (found := _stamps_of(source))}
     if len(stamped) < 2:
         return dict(sources)
-    paired = dict(sources)
-    known: list[int] = []
-    steps = [[b - a for a, b in pairwise(source.numbers)] for source in stamped.values()]
-    reach = _SHARE * min((median(each) for each in steps if each), default=math.inf)
-    for name, source in stamped.items():
-        numbers = _nearest(source.numbers, known, reach)
-        paired[name] = _renumbered(source, numbers)
-        known = sorted({*known, *numbers})
-    return paired
+    numbers, known = dict[str, list[int]](), list[int]()
+    steps = [[b - a for a, b in pairwise(stamps)] for stamps in stamped.values()]
+    reach = min((median_low(each) // _PART for each in steps if each), default=math.inf)
+    for name, stamps in stamped.items():
+        numbers[name] = _nearest(stamps, known, reach)
+        known = sorted({*known, *numbers[name]})
+    # beside images a moment has their number, else its place among all
+    named = any(isinstance(sources[name], ImageSequence) for name in stamped)
+    places = {stamp: stamp if named else place for place, stamp in enumerate(known)}
+    renumbered = {
+        name: _renumbered(sources[name], [places[stamp] for stamp in found])
+        for name, found in numbers.items()
+    }
+    return {**sources, **renumbered}
+
+
+def _stamps_of(source: Source) -> Sequence[int]:
+    """Nanoseconds that frames of a source go by; none where they have numbers."""
+    if isinstance(source, ImageSequence):
+        return source.numbers if source.is_stamped else ()
+    return source.stamps if isinstance(source, DetectionTable) else ()
 
 
 def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
@@ -143,8 +152,11 @@ def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list
     return found
 
 
-def _renumbered(source: ImageSequence, numbers: Sequence[int]) -> ImageSequence:
-    """The same images with other numbers, and the times that they had."""
+def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
+    """The same frames with other numbers, and the times that they had."""
+    if isinstance(source, DetectionTable):
+        return replace(source, places=numbers)
+    assert isinstance(source, ImageSequence), "what has stamps"
     clock = source.clock
     assert clock is not None, "stamps tell the time"
     times = {new: clock(old) for new, old in zip(numbers, source.numbers, strict=True)}

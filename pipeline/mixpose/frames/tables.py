@@ -77,6 +77,8 @@ class DetectionTable(Source):
     columns: tuple[str, ...]
     coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
     clock: Clock | None  # gives the time of a frame number; None means the times in the table
+    # numbers of its moments, where it has times alone and others have moments that it lacks
+    places: Sequence[int] = range(2**62)
 
     @property
     def length(self) -> int:
@@ -105,14 +107,23 @@ class DetectionTable(Source):
         if isinstance(self.clock, FrameTimes):
             require_times(self.clock, (number for number in self.numbers() if number in wanted))
 
+    @property
+    def stamps(self) -> list[int]:
+        """Its moments in nanoseconds, ascending, where they are all that its frames go by."""
+        if self._is_numbered or self.clock is not None:
+            return []
+        return [int(key // 1) * 10**9 + round(key % 1 * 1e9) for key in self._keys()]
+
     def numbers(self) -> list[int]:
         """Frame numbers, ascending, up to the first row that cannot be read."""
-        if not self._is_numbered:
-            return list(range(self.length))
-        numbers: set[int] = set()
+        keys = self._keys()
+        return list(map(int, keys if self._is_numbered else self.places[: len(keys)]))
+
+    def _keys(self) -> list[float]:
+        keys: set[float] = set()
         with suppress(RecordingError):  # `frames` comes to it too
-            numbers.update(int(key) for key, _, _ in self._rows())
-        return sorted(numbers)
+            keys.update(key for key, _, _ in self._rows())
+        return sorted(keys)
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
@@ -133,7 +144,7 @@ class DetectionTable(Source):
                 )
             rows = iter(sorted(unsorted, key=itemgetter(0)))
         for place, (key, group) in enumerate(groupby(rows, key=itemgetter(0))):
-            number = int(key) if self._is_numbered else place
+            number = int(key) if self._is_numbered else self.places[place]
             if number >= wanted.stop:
                 return
             if number in wanted:
@@ -216,7 +227,7 @@ class DetectionTable(Source):
         if first is None or last is None:
             return _Contents(in_order, 0, 0, None, None)
         if not self._is_numbered:
-            first, last = 0, frames - 1
+            first, last = self.places[0], self.places[frames - 1]
         return _Contents(in_order, rows, frames, int(first), int(last))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mixpose.errors import SessionError
 from mixpose.naming import distinct
-from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.session.calibration import CalibratedCamera, Rig, read_rigs
 from mixpose.session.marker_files import READERS, read_marker_file
 from mixpose.session.messages import BadKeyError, one_line
@@ -76,7 +76,10 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
         remarks.append(remark)
         warnings.append(warning)
         factor = length_ratio(stated, unit)
-        cameras += [replace(c, T_camera_rig=_scaled(c.T_camera_rig, factor)) for c in rig.cameras]
+        for camera in rig.cameras:
+            T = camera.T_camera_rig
+            scaled = None if T is None else from_parts(T[:3, :3], factor * T[:3, 3])
+            cameras.append(replace(camera, T_camera_rig=scaled))
     cameras = _renamed(cameras)
     return Imported(
         unit,
@@ -116,14 +119,6 @@ def _renamed(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
     return [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
 
 
-def _scaled(T: Floats | None, factor: float) -> Floats | None:
-    if T is None:
-        return None
-    scaled = T.copy()
-    scaled[:3, 3] *= factor
-    return scaled
-
-
 def _odd(cameras: list[CalibratedCamera]) -> list[str]:
     """Cameras without a place, without a size, or that are there twice."""
     warnings = []
@@ -137,6 +132,13 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
         warnings.append(
             f"{', '.join(unsized)}: the files do not say how large images are; see that recordings "
             "have the size that was calibrated"
+        )
+    lenses = {camera.name: camera.intrinsics for camera in cameras}
+    four = [name for name, k in lenses.items() if k.model is None and k.distortion.size == 4]
+    if four:
+        warnings.append(
+            f"{', '.join(four)}: four coefficients of distortion are a pinhole's or a fisheye's, "
+            'and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
         )
     for camera in cameras:
         warnings += _outside(camera)
@@ -189,24 +191,11 @@ def _objects(imported: Imported, output: Path) -> list[str]:
         ]
     heading = "[object]" if len(imported.bodies) == 1 else "[[object]]"
     texts = []
-    for path, name in zip(imported.bodies, _names(imported.bodies), strict=True):
+    names = distinct([path.stem for path in imported.bodies], str)
+    for path, name in zip(imported.bodies, names, strict=True):
         file = json.dumps(_relative(path, output), ensure_ascii=False)
         texts.append(f"{heading}\nname = {json.dumps(name, ensure_ascii=False)}\nfile = {file}")
     return texts
-
-
-def _names(bodies: Sequence[Path]) -> list[str]:
-    """Names of bodies, all different: those of their files, with numbers where files share one."""
-    stems = [path.stem for path in bodies]
-    taken = {stem for stem in stems if stems.count(stem) == 1}
-    names = []
-    for number, stem in enumerate(stems, 1):
-        name = stem
-        while stems.count(stem) > 1 and (name == stem or name in taken):
-            name, number = f"{stem}_{number}", number + 1  # noqa: PLW2901
-        taken.add(name)
-        names.append(name)
-    return names
 
 
 def _relative(path: Path, output: Path) -> str:

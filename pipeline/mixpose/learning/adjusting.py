@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mixpose.body import Body, PointFeature
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame
 from mixpose.calibration.adjust import Adjusted, adjust
 from mixpose.calibration.bundle import Bundle
@@ -93,7 +94,7 @@ def adjusted(
             if kept.all():
                 rig, blocks = found.state.rig, found.covariance.reshape(len(points), 3, -1, 3)
                 one = Learnt(
-                    names=rig.labels,
+                    names=rig.body.labels,
                     points=rig.points,
                     covariances=np.array([blocks[k, :, k] for k in range(len(points))]),
                     frames=seen,
@@ -140,9 +141,8 @@ def _left(seen: SeenFrame, others: Sequence[Indices]) -> SeenFrame:
 
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
-    rules, none = CalibrationRules(), np.zeros(len(eyes.sensors))
-    labels = tuple(str(k + 1) for k in range(len(points)))
-    rig = Rig(eyes.names, eyes.sensors, points, None, none, none, labels)
+    rules = CalibrationRules()
+    rig = Rig.of(eyes.names, eyes.sensors, Body("", tuple(map(PointFeature, points))))
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
     free = np.ones(6, dtype=np.bool_)
     state = State(rig, poses)

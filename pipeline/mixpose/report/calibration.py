@@ -98,7 +98,7 @@ def _residuals(found: Calibration, kind: Literal["frame", "feature"]) -> Chart:
         axes.plot(numbers, values, ".", markersize=4, **POSE)
         axes.set(xlabel="frame", ylim=(0, None))
     else:
-        labels = [found.after.labels[k] for k in numbers]
+        labels = [found.after.body.labels[k] for k in numbers]
         numbers = numbers + 1
         axes.bar(numbers, values, **BARS)
         if len(numbers) <= _MOST_NAMED:

@@ -66,9 +66,21 @@ def rigid(matrix: Floats, key: str) -> Floats:
     )
 
 
+def rotation_of_vector(values: Floats, key: str) -> Rotation:
+    """The rotation of a vector (3,), refused where it must be in degrees."""
+    angle = float(np.linalg.norm(values))
+    if angle > 2 * np.pi:
+        raise BadKeyError(
+            f"found an angle of {angle:.6g} radians; allowed: axis times angle in radians, at most "
+            "a full turn, 6.283",
+            key,
+        )
+    return Rotation.from_rotvec(values)
+
+
 def _rotation(key: str, values: Floats) -> Rotation:
     if key == "rotation_vector":
-        return Rotation.from_rotvec(values)
+        return rotation_of_vector(values, key)
     if key == "euler_xyz_deg":
         # about the fixed axes, x first, as the paper's R3 R2 R1
         return Rotation.from_euler("xyz", values, degrees=True)

@@ -67,8 +67,8 @@ def _kind(content: Content) -> str:
                 return "cameras"
         case [number, count, "CAMERA" | "IMU", *_] if _is_integer(number) and _is_integer(count):
             return "rigs"
-        case [number, *pose, camera, _] if len(pose) == 7 and _is_integer(number):
-            if _is_integer(camera) and len(row) == 10:
+        case [number, _, _, _, _, _, _, _, camera, name, *_] if _is_integer(number):
+            if _is_integer(camera) and not _is_integer(name):  # which may have blanks
                 return "images"
     return ""
 

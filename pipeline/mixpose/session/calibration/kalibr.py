@@ -6,6 +6,7 @@ programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` in its place
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,13 @@ _MATRIX = "a 4x4 matrix, four rows of four numbers"
 
 
 def _cameras(content: Content) -> list[str]:
-    return [
+    named = [
         name
         for name, camera in content.mapping.items()
         if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
     ]
+    # YAML's writers put cam10 before cam2, and the one before it is cam9
+    return sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
 
 
 def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:

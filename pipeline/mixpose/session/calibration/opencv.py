@@ -118,7 +118,8 @@ def _cameras(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
             pairs = [f"{usual}{suffix}" for usual in DISTORTION_NODES]
             label = match[2] if match[2].isalpha() else f"camera{match[2]}"
             numbered[label] = (name, next((each for each in pairs if each in opened.nodes), ""))
-    return numbered
+    # R and T lead from the first, which need not come first
+    return dict(sorted(numbered.items(), key=lambda each: (len(each[0]), each[0])))
 
 
 def _usual(opened: _Nodes, names: tuple[str, ...]) -> str | None:

@@ -13,7 +13,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.session.intrinsics import CameraModel, column_as_list
 from mixpose.session.messages import BadKeyError, found, one_of, under
-from mixpose.session.motion import rigid
+from mixpose.session.motion import rigid, rotation_of_vector
 from mixpose.session.values import numbers, resolution
 
 # Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
@@ -40,7 +40,7 @@ def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floa
         values = numbers(rotation, (3, 3) if is_matrix else (3,), allowed)
     if is_matrix:
         return rigid(from_parts(values, t), key)
-    return from_parts(Rotation.from_rotvec(values).as_matrix(), t)
+    return from_parts(rotation_of_vector(values, key).as_matrix(), t)
 
 
 def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) -> Floats:
