@@ -10,7 +10,7 @@ the session tells it as its mirror image is a mistake like others: what frames s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
