@@ -77,8 +77,9 @@ def test_nothing_is_overwritten_but_what_mixpose_wrote(
 def test_a_system_may_be_called_by_what_would_be_a_formula(tmp_path: Path) -> None:
     session, picture = tmp_path / r"$\q$.toml", tmp_path / "study.png"
     session.write_bytes(TWO_CAMERAS.read_bytes())
+    flat = ["--volume", "100,0,0"]  # which is a volume, too
     with pytest.raises(SystemExit) as leaving:
-        main(["design", str(session), "--count", "2", "--plot", str(picture)])
+        main(["design", str(session), "--count", "2", *flat, "--plot", str(picture)])
     assert leaving.value.code == 0
     assert picture.stat().st_size > 1000
 

@@ -94,8 +94,9 @@ def test_axes_by_markers_put_them_there(five: tuple[Array, Lesson]) -> None:
     assert np.abs(at["2"]).max() < 1e-9
     assert np.abs(at["5"][1:]).max() < 1e-9 < at["5"][0]
     assert abs(at["1"][2]) < 1e-9 < at["1"][1]
-    with pytest.raises(SessionError, match="allowed: ORIGIN,X,Y, three of the markers 1, 2, 3"):
-        by_markers(five[1].bodies[0], "1,2,9")
+    for words in ("1,2,9", "1,1,2", "1,2,3,1"):
+        with pytest.raises(SessionError, match="allowed: ORIGIN,X,Y, three of the markers 1, 2, 3"):
+            by_markers(five[1].bodies[0], words)
 
 
 def test_an_older_table_gives_axes_names_and_order(five: tuple[Array, Lesson]) -> None:

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 import mutants as tool
 from mutation.drawn import ROOMS, candidates, chosen_tests, drawn, reason_why_harmless
 from mutation.executed import Executed, context_name, digest, read, record
-from mutation.harmless import HARMLESS, Harmless
+from mutation.harmless import GUARDED, HARMLESS, Harmless
 from mutation.mutant import MutationError
 from mutation.rules import changes
 
@@ -251,6 +251,13 @@ def test_nothing_is_tried_where_no_record_is(tree: Path, monkeypatch: pytest.Mon
     options = Namespace(random=1, seed=0, room=[], record=False)
     with pytest.raises(MutationError, match="found no record of what tests execute; add --record"):
         tool.tried_at_random(tree, tree / "none", options)
+
+
+def test_lists_of_one_length_need_not_be_told_to_be(tree: Path) -> None:
+    room = "a = zip(b, c, strict=True)\nd = sorted(e, reverse=True)\n"
+    (tree / tool.PACKAGE / "runner.py").write_text(room, encoding="utf-8")
+    found = [reason_why_harmless(one) for one in candidates(tree / tool.PACKAGE, "runner")]
+    assert found == [GUARDED, None]
 
 
 @pytest.mark.parametrize("one", HARMLESS, ids=lambda one: one.new)

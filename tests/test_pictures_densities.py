@@ -118,6 +118,9 @@ def test_peaks_are_shown_whole_and_titles_hide_nothing_of_them(
         edge = np.concatenate([panel[0], panel[-1], panel[:, 0], panel[:, -1]])
         assert edge.max() < 10
         assert panel.max() > 100
+        # the scale below has a white line, two pixels wide, at the power of ten that is in it
+        scale = picture[first + title + 200 + gap]
+        assert (scale == 255).all(axis=-1).sum() == 2
 
 
 def test_a_panel_shows_a_detection_where_it_is(parallel_cameras: list[ParallelBeam]) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,6 +108,44 @@ def test_the_start_of_identical_bodies_is_that_of_the_first(session: Session) ->
     first, second = runner.scene_of(pair, {pair.labels[1]: T_second}).bodies
     np.testing.assert_array_equal(first.T_start, T)
     np.testing.assert_array_equal(second.T_start, T_second)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
+    """Session and poses to begin at by which a run makes its scene."""
+
+    def of_run(session: Session, **options: Any) -> list[Any]:
+        found: list[Any] = []
+
+        def scene_of(*those: Any) -> None:
+            found.extend(those)
+            raise EndError
+
+        monkeypatch.setattr(runner, "scene_of", scene_of)
+        with pytest.raises(EndError):
+            runner.run(session, **options)
+        return found
+
+    return of_run
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [(("camera",) * 2, "thorough"), (("live", "camera"), "thorough"), (("live",) * 2, "live")],
+)
+def test_the_search_is_in_haste_only_where_all_sources_are_live(
+    session: Session, asked: Callable[..., list[Any]], kinds: tuple[str, ...], expected: str
+) -> None:
+    opened = {setup.name: Namespace(kind=k) for setup, k in zip(session.sensors, kinds)}
+    assert asked(session, opened=opened)[0].estimator.search == expected
+
+
+def test_one_pose_to_begin_at_is_that_of_the_first_body(
+    session: Session, asked: Callable[..., list[Any]]
+) -> None:
+    first, second = replace(session, count=2).labels
+    for given, expected in ((np.eye(4), [first]), ({second: np.eye(4)}, [second]), (None, [])):
+        assert list(asked(replace(session, count=2), T_start=given)[1]) == expected
 
 
 def test_cameras_have_windows_where_thresholds_are_those_of_the_whole_frame(

@@ -85,6 +85,14 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
     assert names(9) == [triples, rays, rays, point]  # more than two detections for a feature
 
 
+def test_a_point_and_two_rays_give_each_pose_once(pinhole_cameras: list[PinholeCamera]) -> None:
+    seen = sensor_detections(detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=0.1), EIGHT)
+    guesses = generators_of(SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4)))[1]
+    poses = next(guesses)()
+    # of two rays and two features, not the other way round again; a ray that passes by is met once
+    assert len(np.unique(poses.round(6), axis=0)) == len(poses) > 100
+
+
 def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
     # 8 of 56 rays in one place: of triples drawn anywhere 1 in 500 is of them, of a ray and two
     # of the 7 nearest to it 1 in 7

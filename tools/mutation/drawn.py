@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from mutation.executed import Executed
-from mutation.harmless import HARMLESS
+from mutation.harmless import GUARDED, HARMLESS
 from mutation.mutant import Mutant, MutationError
 from mutation.rules import Change, changes
 
@@ -100,6 +100,8 @@ def chosen_tests(mutant: Drawn, executed: Executed, seconds: float) -> list[str]
 
 def reason_why_harmless(mutant: Drawn) -> str | None:
     """Why a mutant need fall to no test, None where it should."""
+    if mutant.new.count("strict=False") > mutant.old.count("strict=False"):
+        return GUARDED
     known = {(each.file, each.old, each.new): each.reason for each in HARMLESS}
     return known.get((mutant.file, mutant.old, mutant.new))
 

@@ -27,6 +27,8 @@ class Harmless:
     reason: str
 
 
+GUARDED = "zip(strict=True) only guards against lists that the code made of different lengths"
+
 HARMLESS: tuple[Harmless, ...] = (
     Harmless(
         "calibration/latecomers.py",

@@ -128,7 +128,7 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
 
 def _time_of_stamp(stamp: int) -> float:
     """Nanoseconds as seconds."""
-    return stamp // 10**9 + stamp % 10**9 * 1e-9
+    return stamp / 10**9  # of whole numbers, which Python rounds once
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:

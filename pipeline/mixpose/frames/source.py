@@ -92,7 +92,7 @@ def selection(start: int | None, stop: int | None, step: int, first: int | None)
     if step < 1:
         raise SessionError(f"step: found {step}, allowed is a whole number from 1")
     if start is None:
-        start = 0 if first is None else first
+        start = first or 0
     return range(start, _BEYOND_ALL_NUMBERS if stop is None else stop, step)
 
 

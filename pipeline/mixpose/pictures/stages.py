@@ -334,7 +334,7 @@ def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
         u, word = width * (power - np.log10(bottom)) / np.log10(top / bottom), f"1e{power:.0f}"
         reach = canvas.width_of(picture, word, size=size) + 0.5 * line
         if free <= u < end - reach:
-            picture[: len(bar), max(round(u) - 1, 0) : round(u) + 1] = 255
+            picture[: len(bar), round(u) : round(u) + 2] = 255
             canvas.words(picture, word, (u, baseline), WHITE, size=size)
             free = u + reach
     return picture

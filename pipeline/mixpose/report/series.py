@@ -217,7 +217,6 @@ def rotation_vector_jacobian(vector: Floats) -> Floats:
     """
     x, y, z = vector
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = float(np.linalg.norm(vector))
-    # 1/12 is the limit; near it the difference of large numbers would say nothing
-    share = 1 / 12 if angle < 1e-4 else 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))
+    angle = max(float(np.linalg.norm(vector)), 1e-9)  # of less nothing would be left of the share
+    share = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))
     return np.asarray(np.eye(3) - across / 2 + share * across @ across)

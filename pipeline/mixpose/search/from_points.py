@@ -241,7 +241,7 @@ def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Flo
         cuts[:, i] = False
         half = np.sqrt(np.maximum(half2[cuts], 0.0))
         ray, feature = np.tile(np.nonzero(cuts), 2)
-        depth = along[ray] + np.concatenate([half, -half])
+        depth = along[ray] + np.concatenate([half, np.where(half > 0, -half, -np.inf)])
         ahead = depth > start[ray]
         ray, feature, depth = ray[ahead], feature[ahead], depth[ahead]
         places = origins[ray] + depth[:, None] * directions[ray]
