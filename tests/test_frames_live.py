@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import SourceSpec, capture, live, open_source, pair
 from mixpose.frames.source import Source
-from mixpose.records import RawFrame
+from mixpose.records import Moment, PointPattern, RawFrame
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+NOTHING = PointPattern(np.empty((0, 2)), np.empty(0))
 CLIP = SYNTHETIC / "one_camera_video" / "camera.avi"
 needs_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
 
@@ -220,6 +221,24 @@ def test_selected_frames_of_a_live_stream_end_the_reading(server: str) -> None:
     assert numbers
     assert min(numbers) >= 2
     assert max(numbers) < 9
+
+
+def test_no_frame_is_waited_for_after_the_last_that_is_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Reader(nullcontext[Any]):
+        has_ended = False
+
+        def wait(self, after: int, _: object) -> None:
+            assert after < 2
+
+        def newer_than(self, number: int) -> list[RawFrame]:
+            return [RawFrame(number + 1, 0.0, NOTHING, Moment(0.0, "arrival"))]
+
+    monkeypatch.setattr(Reader, "__enter__", lambda self: self)
+    monkeypatch.setattr(live, "_Reader", lambda *_: Reader())
+    source = opened("http://127.0.0.1:9/live")
+    assert [frame.number for frame in source.frames(1, 3)] == [1, 2]
 
 
 def test_live_source_beside_a_recording_is_refused(server: str) -> None:

@@ -14,7 +14,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Status
-from mixpose.report.figures import TimeAxes, blank
+from mixpose.report.figures import TimeAxes, blank, limit
 from mixpose.report.overlays import chosen_frames
 from mixpose.report.series import (
     errors_of,
@@ -100,6 +100,20 @@ def test_a_line_breaks_where_frames_are_left_out_and_where_a_turn_wraps(tmp_path
     drawn = np.asarray(axes.lines[-1].get_ydata())
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [2, 4]
     assert frame_ranges(series, "ok") == [(10, 14), (20, 22)]
+
+
+def test_values_fill_a_figure_and_not_the_widest_of_their_bands() -> None:
+    _, axes = blank()
+    values, widths = np.linspace(2.0, 4.0, 20), np.full(20, 0.05)
+    widths[3] = 50.0
+    limit(axes, values, None, widths)
+    assert axes.get_ylim() == pytest.approx((1.88, 4.12))  # 6 % of what they span, to either side
+    limit(axes, np.append(values, np.nan), np.array([6.0]), 8 * widths)
+    assert axes.get_ylim() == pytest.approx((1.52, 6.48))  # 1.2 times a band that is usual
+    limit(axes, np.full(20, 5.0), None, 0 * widths)
+    assert axes.get_ylim() == pytest.approx((4.995, 5.005))  # held: a thousandth of it
+    limit(axes, np.full(20, np.nan), None, widths)
+    assert axes.get_ylim() == pytest.approx((4.995, 5.005))  # nothing to fill it
 
 
 def test_a_single_frame_between_lost_ones_is_a_dot_in_a_long_run(tmp_path: Path) -> None:

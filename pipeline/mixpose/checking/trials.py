@@ -188,7 +188,7 @@ def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
     session, rules = case.session, DiagnosisRules()
 
     def best() -> list[_Runner]:
-        ahead = [one for one in runners if one.poses and one.gain(case.before) > rules.margin]
+        ahead = [one for one in runners if one.gain(case.before) > rules.margin]
         ahead.sort(key=lambda one: -one.gain(case.before))
         return [] if ahead and ahead[0].explains(rules) else ahead[: rules.leaders]
 

@@ -123,7 +123,7 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
         given = dict.fromkeys(readers, -1)
         stalled: set[str] = set()
         number = -1
-        while True:
+        while number + 1 < wanted.stop:
             for sensor, reader in readers.items():
                 waits = sensor not in stalled or len(stalled) == len(readers)
                 patience = None if given[sensor] < 0 else STALLED_S if waits else 0.0
@@ -140,8 +140,6 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             frames = _together(going)
             given.update((sensor, frame.number) for sensor, frame in frames.items())
             number = max(number + 1, *given.values())
-            if number >= wanted.stop:
-                return
             if number in wanted:
                 frames = {sensor: replace(frame, number=number) for sensor, frame in frames.items()}
                 yield FrameSet(number, next(iter(frames.values())).time_s, frames)

@@ -358,7 +358,7 @@ def _values(
     panel.draw(values)
     mark_ambiguous(upper, series.x, values, series)
     panel.frame()
-    _limit(upper, values, truth, half_width)
+    limit(upper, values, truth, half_width)
     upper.tick_params(labelbottom=False)
     below = TimeAxes(lower, series)
     below.mark_lost()
@@ -384,7 +384,7 @@ def _open(is_open: Flags, half_width: Floats) -> str:
     return f"open in {count} of {known} frames, where any value fits: no band"
 
 
-def _limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:
+def limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:
     """Let the values fill the figure, not the widest of the bands."""
     shown = values if truth is None else np.concatenate([values, truth])
     shown = shown[np.isfinite(shown)]

@@ -130,10 +130,10 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
             away, _ = cKDTree(sensor.points).query(y)
             met = seen & (away < problem.reach(sensor))
             support += met
-            error += np.where(met, away / problem.reach(sensor), 0.0)
+            error[met] += away[met] / problem.reach(sensor)
         left = np.ones(len(places), dtype=np.bool_)
         beside = cKDTree(places).query_ball_point(places, points.tolerance, p=np.inf)
-        for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
+        for k in np.lexsort((error, -support)):
             if left[k] and len(kept) < most:
                 kept.append(k)
                 left[beside[k]] = False
