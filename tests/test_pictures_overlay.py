@@ -30,7 +30,7 @@ from mixpose.pictures.overlay import (
     projected_covariances,
     projected_features,
 )
-from mixpose.pictures.scene import draw_ranges, draw_scene
+from mixpose.pictures.scene import backdrop, draw_ranges, draw_scene
 from mixpose.pictures.signature import is_ours
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
@@ -347,6 +347,14 @@ def test_a_sensor_without_a_frame_keeps_its_place_in_the_picture(recording: Path
     assert whole.shape == half.shape
     assert np.array_equal(whole[:, :640], half[:, :640])
     assert not np.array_equal(whole[:, 644:], half[:, 644:])
+
+
+def test_a_camera_of_no_known_size_has_room_for_what_it_found() -> None:
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    setup = replace(session.sensors[0], resolution=None)
+    for points, size in ((np.array([[905.0, 705.0]]), (776, 996)), (np.empty((0, 2)), (480, 640))):
+        frame = RawFrame(0, None, PointPattern(points, np.ones(len(points))))
+        assert backdrop(setup, frame, None)[0].shape[:2] == size
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,14 @@ def test_several_cameras_look_at_the_body_together(tmp_path: Path) -> None:
     place = transform(central_pose(session, 0), pivot_of(session.body)[None])[0]
     np.testing.assert_allclose(place, target, atol=1e-6)
     assert count_seen(session, central_pose(session, 0)) == 8
+
+
+def test_parallel_beams_meet_in_the_middle_of_their_images() -> None:
+    path = Path(__file__).parents[1] / "data" / "synthetic" / "parallel_beams" / "session.toml"
+    session = replace(load_session(path), start=None)
+    place = transform(central_pose(session, 0), pivot_of(session.body)[None])
+    for setup in session.sensors:
+        assert setup.sensor.project(place)[0][0] == pytest.approx([199.5, 159.5])  # of 400 x 320
 
 
 def test_cameras_side_by_side_have_the_body_before_them(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def solved(
     inner = basis.T @ S @ basis
     pulls = scales[:, None] * held  # of held parameters that are a standard deviation off
     told = _told(inner, basis.T @ pulls)
-    values, vectors = np.linalg.eigh((told + told.T) / 2)
+    values, vectors = np.linalg.eigh(told)
     known = values > 1.0 / bundle.rules.undetermined**2
     V = basis @ vectors[:, known]
     covariance = V @ np.linalg.inv(V.T @ S @ V) @ V.T
