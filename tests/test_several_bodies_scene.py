@@ -156,11 +156,14 @@ def test_identical_bodies_lost_together_come_back_in_doubt_for_one_frame() -> No
     assert sum(rival.weight for rival in told.hypotheses) <= 1.0 + 1e-9
 
 
-def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_not_seen() -> None:
-    shared = TOOL[:4]
-    one = body("one", np.concatenate([shared[:3], [[70.0, 60.0, -50.0]], [[-60.0, -40.0, 30.0]]]))
-    other = body("other", np.concatenate([shared[:3], [[-50.0, 20.0, 70.0]], [[30.0, 80.0, 40.0]]]))
-    part = body("part", shared[:3])
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_not_seen(
+    count: int,
+) -> None:
+    shared = TOOL[:count]
+    one = body("one", np.concatenate([shared, [[70.0, 60.0, -50.0]], [[-60.0, -40.0, 30.0]]]))
+    other = body("other", np.concatenate([shared, [[-50.0, 20.0, 70.0]], [[30.0, 80.0, 40.0]]]))
+    part = body("part", shared)
     T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
     scene = scene_of(one, other)
     _, alone = scene.advance(scene.begin(), 0, None, views_of([part], [T], 5))
