@@ -134,13 +134,15 @@ class Body:
         """The same of what turns with the body."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariances).max(), 0.0)))
 
+    def feature_spreads(self, T_world_object: Floats) -> Floats:
+        """Spreads Σ_i of the features (..., N, 3, 3) in the world, at poses (..., 4, 4)."""
+        R = T_world_object[..., None, :3, :3]
+        spreads = R @ self.covariances @ R.swapaxes(-1, -2)
+        return np.asarray(spreads if self.gravity is None else spreads + self.gravity.covariance)
+
     def node_spreads(self, T_world_object: Floats) -> Floats:
-        """Spreads Σ_i of the nodes (Q, 3, 3) in the world, of the body at a pose (4, 4)."""
-        R = T_world_object[:3, :3]
-        spreads = R @ self.covariances @ R.T
-        if self.gravity is not None:
-            spreads = spreads + self.gravity.covariance
-        return np.asarray(spreads[self.nodes.feature])
+        """The same of the nodes (Q, 3, 3), at a pose (4, 4)."""
+        return np.asarray(self.feature_spreads(T_world_object)[self.nodes.feature])
 
     @cached_property
     def symmetries(self) -> Floats:

@@ -88,9 +88,8 @@ def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
 def predict(plan: Plan, poses: Floats) -> Prediction:
     """Predict the covariance of one frame at each of P poses (P, 4, 4)."""
     points, count = plan.body.means, len(poses)
-    rotations = poses[:, :3, :3]
-    world, arms = transform(poses, points), points @ rotations.swapaxes(1, 2)
-    spread = _marker_covariances(plan.body, rotations)
+    world, arms = transform(poses, points), points @ poses[:, :3, :3].swapaxes(1, 2)
+    spread = plan.body.feature_spreads(poses)
     H, V = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     G = np.zeros((count, len(points), 6, 3))
     seen = np.zeros((count, len(plan.sensors), len(points)), dtype=np.bool_)
@@ -124,14 +123,6 @@ def at_tip(prediction: Prediction, tip: Floats) -> Floats:
     for p, axis in np.argwhere(touched):
         result[p, axis, axis] = np.inf
     return np.asarray(result)
-
-
-def _marker_covariances(body: Body, rotations: Floats) -> Floats:
-    """Spreads of features in world axes (P, N, 3, 3)."""
-    turned = rotations[:, None] @ body.covariances @ rotations[:, None].swapaxes(-1, -2)
-    if body.gravity is not None:
-        turned = turned + body.gravity.covariance
-    return np.asarray(turned)
 
 
 def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
