@@ -26,6 +26,20 @@ Floats = np.ndarray
 LENS = np.array([-0.08, 0.01, 5e-4, -4e-4])
 
 
+def test_free_is_what_words_name_and_the_body_only_where_they_do() -> None:
+    rig = task_of(cameras(3), recording(cameras(3), 2, 0.02)).rig
+    others = {1: ("pose",), 2: ("pose",)}
+    assert free_parameters(rig, [], poses_known=False) == (others, False)
+    assert free_parameters(rig, [], poses_known=True) == ({0: ("pose",), **others}, False)
+    assert free_parameters(rig, ["s1:focal,pose"], poses_known=False) == (
+        {1: ("focal", "pose")},
+        False,
+    )
+    named = ["s2:pose", "body", "focal"]
+    every = {0: ("focal",), 1: ("focal",), 2: ("pose", "focal")}
+    assert free_parameters(rig, named, poses_known=False) == (every, True)
+
+
 def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
     true = cameras(2)
     matrix = true[1].camera_matrix + np.array([[8.0, 0, 5], [0, 8, -4], [0, 0, 0]])
