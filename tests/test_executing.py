@@ -122,14 +122,14 @@ def test_a_local_cluster_has_a_worker_of_one_thread_for_each_processor(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 5)
-    with executing.on_cluster(executing.LOCAL, workers):
+    with executing.executor(executing.LOCAL, workers):
         ((), options) = distributed.LocalCluster.call_args
     assert (options["n_workers"], options["threads_per_worker"]) == (expected, 1)
 
 
 @pytest.mark.usefixtures("distributed")
 def test_equal_tasks_have_a_result_each_also_on_a_cluster() -> None:
-    with executing.on_cluster(executing.LOCAL) as executor:
+    with executing.executor(executing.LOCAL) as executor:
         results = dict(executor.run(int, ["7", "x", "7"]))
     assert (results[0], results[2]) == (7, 7)
     assert isinstance(results[1], ValueError)

@@ -93,8 +93,8 @@ _BODY = (
     Mutant(
         "body-gravity-widens-nothing",
         "body/model.py",
-        "spreads = spreads + self.gravity.covariance",
-        "spreads = spreads + 0 * self.gravity.covariance",
+        "else spreads + self.gravity.covariance",
+        "else spreads + 0 * self.gravity.covariance",
         "a body that sags is judged as if it were rigid",
     ),
     Mutant(
