@@ -55,6 +55,18 @@ HARMLESS: tuple[Harmless, ...] = (
         "errors that are equal to the last bit",
     ),
     Harmless(
+        "learning/points.py",
+        "if likely > best:",
+        "if likely >= best:",
+        "likelihoods that are equal to the last bit",
+    ),
+    Harmless(
+        "pictures/advice.py",
+        "if size[extra].min() > 1.25 * size[own].max():",
+        "if size[extra].min() >= 1.25 * size[own].max():",
+        "sizes that are equal to the last bit",
+    ),
+    Harmless(
         "pictures/plots.py",
         "places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)",
         "places = np.stack([ranges, np.zeros_like(ranges)], axis=+1)",
@@ -75,10 +87,22 @@ HARMLESS: tuple[Harmless, ...] = (
         "only how many poses wait in the system, which takes no less than some kB",
     ),
     Harmless(
+        "publishing/lsl.py",
+        "_FLUSH_S = 0.5  # outlets send in a thread of their own, which ends with them",
+        "_FLUSH_S = 1.0  # outlets send in a thread of their own, which ends with them",
+        "only how long the end of a run waits for what was sent",
+    ),
+    Harmless(
         "publishing/ros2.py",
         "_DEPTH = 10  # of the queues of publishers, as in ROS's examples",
         "_DEPTH = 11  # of the queues of publishers, as in ROS's examples",
         "only how many messages wait, as in examples of ROS",
+    ),
+    Harmless(
+        "report/series.py",
+        "usual = np.median(steps[1:]) if len(steps) > 1 else 1.0",
+        "usual = np.median(steps[1:]) if len(steps) > 1 else 2.0",
+        "equivalent: the steps of a single frame are 0",
     ),
     Harmless(
         "search/from_points.py",
@@ -87,16 +111,42 @@ HARMLESS: tuple[Harmless, ...] = (
         "more guesses, which are judged as all others are",
     ),
     Harmless(
+        "search/problem.py",
+        'places = places[:, np.argsort(-blurred[tuple(places)], kind="stable")'
+        "[: 8 * THOROUGH.sample]]",
+        'places = places[:, np.argsort(-blurred[tuple(places)], kind="stable")'
+        "[: 16 * THOROUGH.sample]]",
+        "only speed: more of the faintest peaks are tried",
+    ),
+    Harmless(
         "search/search.py",
         "if self._are_enough(poses[:3], best):",
         "if self._are_enough(poses[:4], best):",
         "only speed: a fourth guess is refined at once",
     ),
     Harmless(
+        "search/search.py",
+        "if self._coverage() < budget.sufficient and not is_guessed:",
+        "if self._coverage() <= budget.sufficient and not is_guessed:",
+        "a share that is exactly the one that suffices",
+    ),
+    Harmless(
+        "search/three_points.py",
+        "detections = far_apart(rays.pixels, 3 * budget.sample // 2)",
+        "detections = far_apart(rays.pixels, 4 * budget.sample // 2)",
+        "only speed: more of the outermost detections are tried",
+    ),
+    Harmless(
         "simulation/visible_spots.py",
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)",
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) >= 0)",
         "a face is exactly edge-on only by rounding",
+    ),
+    Harmless(
+        "tracking/proposers.py",
+        "(few,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()",
+        "(few,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
+        "only speed: more poses are looked up, as counts are at least 1",
     ),
     Harmless(
         "trajectories/pivot.py",
