@@ -51,7 +51,7 @@ _NUMBERS = (
     Mutant(
         "frames-selection-from-zero",
         "frames/source.py",
-        "start = 0 if first is None else first",
+        "start = first or 0",
         "start = 0",
         "--step counts from 0 where the recording does not",
     ),
