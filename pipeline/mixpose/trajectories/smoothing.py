@@ -178,7 +178,7 @@ def _segments(
         known: list[PoseLine] = []  # the one before in place of those that are not there
         frames: list[int] = []
         moments: list[float] = []
-        for last, k in pairwise([part[0], *part.tolist()]):
+        for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
             line = lines[k]
             if frames and times[k] - moments[-1] <= fill_s:
                 lost = [lines[i].frame for i in range(last + 1, k)]
