@@ -69,8 +69,8 @@ _IMPORTING = (
     Mutant(
         "importing-translations-keep-their-unit",
         "importing/gather.py",
-        "scaled[:3, 3] *= factor",
-        "scaled[:3, 3] *= 1.0",
+        "from_parts(T[:3, :3], factor * T[:3, 3])",
+        "from_parts(T[:3, :3], T[:3, 3])",
         "a rig in metres is written as millimetres",
     ),
     Mutant(

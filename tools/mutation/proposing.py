@@ -76,9 +76,9 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-a-turned-camera-is-as-told",
-        "tracking/doubt.py",
-        "math.log(likely) + one.log_odds +",
-        "math.log(likely) - abs(one.log_odds) +",
+        "judgement/mistakes.py",
+        "math.log(p) + one.log_odds",
+        "math.log(p) - abs(one.log_odds)",
         "two cameras of which one was turned agree about a wrong pose",
         ("test_turned_camera.py",),
     ),
