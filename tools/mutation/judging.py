@@ -197,8 +197,8 @@ _MISTAKES = (
     Mutant(
         "judgement-mistakes-put-poses-off-that-do-not-give-way-to-them",
         "judgement/mistakes.py",
-        "there - moved @ means",
-        "0 * there - moved @ means",
+        "is_sensor * there - moved",
+        "-moved",
         "frames are in doubt for a camera that two others outvote",
         ("test_judgement_mistakes.py",),
     ),

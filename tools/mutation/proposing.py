@@ -75,7 +75,7 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
-        "tracking-a-turned-camera-is-as-told",
+        "judgement-a-turned-camera-is-as-told",
         "judgement/mistakes.py",
         "math.log(p) + one.log_odds",
         "math.log(p) - abs(one.log_odds)",

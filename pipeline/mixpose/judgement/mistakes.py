@@ -8,8 +8,9 @@ and z = UᵀXᵀr, in ν directions,
     ln p(r | s) = −½ ν ln s² − ½ (|r|² − Σ z² / (λ + s²)) / s² − ½ Σ ln (1 + λ / s²),
 
 of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts as often
-as the pose, with its noise, is then outside its ellipsoid: it is δ = (JᵀJ)⁻¹ Jᵀ (r − C γ) off, of
-sizes γ that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  Sensors always stand
+as the pose, with its noise, is then outside its ellipsoid: it is δ = −(JᵀJ)⁻¹ JᵀC γ off, of sizes γ
+that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  By one sensor that stands
+otherwise it is (JᵀJ)⁻¹ Jᵀ (r − C γ) off: nothing where it follows the others.  Sensors always stand
 a little otherwise than told: that counts where n + E is outside.  One of them does so by far, at
 the most: one of which that leaves the pose in place tells against the others.
 
@@ -89,19 +90,17 @@ def possible_mistakes(
     noise = pose.variances[:, None]
     shares = found.shares * noise / (noise + found.extra)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
-    r, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
+    seen, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
     drawn = inverted(J.T @ J) @ J.T
-    # where these rows alone would put the pose
-    r = r - J @ (there := drawn @ r)
+    r = seen - J @ (drawn @ seen)
     # noise from a hundredth of σ_ε to twice that
     s2 = np.asarray(1e-4 * 1.6 ** np.arange(24))
     given = r, float(met @ found.dimensions) - len(chosen), s2
     columns, stated = _columns(pose, body, rows, met, model), _stated(pose, body, roots, rows)
     lenses = roots * _by_lenses(pose, body, model, sensors)
     columns = _widened(columns, lenses)
-    moves = drawn @ columns
-    left, stated = columns - J @ moves, stated - J @ (drawn @ stated)
+    left, stated = columns - J @ (drawn @ columns), stated - J @ (drawn @ stated)
     told, *odds = evidence_of(_beside(left, stated), *given)[0].tolist()
     names = [SIZE, *found.names, LENS]
     known = [before.get(name, 0.0) for name in names]
@@ -114,13 +113,19 @@ def possible_mistakes(
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = evidence_of(usual, *given)[0]
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
+    # where sensors put the pose that are as exact as they are, which matters where one is wrong and
+    # not all: one that the pose does not follow leaves it in place
+    exact = np.repeat(pose.variances.min() / pose.variances, 2 * shares.shape[1])[:, None] * J
+    pulled = inverted(exact.T @ J) @ exact.T
+    there, moves = pulled @ seen, drawn @ columns
+    moves[2:-1] = pulled @ columns[2:-1]
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         is_sensor = names[k] not in (SIZE, LENS)
         asked = slice(len(usual) // 2 if is_sensor else None)
         logs, means, spreads = evidence_of(_beside(usual[asked], left[k + 1]), *given)
         best, moved, width = logs.argmax(), moves[k + 1], columns.shape[2]
-        off = there - moved @ means[best, -width:]
+        off = is_sensor * there - moved @ means[best, -width:]
         by_mistake = moved @ spreads[best, -width:, -width:] @ moved.T + np.outer(off, off)
         gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[asked]))
         outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
