@@ -183,9 +183,9 @@ def test_a_likelier_mistake_that_leaves_the_pose_in_place_tells_against_others()
     both = odds_of_each([harmful, harmless], [2e-4, 2e-4])
     # e²⁰ against e⁴⁰, whatever sessions are like
     assert both == [pytest.approx(-20.0, abs=1e-6), -np.inf]
-    # which says nothing of the size of the body
+    # which says nothing of the size of the body, that puts one pose of a hundred elsewhere
     of_size = odds_of_each([Mistake("a", SIZE, 40.0, np.log(0.01)), harmless], [2e-4, 2e-4])
-    assert of_size == [pytest.approx(40 + np.log(2e-4 * 0.01)), -np.inf]
+    assert of_size == [pytest.approx(np.log(0.01 / 0.99)), -np.inf]
 
 
 def test_a_single_feature_that_is_far_off_is_no_contradiction() -> None:

@@ -11,8 +11,8 @@ of which the sum over s, even in ln s, and over d is what a hypothesis is worth.
 as the pose, with its noise, is then outside its ellipsoid: it is δ = −(JᵀJ)⁻¹ JᵀC γ off, of sizes γ
 that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  By one sensor that stands
 otherwise it is (JᵀJ)⁻¹ Jᵀ (r − C γ) off: nothing where it follows the others.  Sensors always stand
-a little otherwise than told: that counts where n + E is outside.  One of them does so by far, at
-the most: one of which that leaves the pose in place tells against the others.
+a little otherwise than told: that counts where n + E is outside.  A session has one mistake of a
+kind, at the most, and may have one that leaves the pose in place.
 
 What one frame tells of a session holds in those that follow, which may not tell it themselves: log
 odds add up from frame to frame, and never fall below those of a session of which nothing is known
@@ -54,19 +54,14 @@ class Mistake(NamedTuple):
 def odds_of_each(mistakes: Sequence[Mistake], likely: Sequence[float]) -> list[float]:
     """Log odds of each mistake against the pose; of a kind a session has one at the most.
 
-    They are so `likely` before any frame.  Another that leaves the pose in place tells against it.
+    They are so `likely` before any frame.  One that leaves the pose in place tells for it.
     """
     believed = [math.log(p) + one.log_odds for p, one in zip(likely, mistakes, strict=True)]
-    harmless = [math.log(max(-math.expm1(one.log_harm), 1e-300)) for one in mistakes]
-    odds = []
+    right = dict[str, float]()
     for own, one in zip(believed, mistakes, strict=True):
-        others = [
-            sum(each)
-            for *each, other in zip(believed, harmless, mistakes, strict=True)
-            if other.what == one.what and other is not one
-        ]
-        odds.append(own + one.log_harm - float(np.logaddexp.reduce([0.0, *others])))
-    return odds
+        harmless = own + math.log(max(-math.expm1(one.log_harm), 1e-300))
+        right[one.what] = float(np.logaddexp(right.get(one.what, 0.0), harmless))
+    return [own + one.log_harm - right[one.what] for own, one in zip(believed, mistakes)]
 
 
 def possible_mistakes(
