@@ -153,65 +153,6 @@ _CUT = (
     ),
 )
 
-_MISTAKES = (
-    Mutant(
-        "judgement-bodies-have-the-size-that-is-told",
-        "judgement/mistakes.py",
-        "columns[1, :, 0] = model.turned *",
-        "columns[1, :, 0] = 1e-9 *",
-        "the tip of a tool that is a fiftieth too large is ok millimetres off",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-bodies-that-give-way-are-of-another-size",
-        "judgement/mistakes.py",
-        "axes *= np.sqrt(np.maximum(values, 0.0))[:, None]",
-        "axes *= 0",
-        "a body whose spread is stated is said to be of another size",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-lenses-are-those-that-are-told",
-        "judgement/mistakes.py",
-        "/ found.sigmas[:, None, None]",
-        "* 1e-9",
-        "poses are ok whose cameras were given without their distortion",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-what-frames-told-of-a-session-is-forgotten",
-        "judgement/mistakes.py",
-        "before.get(name, 0.0)",
-        "0.0 * before.get(name, 0.0)",
-        "a body known to be too large is ok where one camera alone sees it",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-mistakes-cost-nothing",
-        "judgement/mistakes.py",
-        "np.log(wide / s2).sum(axis=1)",
-        "0 * np.log(wide / s2).sum(axis=1)",
-        "what may explain anything is likelier than what is told",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-mistakes-put-poses-off-that-do-not-give-way-to-them",
-        "judgement/mistakes.py",
-        "is_sensor * there - moved",
-        "-moved",
-        "frames are in doubt for a camera that two others outvote",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
-        "judgement-any-number-of-mistakes-may-be-made",
-        "judgement/mistakes.py",
-        "np.logaddexp(right.get(one.what, 0.0), harmless)",
-        "0.0",
-        "a camera that agrees is doubted as much as the one that is off",
-        ("test_judgement_mistakes.py",),
-    ),
-)
-
 _EVIDENCE = (
     Mutant(
         "judgement-covered-features-missed-one-by-one",
@@ -449,4 +390,4 @@ _JUDGE = (
     ),
 )
 
-MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_MISTAKES, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
+MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)

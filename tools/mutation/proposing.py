@@ -75,14 +75,6 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
-        "judgement-a-turned-camera-is-as-told",
-        "judgement/mistakes.py",
-        "math.log(p) + one.log_odds",
-        "math.log(p) - abs(one.log_odds)",
-        "two cameras of which one was turned agree about a wrong pose",
-        ("test_turned_camera.py",),
-    ),
-    Mutant(
         "tracking-three-markers-of-eight-are-the-body",
         "tracking/doubt.py",
         "    yield Alternative(FEW, of_other_things(data, best))",

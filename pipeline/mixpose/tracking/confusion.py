@@ -94,8 +94,5 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Conf
 
 def _as_lost(against: Sequence[Confusion], one: Frame, other: Frame) -> list[Confusion]:
     """Odds of two bodies of which the one may be the other, even where both were lost."""
-    lost = [
-        data.predictions and data.track.misses > data.rules.motion.coasting for data in (one, other)
-    ]
-    least = math.log(0.5) if all(lost) else -math.inf
+    least = math.log(0.5) if one.was_lost and other.was_lost else -math.inf
     return [each._replace(log_odds=max(each.log_odds, least)) for each in against]

@@ -162,7 +162,7 @@ class Frame(Setup):
         anywhere, rules = self.anywhere, self.rules.motion
         if not some:
             return anywhere
-        surprise = min(rules.surprise * (1 + misses), 1.0)
+        surprise = rules.surprised(misses)
         terms, spreads = [math.log(surprise) + anywhere[0]], [anywhere[1]]
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
@@ -181,7 +181,7 @@ class Frame(Setup):
     def expectation(self, poses: Sequence[Floats]) -> Floats:
         """Log densities (K,) of poses (4, 4) by the body's own track, or that it is elsewhere."""
         logs = np.full(len(poses), self.anywhere[0])
-        surprise = min(self.rules.motion.surprise * (1 + self.track.misses), 1.0)
+        surprise = self.rules.motion.surprised(self.track.misses)
         logs += math.log(surprise) if self.predictions else 0.0
         for one in self.predictions:
             alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
@@ -199,6 +199,11 @@ class Frame(Setup):
         if doubt > self.rules.acceptance.log_doubt:
             return np.zeros(len(poses))
         return self.expectation([*poses]) - self.anywhere[0]
+
+    @property
+    def was_lost(self) -> bool:
+        """Whether no velocity of the body is believed any more, which was seen before."""
+        return bool(self.predictions) and self.track.misses > self.rules.motion.coasting
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

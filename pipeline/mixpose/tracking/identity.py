@@ -115,8 +115,8 @@ def identify(
     without = iter([k for k in group if k not in bests])
     assigned = {k: finders[pose_of[k]] if k in pose_of else next(without) for k in group}
     odds = assignment.exchanged(given)
-    # no velocity is believed any more: they may have changed places, wherever they were before
-    lost = ~is_new & [one.track.misses > one.rules.motion.coasting for one in data]
+    # they may have changed places, wherever they were before
+    lost = np.array([one.was_lost for one in data])
     odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
     odds[is_new & is_new[:, None]] = -np.inf
     rivals, limit = dict[int, Rivals](), rules.acceptance.log_doubt

@@ -66,6 +66,10 @@ class MotionRules:
     lost: float = constant(50.0, "squared deviations from what was foretold: it begins anew")
     longest_s: float = constant(0.5, "without a pose, after which nothing is foretold")
 
+    def surprised(self, misses: int) -> float:
+        """Chance that the body is somewhere else after so many frames without it."""
+        return min(self.surprise * (1 + misses), 1.0)
+
 
 def per_kind(body: Body, scale: Scale) -> Floats:
     """Lengths, in radii of a body, and angles for all directions alike (6,)."""
