@@ -3,6 +3,7 @@
 from mixpose.judgement.acceptance import (
     AcceptanceRules as AcceptanceRules,
     Alternative as Alternative,
+    Second as Second,
     Verdict as Verdict,
     beliefs as beliefs,
     convinces as convinces,

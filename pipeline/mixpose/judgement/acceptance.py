@@ -54,6 +54,14 @@ class Alternative(NamedTuple):
 _NOTHING = Alternative("", -math.inf)
 
 
+class Second(NamedTuple):
+    """What else in a frame looks like the body."""
+
+    pose: ScoredPose | None  # None where there is nothing
+    there: float  # log odds that it is there
+    either: float  # that it is the body, and not the best pose
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The decision about a frame: ok where nothing else is likely."""
@@ -64,8 +72,7 @@ class Verdict:
     most: float = -math.inf  # log odds against it up to which it is ok
     # detections that sensors had left where the body was sought a second time
     tried: Mapping[str, int] = field(default_factory=dict)
-    # log odds that the body is there twice; None where nobody asked
-    twice: float | None = None
+    second: Second | None = None  # None where nobody asked
     # log odds of mistakes in the session, by name; None where it was not asked for them
     mistaken: Mapping[str, float] | None = None
 

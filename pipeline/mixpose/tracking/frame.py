@@ -24,7 +24,7 @@ from mixpose.judgement import (
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
-from mixpose.rigid import twist_between
+from mixpose.rigid import transform, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import Course, Expected, RandomWalk, at_rest, per_kind
@@ -199,6 +199,21 @@ class Frame(Setup):
         if doubt > self.rules.acceptance.log_doubt:
             return np.zeros(len(poses))
         return self.expectation([*poses]) - self.anywhere[0]
+
+    def other_at(self, T_world_object: Floats) -> float | None:
+        """Log odds that what is at a pose is not the body, by the prediction that it goes on from.
+
+        That is the nearest of those that it overlaps; None where nothing else was ever seen.
+        """
+        if all(one.other is None for one in self.predictions):
+            return None
+        here, means = transform(T_world_object, self.body.means), self.body.means
+        away = [
+            np.linalg.norm(transform(one.T_world_object, means) - here, axis=1)
+            for one in self.predictions
+        ]
+        near = [k for k, off in enumerate(away) if off.min() <= self.body.radius]
+        return self.predictions[min(near, key=lambda k: away[k].mean())].other if near else None
 
     @property
     def was_lost(self) -> bool:

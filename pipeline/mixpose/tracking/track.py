@@ -35,6 +35,7 @@ class Branch:
     spread: Floats | None = None
     deviation: Floats | None = None  # (6,), the same, where anybody asks for velocities at moments
     course: Course | None = None  # for its velocity at a moment, there
+    other: float | None = None  # log odds of another thing there, if it was seen beside the body
 
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
         """Of poses (..., 4, 4) before the frame that this predicts, in directions that are free."""

@@ -263,7 +263,11 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         belief = weight * float(expit(one.log_evidence))
         momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
         spread = one.spread if data.options.fuse else None
-        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=momentary))
+        second = verdict.second
+        is_second = second is not None and one is second.pose
+        other = -second.either if second and is_second else data.other_at(one.T_world_object)
+        branch = Branch(one.T_world_object, belief, spread=spread, deviation=momentary, other=other)
+        found.append(branch)
     used = best.used
     met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
@@ -286,7 +290,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         shown=None if is_ok else shown_after(data, best),
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
-        twice=track.twice if verdict.twice is None else verdict.twice,
+        twice=track.twice if verdict.second is None else verdict.second.there,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 

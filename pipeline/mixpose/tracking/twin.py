@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mixpose.body import thickness
-from mixpose.judgement import Alternative, ScoredPose, Verdict, is_sure
+from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
 from mixpose.objective import View
 from mixpose.rigid import transform
 from mixpose.search import Candidate, Copy, search_copies
@@ -36,12 +36,12 @@ def is_flat(data: Setup) -> bool:
 def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     """The same; in doubt where what is left of the frame's views shows the body once more.
 
-    Either may be it then, whichever was followed so far.
+    Either may be it then, whichever was followed so far; and the other one goes on to be the other.
     """
     best, left = verdict.best, {one.name: one.observation.cells for one in rest}
     if best is None or verdict.status != "ok":
         return verdict
-    accepted = data.rules.acceptance
+    accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
     second, odds = _where_it_was(data, best, rest), -math.inf
     if second is not None:
@@ -52,13 +52,17 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
         verdict, found = replace(verdict, tried=most), _second_pose(data, best, rest)
         if found is not None:
             second, odds = found, -accepted.log_doubt
-    verdict = replace(verdict, twice=odds)
     if second is None or odds <= accepted.log_doubt:
-        return verdict
+        against = [] if known is None else [Alternative(TWICE, known)]
+        return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
     either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
+    # of all frames the one counts that tells most
+    if known is not None and abs(known) > abs(either):
+        either = known
     share = float(expit(either))
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
-    return replace(verdict, kept=kept).doubted([Alternative(TWICE, either)])
+    verdict = replace(verdict, kept=kept, second=Second(second, odds, either))
+    return verdict.doubted([Alternative(TWICE, either)])
 
 
 def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
