@@ -67,8 +67,12 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     given = rules.judgement.noise, sensors, before
     mistakes = [*possible_mistakes(best, data.body, data.free, *given), of_reflection(data, best)]
     # one frame in as many as there are sessions with a mistake may be of another kind
-    most = -2 * math.log(rules.acceptance.mistaken)
-    mistaken = {one.name: min(one.log_odds, most) for one in mistakes if one.log_odds > 0}
+    most = _most_told(data)
+    mistaken = {
+        one.name: max(min(one.log_odds, most), -most)
+        for one in mistakes
+        if one.log_odds > 0 or one.name == MIRRORED
+    }
     against = _alternatives(data, best, mistakes)
     # what lasts shows in frames like those before; one that is not is a doubled image, or the like
     is_usual = best.residual_ratio <= rules.acceptance.changed
@@ -150,18 +154,29 @@ def of_other_things(data: Frame, judged: ScoredPose) -> float:
     return float(odds - (_gained(data, judged) if data.track.known else 0.0))
 
 
+def _most_told(data: Frame) -> float:
+    """Log odds of a mistake that frames tell at the most."""
+    return -2 * math.log(data.rules.acceptance.mistaken)
+
+
 def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
     """By how much likelier the body's mirror image is, by this frame and those before it.
 
-    A mirror in the scene shows it in one frame and not in another.
+    A body is mirrored in all frames or in none, so that the first ones tell against it as well.  A
+    mirror in the scene shows it in one frame and not in another.
     """
-    lasts = not data.options.mirrors
-    before = data.track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
-    return Mistake(MIRRORED, MIRRORED, before + _reflected(data, judged, before > 0), 0.0)
+    track, lasts = data.track, not data.options.mirrors
+    before = track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
+    is_early = track.believed < data.rules.proposals.believed
+    asked = before > 0 or (lasts and is_early and before > -_most_told(data))
+    odds = _reflected(data, judged, asked, before)
+    if odds == -math.inf:  # what is known of it holds
+        return Mistake(MIRRORED, MIRRORED, before, -math.inf)
+    return Mistake(MIRRORED, MIRRORED, before + odds, 0.0)
 
 
-def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
-    """Log odds by this frame; minus infinity where it cannot be.
+def _reflected(data: Frame, judged: ScoredPose, asked: bool, before: float) -> float:
+    """Log odds by this frame, with those `before`; minus infinity where it cannot be.
 
     What is not likely is looked for only where it is `asked` for.
     """
@@ -171,7 +186,8 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return -math.inf
     accepted, met, near = rules.acceptance, seen.met_by, -math.inf
-    own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mistaken)
+    own = judged.log_evidence
+    likely = accepted.log_doubt - math.log(accepted.mistaken) - before
     # of these the mirror image may meet more than the body
     if asked or sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
