@@ -9,7 +9,7 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 from rounding import rounding
-from scipy.stats import t as student
+from scipy.stats import multivariate_t as student
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
@@ -92,8 +92,9 @@ def test_a_pose_far_from_every_prediction_is_a_surprise_that_grows_with_the_wait
 
 def test_at_a_prediction_directions_that_are_open_are_as_uncertain_as_predicted() -> None:
     log_density, spread = prior_near(TRUTH)
-    # Student's distribution with 3 degrees of freedom, and next to nothing of anywhere
-    peak = np.log(0.98) + student.logpdf(np.zeros(6), 3, scale=NARROW).sum()
+    # Student's distributions with 3 degrees of freedom, and next to nothing of anywhere
+    by_kind = [student(shape=np.diag(one**2), df=3) for one in np.split(NARROW, 2)]
+    peak = np.log(0.98) + sum(one.logpdf(np.zeros(3)) for one in by_kind)
     assert log_density == pytest.approx(peak, abs=1e-3)
     np.testing.assert_allclose(spread, NARROW)
 
@@ -102,7 +103,7 @@ def test_a_sudden_turn_is_unlikely_but_no_surprise() -> None:
     # by 6 of the degrees that it may be off: normal errors would make that 6²/2 = 18 nats
     at, _ = prior_near(TRUTH)
     turned, _ = prior_near(perturb(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, np.radians(6.0), 0.0])))
-    assert at - turned == pytest.approx(2 * np.log(1 + 36 / 3), rel=0.02)
+    assert at - turned == pytest.approx(3 * np.log(1 + 36 / 3), rel=0.02)
 
 
 def test_how_far_a_prediction_erred_over_several_frames_counts_per_frame() -> None:

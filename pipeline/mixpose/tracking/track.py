@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -39,16 +40,18 @@ class Branch:
 
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
         """Of poses (..., 4, 4) before the frame that this predicts, in directions that are free."""
-        u = self.uncertainty[free]
-        squares = (twist_between(self.T_world_object, T_world_object)[..., free] / u) ** 2
-        count, volume = len(u), float(sum(np.log(u).tolist()))
+        away = twist_between(self.T_world_object, T_world_object)
+        off = np.divide(away, self.uncertainty, out=np.zeros(away.shape), where=free)
+        squares = (off.reshape(*off.shape[:-1], 2, 3) ** 2).sum(axis=-1)  # of shifts, and of turns
+        count, volume = int(free.sum()), float(np.log(self.uncertainty[free]).sum())
         if self.spread is not None:
             exponents = -0.5 * squares.sum(axis=-1)
             return np.asarray(exponents - 0.5 * count * math.log(2 * math.pi) - volume)
-        n = rules.known_from  # from a step or two: errors are Student's
-        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-        tails = 0.5 * (n + 1) * np.log1p(squares / n).sum(axis=-1)
-        return np.asarray(count * peak - tails - volume)
+        # from a step or two, which are as wide in all directions of a kind: errors are Student's
+        n, p = rules.known_from, free.reshape(2, 3).sum(axis=1)
+        peak = float((gammaln((n + p) / 2) - gammaln(n / 2)).sum())
+        tails = 0.5 * np.log1p(squares / n) @ (n + p)
+        return np.asarray(peak - 0.5 * count * math.log(n * math.pi) - tails - volume)
 
 
 @dataclass(frozen=True)
