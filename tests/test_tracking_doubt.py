@@ -62,16 +62,19 @@ def test_of_four_cameras_two_have_to_meet_a_marker(pinhole_cameras: list[Pinhole
     assert both - alone == pytest.approx(1.5 * np.log(1 / 20))
 
 
-def test_a_frame_is_ok_from_the_confidence_that_the_session_asks_for() -> None:
+def test_a_frame_is_ok_from_the_confidence_that_the_session_asks_for(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
     assert Tracker.create(EIGHT, EstimatorOptions()).rules.acceptance.confidence == 0.999
     asked = Tracker.create(EIGHT, EstimatorOptions(confidence=0.9), TRUTH)
     assert asked.rules.acceptance.log_doubt == pytest.approx(np.log(0.1 / 0.9))
     # a pose with odds of 100 against clutter, and nothing else against it
     seen = [Seen(np.zeros((8, 2, 6)), str(k)) for k in range(2)]
+    views = [view_of(str(k), pinhole_cameras[k], np.ones((4, 2))) for k in range(2)]
     pose = replace(scored(TRUTH, *seen), log_evidence=np.log(100.0))
     for confidence, expected in ((0.9, "ok"), (0.99, "ok"), (0.991, "ambiguous")):
         tracker = Tracker.create(EIGHT, EstimatorOptions(confidence=confidence), TRUTH)
-        verdict = decided(tracker.data(tracker.begin(), 0, None, []), [pose])
+        verdict = decided(tracker.data(tracker.begin(), 0, None, views), [pose])
         assert verdict.status == expected
         assert verdict.confidence == pytest.approx(100 / 101, abs=1e-5)
 
