@@ -14,6 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.doubt import MIRRORED as MIRROR_IMAGE
 
 Floats = NDArray[np.float64]
 
@@ -137,3 +138,27 @@ def test_a_body_in_a_plane_is_its_own_mirror_image() -> None:
     assert thickness(body(places)) < 1e-6
     assert thickness(body(places + 0.01 * np.eye(7)[:, :1] * along[2])) > 1e-6
     assert thickness(body(places[:2])) < 1e-6
+
+
+def test_what_frames_say_against_a_mirrored_body_holds_in_those_that_say_nothing(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    points = PLATE * ([[1, 1, 0]] * 4 + [[1, 1, 1]])
+    given = Body("plate", tuple(PointFeature(point) for point in points))
+    plane = Body("plane", given.features[:4])
+    tracker = Tracker.create(given, EstimatorOptions())
+    track, told = tracker.begin(), list[float]()
+    for frame, body in enumerate((given, plane, plane, plane, plane)):
+        views = detect(pinhole_cameras, body, TRUTH, noise=0.2, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status == "ok"
+        told.append(track.mistaken[MIRROR_IMAGE])
+    # as sure as one session in 2e-4² may be, at the most
+    assert told == pytest.approx([2 * np.log(2e-4)] * 5)
+    # and four markers in a plane, which are their own mirror image, are not asked any more
+    views = detect(pinhole_cameras, plane, TRUTH, noise=0.2, seed=5)
+    doubted = replace(track, mistaken={MIRROR_IMAGE: 1.0})
+    odds = 1.0 + np.log(2e-4)
+    for known, share in ((track, 0.0), (doubted, 1 / (1 + np.exp(-odds)))):
+        _, estimate = tracker.advance(known, 5, None, views)
+        assert estimate.confidence == pytest.approx(1 - share, abs=2e-5)
