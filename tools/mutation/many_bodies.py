@@ -75,6 +75,14 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
+        "tracking-twin-forgotten",
+        "tracking/tracker.py",
+        "other = -second.either if second and is_second else",
+        "other = None if second and is_second else",
+        "what stood beside the body is ok when the body goes",
+        (_TWIN,),
+    ),
+    Mutant(
         "tracking-twin-among-what-is-met",
         "tracking/twin.py",
         "is_left[numbers[view.name][numbers[view.name] >= 0]] = False",

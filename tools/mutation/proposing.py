@@ -302,6 +302,14 @@ _REFLECTION = (
         ("test_tracking_reflection.py",),
     ),
     Mutant(
+        "tracking-nothing-tells-against-a-mirrored-body",
+        "tracking/doubt.py",
+        "if one.log_odds > 0 or one.name == MIRRORED",
+        "if one.log_odds > 0",
+        "frames whose markers are hidden are ambiguous, though others showed the body itself",
+        ("test_tracking_reflection.py",),
+    ),
+    Mutant(
         "tracking-few-markers-are-a-mirror-image",
         "tracking/doubt.py",
         "    return next((odds for odds in found if odds > likely), near if asked else -math.inf)",
