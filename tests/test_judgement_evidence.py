@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mixpose.judgement import DetectionModel, Prior
 from mixpose.judgement.information import information_of
-from mixpose.judgement.judge import log_evidence
+from mixpose.judgement.judge import log_evidence, odds_of
 from mixpose.matching import Matches
 
 Floats = NDArray[np.float64]
@@ -221,3 +221,11 @@ def test_information_is_that_of_least_squares() -> None:
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))
     met = Matches.stacked([matches_of(replace(SIX, shares=shares))])
     np.testing.assert_allclose(information_of(met, np.array([[S2]]))[0], expected / S2)
+
+
+def test_what_a_cloud_misses_costs_as_much_as_what_one_camera_misses() -> None:
+    planes = [replace(SIX, name=name, shares=[1, 1, 1, 1, 1, 0]) for name in ("xy", "yz", "zx")]
+    cloud = replace(matches_of(*planes), owners=np.zeros(3, dtype=np.intp))
+    model, given = DetectionModel(), (np.full((1, 3), S2), np.array([100.0]))
+    _, missed, _ = odds_of(Matches.stacked([cloud]), *given, model)
+    assert missed == pytest.approx(log(1 - model.probability))

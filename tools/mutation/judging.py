@@ -96,8 +96,8 @@ _FIELDS = (
     Mutant(
         "judgement-outliers-in-the-covariance",
         "judgement/noise.py",
-        "np.where(is_off, 0.0, found.shares * scale[:, None] / wide)",
-        "found.shares * scale[:, None] / wide",
+        "np.where(is_off, 0.0, counted)",
+        "counted",
         "a cut spot makes a frame unsure",
     ),
 )
@@ -164,7 +164,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-blind-cameras-miss-each-feature",
         "judgement/judge.py",
-        "< detection.log_blind\n",
+        "< detection.log_blind / images\n",
         "< -np.inf\n",
         "a body that one of several cameras does not see at all is never sure",
         ("test_judgement_evidence.py",),

@@ -172,16 +172,23 @@ _RECORD = (
     Mutant(
         "matching-ranges-have-two-coordinates",
         "matching/matches.py",
-        "self.met * self.dimensions * self.parts",
-        "self.met * 2 * self.parts",
+        "self.met * self.dimensions * self.each_part",
+        "self.met * 2 * self.each_part",
         "ranges seem to fix poses that they leave open",
     ),
     Mutant(
         "matching-points-in-space-have-six-coordinates",
-        "matching/associate.py",
-        "parts[planes] = 0.5",
-        "parts[planes] = 1.0",
+        "matching/matches.py",
+        "np.where(self.images > 1, 0.5, 1.0)",
+        "np.where(self.images > 1, 1.0, 1.0)",
         "points in space fix poses that they leave open",
+    ),
+    Mutant(
+        "matching-images-of-a-cloud-are-sensors",
+        "matching/associate.py",
+        "owners[planes] = planes[0]",
+        "owners[planes] = planes",
+        "a cloud outvotes the camera beside it",
     ),
     Mutant(
         "matching-images-of-a-cloud-are-met-apart",

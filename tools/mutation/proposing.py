@@ -61,8 +61,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-another-sensor-left-out",
         "tracking/refinements.py",
-        "names = [seen.names[k] for k in np.flatnonzero(apart)]",
-        "names = [seen.names[k - 1] for k in np.flatnonzero(apart)]",
+        "names = [seen.names[k] for k in np.flatnonzero(apart[seen.owner])]",
+        "names = [seen.names[k - 1] for k in np.flatnonzero(apart[seen.owner])]",
         "of three cameras a sound one is left out",
         (_STARTS,),
     ),

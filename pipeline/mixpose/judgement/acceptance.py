@@ -256,22 +256,27 @@ def one_misses(
     sensors `agreed` in one of them, one may miss the body now.
     """
     used = judged.used
-    if used.dimensions.tolist() != [2, 2]:
+    if len(used.images) != 2 or (used.dimensions != 2).any():
         return False
-    least, most = sorted(range(2), key=used.coverage.tolist().__getitem__)
-    if not used.coverage[least] < rules.agreeing <= used.coverage[most]:
+    names = "coverage", "unmatched_nearby", "missed", "count", "met"
+    coverage, nearby, missed, count, met = (
+        used.summed(getattr(used, name)) / used.images for name in names
+    )
+    least, most = sorted(range(2), key=coverage.tolist().__getitem__)
+    if not coverage[least] < rules.agreeing <= coverage[most]:
         return False
     # beside the body, or, where the two never agreed, anywhere
-    beside, needed = used.unmatched_nearby[least], used.missed[least]
+    beside, needed = nearby[least], missed[least]
     if not agreed:
-        beside, needed = used.count[least] - used.met[least], used.met[most]
+        beside, needed = count[least] - met[least], met[most]
     if needed <= 0 or beside < rules.agreeing * needed:
         return False
     # what it meets is of the body, against detections anywhere near
     variance = _variance(before, model, model.errors.typical)
-    v = min(variance, model.usual**2) + used.extra[least]
-    odds = np.log(model.errors.met**2 / (2 * v)) - used.squared[least] / (2 * v)
-    return bool(used.shares[least] @ odds < -rules.log_doubt)
+    v = min(variance, model.usual**2) + used.extra
+    odds = np.log(model.errors.met**2 / (2 * v)) - used.squared / (2 * v)
+    odds = used.summed(np.vecdot(used.shares, odds) * used.each_part)
+    return bool(odds[least] < -rules.log_doubt)
 
 
 def _variance(before: Floats, model: NoiseModel, typical: float) -> float:

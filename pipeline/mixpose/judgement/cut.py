@@ -37,7 +37,9 @@ def with_cut_spots(
     outside: float,  # share of truths outside the ellipsoid of that share
 ) -> tuple[Floats, float]:
     """What a covariance (k, k) is larger by as one detection may be cut, and a factor for both."""
-    is_spot = (found.detections >= 0) & (found.dimensions == 2)[:, None]
+    # points in space are no spots, and three coordinates seldom agree with somebody else's
+    in_image = (found.dimensions == 2) & (found.images[found.owner] == 1)
+    is_spot = (found.detections >= 0) & in_image[:, None]
     met, k = (is_spot & (found.shares > 0)).nonzero(), len(known)
     if not (len(met[0]) and k and any(errors.chances)):
         return np.zeros(information.shape), 1.0

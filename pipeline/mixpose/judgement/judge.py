@@ -306,15 +306,19 @@ def odds_of(
     """
     roots, m = np.sqrt(variances[..., None] + found.extra), found.dimensions[:, None]
     gained = gained_by(found, roots, detection, spreads)
-    missed = (found.weights - found.shares) * detection.log_missed
+    # what a cloud misses, it misses in all of its images at once
+    images = found.images[found.owner]
+    missed = (found.weights - found.shares) * (detection.log_missed / images[:, None])
     if surfaces is not None and surfaces.max() > 0:
         missed *= _each_of_hidden(found, surfaces)
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
-    is_blind = (gained + missed).sum(axis=-1) < detection.log_blind
+    is_blind = (gained + missed).sum(axis=-1) < detection.log_blind / images
     shares = found.shares
     if np.count_nonzero(is_blind):
         even = found.weights / np.maximum(found.expected, 1.0)[..., None]
-        missed = np.where(is_blind[..., None], even * detection.log_blind, missed)
+        missed = np.where(
+            is_blind[..., None], even * (detection.log_blind / images)[:, None], missed
+        )
         gained, shares = (one * ~is_blind[..., None] for one in (gained, shares))
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)

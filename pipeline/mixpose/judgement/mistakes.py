@@ -80,10 +80,12 @@ def possible_mistakes(
     # one sensor has the world stand as it does, and bodies as large as they are far
     if not len(chosen) or (len(found.names) < 2 and not before):
         return
-    for name in before.keys() - {SIZE, *found.names, LENS}:
+    firsts = np.unique(found.owner, return_index=True)[1].tolist()
+    names = [SIZE, *[found.names[k] for k in firsts], LENS]
+    for name in before.keys() - {*names}:
         yield Mistake(name, APART, before[name], -math.inf)
     noise = pose.variances[:, None]
-    shares = found.shares * noise / (noise + found.extra)
+    shares = found.shares * found.each_part[:, None] * noise / (noise + found.extra)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
     seen, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
@@ -97,7 +99,6 @@ def possible_mistakes(
     columns = _widened(columns, lenses)
     left, stated = columns - J @ (drawn @ columns), stated - J @ (drawn @ stated)
     told, *odds = evidence_of(_beside(left, stated), *given)[0].tolist()
-    names = [SIZE, *found.names, LENS]
     known = [before.get(name, 0.0) for name in names]
     # what is not likelier by itself is not likelier beside fields
     likelier = [k for k, one in enumerate(odds) if one + known[k] > told]
@@ -140,18 +141,22 @@ def _outside(squared: float, directions: int, chance: float) -> tuple[float, flo
 
 
 def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: NoiseModel) -> Floats:
-    """How residuals change with mistakes (L + 2, R, 6), weighted as rows (R, 6), times deviations.
+    """How residuals change with mistakes (S + 2, R, 6), weighted as rows (R, 6), times deviations.
 
     With none; with another size of the body, in the first column; with each sensor that is moved.
     """
-    L, T = len(met), pose.T_world_object
-    columns, by_sensor = np.zeros((L + 2, *rows.shape)), rows.reshape(L, -1, 2, 6)
+    used, T = pose.used, pose.T_world_object
+    S, L = len(used.images), len(met)
+    columns, by_sensor = np.zeros((S + 2, *rows.shape)), rows.reshape(L, -1, 2, 6)
     away = (body.nodes.points @ T[:3, :3].T)[..., None]
     columns[1, :, 0] = model.turned * (by_sensor[..., :3] @ away).ravel()
-    moved = np.sqrt(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)) / np.maximum(met, 1e-9))
-    deviations, own = np.full((L, 1, 6), model.turned), range(L)
-    deviations[..., :3] = (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
-    columns[2:].reshape(L, L, -1, 6)[own, own] = rows.reshape(L, -1, 6) * deviations
+    squares = used.summed(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)))
+    moved = np.sqrt(squares / np.maximum(used.summed(met), 1e-9))
+    # one sensor has the world stand as it does
+    deviations = np.full((S, 1, 6), model.turned * (S > 1))
+    deviations[..., :3] = (S > 1) * (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
+    each = rows.reshape(L, -1, 6) * deviations[used.owner]
+    columns[2:].reshape(S, L, -1, 6)[used.owner, range(L)] = each
     return columns
 
 

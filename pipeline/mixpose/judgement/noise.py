@@ -122,11 +122,15 @@ def noise_of(
     wide = scale[:, None] + found.extra
     # what errs by more than noise counts less
     is_off, noise = model.errors.are_off(found, wide), np.sqrt(scale)
-    met = (shares := np.where(is_off, 0.0, found.shares * scale[:, None] / wide)).sum(axis=1)
+    counted = found.shares * found.each_part[:, None] * scale[:, None] / wide
+    met = (shares := np.where(is_off, 0.0, counted)).sum(axis=1)
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    J, fields = rows[:, chosen], fields_of_sensors(found, shares, met)
+    fields = fields_of_sensors(found, shares, met)
+    if found.owners is not None:
+        r, rows, fields = (_folded(one, found) for one in (r, rows, fields))
+    J = rows[:, chosen]
     markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
     inverse, q = inverted(information := J.T @ J), fields.shape[1]
     by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
@@ -238,6 +242,19 @@ def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, f
     return at * pooled(ratios, rules, nu, deviation=1.0), rarity
 
 
+def _folded(rows: Floats, found: Matches) -> Floats:
+    """Rows (R, ...) of all sensors, with each coordinate of a cloud in one image instead of two.
+
+    The second coordinate of an image is the first of the next: they err alike, as one.
+    """
+    folded = rows.reshape(*found.shares.shape, 2, -1).copy()
+    for number in np.flatnonzero(found.images > 1):
+        own = np.flatnonzero(found.owner == number)
+        first, second = folded[np.roll(own, -1), :, 0], folded[own, :, 1]
+        folded[own, :, 0], folded[own, :, 1] = 0.0, (first + second) / math.sqrt(2)
+    return folded.reshape(rows.shape)
+
+
 def of_each(rows: Floats, found: Matches) -> Floats:
     """Rows (R, k) of all sensors by marker (N, 2 L, k)."""
     L, N = found.shares.shape
@@ -250,7 +267,7 @@ def _by_marker(found: Matches, by_place: Floats) -> Floats:
     Of weighted Jacobians (R, 3) by its place; a field is nothing in the rows of other markers.
     """
     # in units of how features move with the body, the root mean square of those in view
-    counts = 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
+    counts = 3 * (found.weights > 0).sum(axis=1) @ (found.dimensions * found.each_part)
     moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
     return of_each(by_place, found) / max(moved, 1e-6)
 

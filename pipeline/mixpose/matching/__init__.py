@@ -4,7 +4,7 @@ from mixpose.matching.associate import (
     AssociationRules as AssociationRules,
     associate as associate,
     crowding as crowding,
-    parts_of as parts_of,
+    owners_of as owners_of,
 )
 from mixpose.matching.matches import (
     LEAST_VARIANCE as LEAST_VARIANCE,

@@ -106,20 +106,20 @@ def associate(
         unseen=(match.faced[:, 0] & ~seen) @ body.nodes.weights,
         merged=merged,
         beside=np.where(seen, np.sqrt(others) / sigmas[:, None], np.nan),
-        parts=parts_of(len(views), clouds),
+        owners=owners_of(len(views), clouds),
         **_surroundings(objective, y, seen, shares, detections, rules, narrowest),
         by_calibration=_by_calibration(objective, T_world_object),
     )
 
 
-def parts_of(count: int, clouds: Sequence[Sequence[int]]) -> Floats | float:
-    """`Matches.parts` of so many sensors: a coordinate of a cloud is in two of its images."""
+def owners_of(count: int, clouds: Sequence[Sequence[int]]) -> Indices | None:
+    """`Matches.owners` of so many images: those of a cloud are one sensor's."""
     if not clouds:
-        return 1.0
-    parts = np.ones(count)
+        return None
+    owners = np.arange(count)
     for planes in clouds:
-        parts[planes] = 0.5
-    return parts
+        owners[planes] = planes[0]
+    return owners
 
 
 @lru_cache(maxsize=8)  # of one frame, some poses of which are matched

@@ -54,7 +54,8 @@ class Matches:
     # (..., L, N, 2) chances that these are cut unseen, and variances then, σ_ε²; NaN: nobody knows
     cut: Floats
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
-    parts: Floats | float = 1.0  # (L,) that a coordinate counts: 1/2 where two images show it
+    # (L,) numbers of the sensors that these are images of, as of clouds; None: each of its own
+    owners: Indices | None = None
 
     def at(self, index: int | list[int] | None) -> Matches:
         """At one of K poses; None makes K = 1 of one."""
@@ -62,7 +63,7 @@ class Matches:
             name: None if (array := getattr(self, name)) is None else array[index]
             for name in _BY_POSE
         }
-        return Matches(self.names, self.dimensions, self.sigmas, **arrays, parts=self.parts)
+        return Matches(self.names, self.dimensions, self.sigmas, **arrays, owners=self.owners)
 
     def of_sensors(self, chosen: Sequence[int] | Mask | Indices) -> Matches:
         """Some of the sensors, by numbers or a mask, at one pose."""
@@ -72,7 +73,7 @@ class Matches:
             names=tuple([self.names[k] for k in numbers]),
             dimensions=self.dimensions[numbers],
             sigmas=self.sigmas[numbers],
-            parts=self.each_part[numbers],
+            owners=None if self.owners is None else self.owner[numbers],
         )
 
     @classmethod
@@ -117,20 +118,36 @@ class Matches:
         """Share of the features that face each sensor that are met (..., L)."""
         return np.asarray(self.met / np.maximum(self.expected + self.unseen, 1e-12))
 
-    @property
+    @cached_property
+    def owner(self) -> Indices:
+        """Numbers (L,) of the sensors that these are images of, without gaps."""
+        if self.owners is None:
+            return np.arange(len(self.names))
+        return np.unique(self.owners, return_inverse=True)[1]
+
+    @cached_property
+    def images(self) -> Indices:
+        """How many images each sensor has (S,): a cloud three."""
+        return np.bincount(self.owner)
+
+    @cached_property
     def each_part(self) -> Floats:
-        """`parts` as an array (L,)."""
-        return np.zeros(len(self.names)) + self.parts
+        """What a coordinate counts (L,): half in images of a cloud, of which two show it."""
+        return np.where(self.images > 1, 0.5, 1.0)[self.owner]
+
+    def summed(self, values: Floats) -> Floats:
+        """Sums (S,) over the images of each sensor, of values (L,) at one pose."""
+        return np.asarray(np.bincount(self.owner, values), dtype=np.float64)
 
     @property
     def measurements(self) -> Floats:
         """Number of coordinates that are met (..., L)."""
-        return np.asarray(self.met * self.dimensions * self.parts)
+        return np.asarray(self.met * self.dimensions * self.each_part)
 
     @cached_property
     def squares(self) -> Floats:
         """Sum of the squared offsets (..., L), σ_ε², of coordinates that count."""
-        return np.asarray(np.vecdot(self.shares, self.squared) * self.parts)
+        return np.asarray(np.vecdot(self.shares, self.squared) * self.each_part)
 
     @cached_property
     def met_by(self) -> Indices:
@@ -152,7 +169,7 @@ class Matches:
         return J, (roots * self.offsets).reshape(L, m * N)
 
 
-_BY_SENSOR = ("names", "dimensions", "sigmas", "parts")
+_BY_SENSOR = ("names", "dimensions", "sigmas", "owners")
 _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SENSOR])
 
 

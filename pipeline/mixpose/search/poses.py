@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 from mixpose.judgement import odds_of, paid_by_count
-from mixpose.matching import Matches, crowding, parts_of
+from mixpose.matching import Matches, crowding, owners_of
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
@@ -182,7 +182,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         extra=np.zeros(seen.shape),
         radii=np.zeros(seen.shape),
         finest=nothing + 1.0,
-        parts=parts_of(len(sensors), clouds),
+        owners=owners_of(len(sensors), clouds),
     )
 
 

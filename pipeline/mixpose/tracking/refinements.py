@@ -44,17 +44,18 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
     They meet little of it, with as many detections beside it that belong to nothing, or with
     residuals that are far larger than the others', more than chance would make them.
     """
-    agreeing = seen.coverage >= rules.agreeing
-    apart = ~agreeing & (seen.expected > 0)
-    apart &= seen.unmatched_nearby >= rules.agreeing * seen.missed
-    squares, degrees = seen.squares * agreeing, seen.measurements * agreeing
+    summed = seen.summed
+    agreeing = summed(seen.coverage) >= rules.agreeing * seen.images
+    apart = ~agreeing & (summed(seen.expected) > 0)
+    apart &= summed(seen.unmatched_nearby) >= rules.agreeing * summed(seen.missed)
+    squares, degrees = summed(seen.squares) * agreeing, summed(seen.measurements) * agreeing
     if np.count_nonzero(agreeing) > 2:
         rest = degrees.sum() - degrees
         variances = (squares.sum() - squares) / np.maximum(rest, 1e-12)
         # NaN without degrees of freedom, which nothing is larger than
         limits = np.maximum(rules.disagreeing, fdtri(degrees, rest, model.by_chance))
         apart |= squares > degrees * limits * np.maximum(variances, LEAST_VARIANCE)
-    names = [seen.names[k] for k in np.flatnonzero(apart)]
+    names = [seen.names[k] for k in np.flatnonzero(apart[seen.owner])]
     return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
 
 
