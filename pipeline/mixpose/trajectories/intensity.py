@@ -41,8 +41,8 @@ class SmoothingRules:
         "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
         "times what covariances say, 4 times with one intensity throughout",
     )
-    passes: int = constant(30, "at most, over which sudden motion is told from steady: 10 are enough")
-    settled: float = constant(0.1, "change of the logarithm of a factor of noise in the last of these passes")
+    passes: int = constant(30, "at most, over which sudden motion is told from steady; 10 do")
+    settled: float = constant(0.1, "change of the logarithm of a scale in the last of these")
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
     )

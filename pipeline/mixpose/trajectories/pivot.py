@@ -34,7 +34,7 @@ class PivotRules:
     turned: float = constant(
         1.5, "times what errors alone swing a direction by: of ten poses they reach 1.45 by 0.1 %"
     )
-    steps: int = constant(20, "to the likeliest tip and poses: 4 are enough where turns err by 1 deg")
+    steps: int = constant(20, "to the likeliest tip and poses: 4 do where turns err by 1 deg")
     foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
     parts: int = constant(5, "of the recording that are held out in turn")
     accident: float = constant(
