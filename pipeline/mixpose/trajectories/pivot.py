@@ -22,7 +22,6 @@ from scipy.special import chdtri
 from mixpose import rigid
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
-from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats, Mask
 
 
@@ -203,9 +202,10 @@ def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Float
         moved = rigid.perturb(poses, twists)
         arms = moved[:, :3, :3] @ place
         rest += sign * (arms + moved[:, :3, 3])
-        J = pose_jacobian(np.broadcast_to(np.eye(3), (len(arms), 3, 3)), arms)
-        # a turn on top of another one: the left Jacobian of SO(3), to the second order
-        J[:, :, 3:] = J[:, :, 3:] @ rigid.rotation_matrix(twists[:, 3:] / 2)
+        # a turn moves an arm across both; on top of another one, by the left Jacobian of SO(3)
+        by_turn = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)
+        by_turn = by_turn @ rigid.rotation_matrix(twists[:, 3:] / 2)  # which this is to 2nd order
+        J = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn], axis=2)
         by_poses.append(sign * J)
         by_x.append(sign * moved[:, :3, :3])
     return rest, np.concatenate(by_poses, axis=2), np.concatenate(by_x, axis=2)
