@@ -41,7 +41,7 @@ class SmoothingRules:
         "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
         "times what covariances say, 4 times with one intensity throughout",
     )
-    passes: int = constant(30, "at most, over which sudden motion is told from steady; 10 do")
+    passes: int = constant(60, "at most, over which sudden motion is told from steady; 40 do")
     settled: float = constant(0.1, "change of the logarithm of a scale in the last of these")
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
@@ -109,14 +109,9 @@ def smooth_with_sudden_motion(
     """
     logs = np.zeros((len(track) - 1, 2))  # of λ
     for _ in range(rules.passes):
-        once = _fixed_point(track, model, logs, rules)
-        step = once - logs
-        if np.abs(step).max(initial=0.0) < rules.settled:
+        before, logs = logs, _fixed_point(track, model, logs, rules)
+        if np.abs(logs - before).max(initial=0.0) < rules.settled:
             break
-        # steps that shrink slowly are extrapolated (R. Varadhan and C. Roland, 2008, SqS3)
-        bend = _fixed_point(track, model, once, rules) - once - step
-        ahead = max(1.0, float(np.linalg.norm(step) / np.linalg.norm(bend)))
-        logs = logs + 2 * ahead * step + ahead**2 * bend
     result = smooth_track(track, model, np.exp(logs))
     share = _usual(logs) / np.exp(logs)
     prior = 0.5 * rules.tail * (np.log(share) - share).sum(axis=1)
