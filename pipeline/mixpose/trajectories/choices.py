@@ -18,7 +18,7 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, foretold, updated
-from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_part
+from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_share
 
 _NONE = -1  # a choice: the frame shows something else
 
@@ -68,20 +68,21 @@ def _followed(
 ) -> tuple[list[tuple[int, ...]], Floats]:
     """The likeliest paths, each a choice per time, and their log likelihoods."""
     first, white = alternatives[0], np.array([model.white])
-    noise = noise_of(track, model.intensities[None])
+    noise, share = noise_of(track, model.intensities[None]), white_share(track, white)
     states = begun(track, model.order, white.repeat(len(first.poses)))._replace(poses=first.poses)
     paths: list[tuple[int, ...]] = [(k,) for k in range(len(first.poses))]
     logs: Floats = np.log(first.weights)
     for k, elapsed in enumerate(np.diff(track.times).tolist(), 1):
         ahead, _ = foretold(states, elapsed, np.repeat(noise, len(logs), axis=0))
-        S = ahead.covariances[:, :6, :6] + white_part(track, k, white)
+        R = track.covariances[k] * share
+        S = ahead.covariances[:, :6, :6] + R
         off_track = -0.5 * (rules.none + np.linalg.slogdet(S)[1])
         one = alternatives[k]
         found: list[States] = []
         all_paths: list[tuple[int, ...]] = []
         all_logs: list[float] = []
         for j, (pose, weight) in enumerate(zip(one.poses, one.weights.tolist(), strict=True)):
-            state, _, own = updated(ahead, pose, white_part(track, k, white))
+            state, _, own = updated(ahead, pose, R)
             found.append(state)
             all_paths += [(*path, j) for path in paths]
             all_logs += (logs + own + np.log(weight)).tolist()

@@ -13,7 +13,15 @@ import numpy as np
 from mixpose.constants import constant
 from mixpose.records import Floats, Indices
 from mixpose.trajectories.motion import ORDERS, foretold, updated
-from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, smooth_track, white_part
+from mixpose.trajectories.track import (
+    MotionModel,
+    SmoothedTrack,
+    Track,
+    begun,
+    noise_of,
+    smooth_track,
+    white_share,
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,8 @@ class SmoothingRules:
         "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
         "times what covariances say, 4 times with one intensity throughout",
     )
-    passes: int = constant(4, "over which sudden motion is told from steady: changes by 10 % then")
+    passes: int = constant(60, "at most, over which sudden motion is told from steady; 40 do")
+    settled: float = constant(0.1, "change of the logarithm of a scale in the last of these")
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
     )
@@ -74,7 +83,9 @@ def fitted_model(
             break
         # a derivative more takes e³ times less noise, about, in units of the poses'
         x = x - [3.0, 3.0, 0.0]
-    order, shared = best[1:]
+    likely, order, shared = best
+    if not np.isfinite(likely):
+        raise OverflowError("no motion has a likelihood")
     x = shared * [1.0, 1.0, 0.0]
     for width, points in _FINE:
         x, likely = _along(blocks, order, x, width, points, _EACH, rules)
@@ -84,20 +95,42 @@ def fitted_model(
     return MotionModel(order, _intensities(track, order, x[None, :2])[0], float(np.exp(x[2])))
 
 
-def local_scales(track: Track, model: MotionModel, rules: SmoothingRules) -> Floats:
-    """By how much more noise there was between each two times than elsewhere, (N - 1, 2).
+def smooth_with_sudden_motion(
+    track: Track, model: MotionModel, rules: SmoothingRules
+) -> tuple[SmoothedTrack, Floats]:
+    """Smooth a track with as much noise between each two times as there was.
+
+    And the logarithm (N,) of how likely each pose is, by those before and the noise up to it.
 
     Noise of each passage has an inverse gamma variance, so that all in all it has the t
-    distribution.  d log p / d log λ = (bᵀQb − tr NQ) / 2 + ν (1/λ − 1) / 2 = 0 gives the fixed
-    point λ = (λ bᵀQb + ν) / (tr NQ + ν).
+    distribution.  d log p / d log λ = (bᵀQb − tr NQ) / 2 + ν (μ/λ − 1) / 2 = 0 gives the fixed
+    point λ = (λ bᵀQb + ν μ) / (tr NQ + ν).  μ is what is usual, 1 where all of the motion is; the
+    model was fitted to sudden motion as well.  d log p / d log μ = 0 where the mean of μ/λ is 1.
     """
-    scales = np.ones((len(track) - 1, 2))
+    logs = np.zeros((len(track) - 1, 2))  # of λ
     for _ in range(rules.passes):
-        passages = smooth_track(track, model, scales).passages
-        squared = np.stack([each.squared for each in passages])
-        degrees = np.stack([each.degrees for each in passages])
-        scales = (scales * squared + rules.tail) / (np.maximum(degrees, 0.0) + rules.tail)
-    return scales
+        before, logs = logs, _fixed_point(track, model, logs, rules)
+        if np.abs(logs - before).max(initial=0.0) < rules.settled:
+            break
+    result = smooth_track(track, model, np.exp(logs))
+    share = _usual(logs) / np.exp(logs)
+    prior = 0.5 * rules.tail * (np.log(share) - share).sum(axis=1)
+    return result, result.logs + np.append(0.0, prior)
+
+
+def _fixed_point(track: Track, model: MotionModel, logs: Floats, rules: SmoothingRules) -> Floats:
+    """The next logarithms of λ (N - 1, 2)."""
+    scales = np.exp(logs)
+    passages = smooth_track(track, model, scales).passages
+    squared = np.stack([each.squared for each in passages])
+    degrees = np.stack([each.degrees for each in passages])
+    energy = scales * squared + rules.tail * _usual(logs)
+    return np.asarray(np.log(energy / (np.maximum(degrees, 0.0) + rules.tail)))
+
+
+def _usual(logs: Floats) -> Floats:
+    """Factors μ (2,) that are usual."""
+    return np.asarray(1 / np.exp(-logs).mean(axis=0))
 
 
 def _blocks(track: Track, longest: float, rules: SmoothingRules) -> list[Track]:
@@ -171,20 +204,27 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
     """
     white = np.exp(x[:, 2])
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
-    moved = track.moved
+    own = track.covariances[:, None] * white_share(track, white)
+    logs_wrong = logs_of_wrong(track, white, rules)
     states = begun(track, order, white)
     steps = np.diff(track.times).tolist()
     total, was_wrong = np.zeros(len(x)), np.zeros(len(x), bool)
     for k, elapsed in enumerate(steps, 1):
         ahead, _ = foretold(states, elapsed, noise)
-        R = white_part(track, k, white)
-        seen, _, log = updated(ahead, track.poses[k], R)
-        anywhere = np.diagonal(R, axis1=1, axis2=2) + (rules.reach * moved) ** 2
-        log_wrong = np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=1)
+        states, _, log = updated(ahead, track.poses[k], own[k])
+        if k < max(ORDERS.values()):
+            continue
         # two that follow each other are no accident: the body went another way
-        may_be_wrong = ~was_wrong & (k >= max(ORDERS.values()))
-        was_wrong = may_be_wrong & (log < log_wrong)
-        states = seen.mixed(ahead, was_wrong)
-        if k >= max(ORDERS.values()):
-            total += np.where(may_be_wrong, np.logaddexp(log, log_wrong), log)
+        may_be_wrong = ~was_wrong
+        was_wrong = may_be_wrong & (log < logs_wrong[k])
+        if was_wrong.any():
+            states = states.mixed(ahead, was_wrong)
+        total += np.where(may_be_wrong, np.logaddexp(log, logs_wrong[k]), log)
     return np.asarray(total)
+
+
+def logs_of_wrong(track: Track, white: Floats, rules: SmoothingRules) -> Floats:
+    """Log-likelihoods (N, G), without −3 log 2π, of poses that are ok, and wrong."""
+    own = track.covariances[:, None] * white_share(track, white)
+    anywhere = np.diagonal(own, axis1=2, axis2=3) + (rules.reach * track.moved) ** 2
+    return np.asarray(np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=2))

@@ -34,6 +34,7 @@ ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
 )
+_TRACE = np.eye(3).ravel()
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 
@@ -59,7 +60,7 @@ class States(NamedTuple):
 
     def moved(self, errors: Floats, covariances: Floats) -> States:
         """These states moved by errors (G, 6 p), with other covariances."""
-        poses = rigid.perturb(self.poses, errors[:, :6])
+        poses = _perturbed(self.poses, errors[:, :3], _turn(_across(errors[:, 3:6])))
         return States(poses, self.rates + errors[:, 6:].reshape(self.rates.shape), covariances)
 
     def mixed(self, others: States, is_other: Mask) -> States:
@@ -78,17 +79,22 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     Noise are the intensities q (G, 6), one per coordinate of a pose.
     """
     p = states.order
-    powers = np.array([elapsed**j / factorial(j) for j in range(p + 1)])
-    turned = _turned(states.rates[..., 3:], elapsed)
-    shift = np.einsum("j,gji->gi", powers[1:p], states.rates[..., :3])
-    moved = np.concatenate([shift, turned], axis=1)
-    rates = np.stack(
-        [np.einsum("j,gji->gi", powers[: p - 1 - k], states.rates[:, k:]) for k in range(p - 1)],
-        axis=1,
-    )
-    F = _transition(turned, powers)
-    covariances = F @ states.covariances @ F.swapaxes(1, 2) + _process_noise(elapsed, p, noise)
-    return States(rigid.perturb(states.poses, moved), rates, covariances), F
+    powers, by_taylor, by_rate = _step(elapsed, p)
+    moved = powers[1:p] @ states.rates
+    if p > 2:  # Magnus: a turn that changes its axis
+        changing = (powers[3:5] * [0.5, 1.0])[: p - 2] @ states.rates[:, 1:3, 3:]
+        moved[:, 3:] += (_across(changing) @ states.rates[:, 0, 3:, None])[..., 0]
+    across = _across(moved[:, 3:])
+    turn = _turn(across)
+    F = by_taylor[None].repeat(len(turn), axis=0)
+    # what a turn does to errors of rates is told to first order in it
+    F[:, 0, 3:, 0, 3:] = turn
+    F[:, 0, 3:, 1:, 3:] += across[:, :, None] * by_rate[:, None]
+    F = F.reshape(states.covariances.shape)
+    covariances = F @ states.covariances @ F.swapaxes(1, 2)
+    _add_process_noise(covariances, elapsed, p, noise)
+    rates = by_taylor[: p - 1, 0, : p - 1, 0] @ states.rates
+    return States(_perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
 
 
 def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, Floats, Floats]:
@@ -97,32 +103,20 @@ def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, F
     Beside them the Mahalanobis distances squared (G,) of the poses from what was foretold, and the
     log-likelihoods (G,) without the constant −3 log 2π.
     """
-    rest = rigid.twist_between(states.poses, np.broadcast_to(pose, states.poses.shape))
-    rest = rest.reshape(-1, 6)
+    rest = _twists(states.poses, pose)
     P = states.covariances
     S = P[:, :6, :6] + covariance
-    gains, whitened, log_determinants = _solved(S, P[:, :6], rest)
-    squared = np.einsum("gi,gi->g", whitened, rest)
-    errors = np.einsum("gij,gj->gi", gains, rest)
-    # Joseph's form: symmetric, and positive whatever rounding does
-    left = np.eye(P.shape[1]) - np.concatenate(
-        [gains, np.zeros((len(P), P.shape[1], P.shape[1] - 6))], axis=2
-    )
-    covariances = left @ P @ left.swapaxes(1, 2) + gains @ covariance @ gains.swapaxes(1, 2)
-    return states.moved(errors, covariances), squared, -0.5 * (squared + log_determinants)
-
-
-def _solved(S: Floats, cross: Floats, rest: Floats) -> tuple[Floats, Floats, Floats]:
-    """Gains (G, n, 6) Cᵀ S⁻¹, S⁻¹ r (G, 6) and log det S (G,)."""
     scale = 1 / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-    both = np.concatenate([cross, rest[:, :, None]], axis=2) * scale[:, :, None]
-    solved = np.linalg.solve(S * scale[:, :, None] * scale[:, None], both) * scale[:, :, None]
-    scaled = np.linalg.slogdet(S * scale[:, :, None] * scale[:, None])[1]
-    return (
-        solved[:, :, :-1].swapaxes(1, 2),
-        solved[:, :, -1],
-        scaled - 2 * np.log(scale).sum(axis=1),
-    )
+    both = scale[:, :, None] * scale[:, None]
+    inverse = np.linalg.inv(S * both) * both
+    gains = P[:, :, :6] @ inverse
+    squared = ((inverse @ rest[..., None])[..., 0] * rest).sum(axis=1)
+    log_determinants = np.linalg.slogdet(S * both)[1] - 2 * np.log(scale).sum(axis=1)
+    # Joseph's form: symmetric, and positive whatever rounding does
+    left = P - gains @ P[:, :6]
+    covariances = left + (gains @ covariance - left[:, :, :6]) @ gains.swapaxes(1, 2)
+    state = states.moved((gains @ rest[..., None])[..., 0], covariances)
+    return state, squared, -0.5 * (squared + log_determinants)
 
 
 class Passage(NamedTuple):
@@ -152,7 +146,9 @@ def smoothed(
     N = inverse @ (foretold_ - later.covariances[0]) @ inverse
     gain = P @ F[0].T
     covariance = P - gain @ N @ gain.T
-    Q = _process_noise(elapsed, here.order, noise)[0]
+    Q = np.zeros_like(here.covariances)
+    _add_process_noise(Q, elapsed, here.order, noise)
+    Q = Q[0]
     is_turn = np.arange(len(b)) % 6 >= 3
     # the noise that followed has the mean Q b and the covariance Q - Q N Q
     told = b * (Q @ b), (N * Q).sum(axis=1)
@@ -161,50 +157,57 @@ def smoothed(
     return state, passage
 
 
-def _turned(rates: Floats, elapsed: float) -> Floats:
-    """Rotation vectors (G, 3) over a time of angular velocities and derivatives (G, p - 1, 3)."""
-    angles = sum(
-        rates[:, j] * (elapsed ** (j + 1) / factorial(j + 1)) for j in range(rates.shape[1])
-    )
-    angles = np.asarray(angles)
-    if rates.shape[1] > 1:
-        changing = rates[:, 1] * (elapsed**3 / 12)
-        if rates.shape[1] > 2:
-            changing = changing + rates[:, 2] * (elapsed**4 / 24)
-        across = (changing @ _ACROSS).reshape(-1, 3, 3)
-        angles = angles + (across @ rates[:, 0, :, None])[..., 0]
-    return angles
+# For a few poses at a time the functions of `mixpose.rigid` take five times as long.
 
 
-def _transition(turned: Floats, powers: Floats) -> Floats:
-    """F (G, 6 p, 6 p); what a turn does to errors of rates is told to first order in it."""
-    p = len(powers) - 1
-    single = _upper(tuple(powers[:p].tolist()))
-    F = np.empty((len(turned), p, 6, p, 6))
-    F[...] = np.multiply.outer(single, np.eye(6)).swapaxes(1, 2)
-    F[:, 0, 3:, 0, 3:] = rigid.rotation_matrix(turned)
-    # [Ω] of x -> Ω × x
-    across = (turned @ _ACROSS).reshape(-1, 3, 1, 3)
-    by_rate = powers[1:p] / np.arange(2, p + 1)
-    F[:, 0, 3:, 1:, 3:] += across * by_rate[:, None]
-    return F.reshape(len(turned), 6 * p, 6 * p)
+def _across(vectors: Floats) -> Floats:
+    """[ω] (G, 3, 3) of vectors (G, 3): x -> ω × x."""
+    return np.asarray((vectors @ _ACROSS).reshape(-1, 3, 3))
+
+
+def _turn(across: Floats) -> Floats:
+    """Rotations exp [ω] (G, 3, 3), by O. Rodrigues."""
+    angle = np.sqrt((across**2).sum(axis=(1, 2), keepdims=True) / 2) + 1e-300
+    half = np.sin(angle / 2) / angle
+    return np.asarray(np.eye(3) + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
+
+
+def _perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
+    """Poses (G, 4, 4) after shifts (G, 3) and turns (G, 3, 3) in world axes."""
+    moved = poses.copy()
+    moved[:, :3, :3] = turn @ poses[:, :3, :3]
+    moved[:, :3, 3] += shift
+    return moved
+
+
+def _twists(T_from: Floats, T_to: Floats) -> Floats:
+    """Twists (G, 6) from poses (G, 4, 4) to others, or to one (4, 4)."""
+    R = T_to[..., :3, :3] @ T_from[:, :3, :3].swapaxes(1, 2)
+    flat = R.reshape(-1, 9)
+    cosine = flat @ _TRACE - 1  # twice that of the angle, as the axis is of its sine
+    if (cosine <= 0).any():
+        return rigid.twist_between(T_from, np.broadcast_to(T_to, T_from.shape)).reshape(-1, 6)
+    axis = flat @ _ACROSS.T
+    length = np.sqrt((axis**2).sum(axis=1)) + 1e-300
+    turn = axis * (np.arctan2(length, cosine) / length)[:, None]
+    return np.concatenate([T_to[..., :3, 3] - T_from[:, :3, 3], turn], axis=1)
 
 
 @lru_cache(maxsize=64)
-def _upper(powers: tuple[float, ...]) -> Floats:
-    """Taylor's coefficients (p, p) of a step."""
-    p = len(powers)
+def _step(elapsed: float, p: int) -> tuple[Floats, Floats, Floats]:
+    """Powers τ^j / j! (p + 1,), Taylor's F (p, 6, p, 6), and what a turn does by each rate."""
+    powers = np.array([elapsed**j / factorial(j) for j in range(max(p + 1, 5))])
     i, j = np.indices((p, p))
-    return np.where(j >= i, np.array(powers)[np.maximum(j - i, 0)], 0.0)
+    single = np.where(j >= i, powers[np.maximum(j - i, 0)], 0.0)
+    F = np.multiply.outer(single, np.eye(6)).swapaxes(1, 2).copy()
+    return powers, F, powers[1:p] / np.arange(2, p + 1)
 
 
-def _process_noise(elapsed: float, p: int, noise: Floats) -> Floats:
-    """Q (G, 6 p, 6 p)."""
-    single = _noise_of_step(elapsed, p)
-    Q = np.zeros((len(noise), p, 6, p, 6))
-    of_each = range(6)
-    Q[:, :, of_each, :, of_each] = single * noise.T[:, :, None, None]
-    return Q.reshape(len(noise), 6 * p, 6 * p)
+def _add_process_noise(covariances: Floats, elapsed: float, p: int, noise: Floats) -> None:
+    """Add Q to covariances (G, 6 p, 6 p)."""
+    by_axis = (noise[:, :, None] * np.eye(6))[:, None, :, None]
+    Q = _noise_of_step(elapsed, p)[:, None, :, None] * by_axis
+    covariances += Q.reshape(covariances.shape)
 
 
 @lru_cache(maxsize=64)

@@ -5,8 +5,10 @@ At each time the tip p in the body and the point c in the reference are at one p
     t_k + R_k p = t'_k + R'_k c
 
 with R', t' the pose of a reference body, or the identity where c is fixed in the world.  This is
-linear in p and c (Z. Yaniv, *Which Pivot Calibration?*, SPIE Medical Imaging 2015); then each
-equation is weighed by the covariance of its poses at the tip.
+linear in p and c (Z. Yaniv, *Which Pivot Calibration?*, SPIE Medical Imaging 2015), which is where
+to begin; but its coefficients are rotations that err.  So p, c and the poses at which all of this
+holds exactly are sought together: those from which the measured poses are off least, by their
+covariances (F. R. Helmert, 1872; the Gauss-Helmert model).
 """
 
 from __future__ import annotations
@@ -29,9 +31,9 @@ class PivotRules:
 
     fewest: int = constant(10, "poses: six numbers are sought, three equations come of each")
     turned: float = constant(
-        5.0, "times the noise of turns: of less, noise passes for turning, by 4 % (1/5²)"
+        1.5, "times what errors alone swing a direction by: of ten poses they reach 1.45 by 0.1 %"
     )
-    steps: int = constant(20, "of weighing: weights change with the place of the tip; 4 are enough")
+    steps: int = constant(20, "to the likeliest tip and poses: 4 do where turns err by 1 deg")
     foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
     parts: int = constant(5, "of the recording that are held out in turn")
     accident: float = constant(
@@ -90,11 +92,10 @@ def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
             "which the tool turns about its tip"
         )
     turns, directions = turns_seen(pivoting)
-    _require_turns(pivoting, turns, directions, rules)
+    _require_turns(pivoting, turns, directions, 1.0, rules)
     kept = np.ones(len(pivoting.poses), bool)
-    for _ in range(3):
-        some = pivoting.part(kept)
-        x, covariance, squared = _solved(some, pivoting, rules)
+    for _ in range(10):
+        x, information, squared = _solved(pivoting, kept, rules)
         # of three numbers, the median of χ² is 2.37; a slipping tip makes all of them larger
         usual = max(1.0, float(np.median(squared[kept])) / 2.366)
         now = squared <= usual * chdtri(3, rules.foreign)
@@ -103,10 +104,13 @@ def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
         kept = now
     some = pivoting.part(kept)
     rest = _residuals(some, x)
-    expected = _covariances(some, x)
+    still = np.zeros((len(rest), 12))
+    expected = _covariances(some, _at_tip(some, x, still)[1])
     scale = float(squared[kept].sum() / (3 * len(rest) - 6))
-    covariance = covariance[:3, :3] * max(1.0, scale)
-    held_out, lasting = _held_out(some, x[:3], covariance, max(1.0, scale), rules)
+    told = max(1.0, scale)
+    _require_turns(pivoting, turns, directions, told, rules)
+    covariance = told * _of_tip(information[kept])
+    held_out, lasting = _held_out(some, x[:3], information[kept], told, rules)
     return Tip(
         place=x[:3],
         covariance=covariance * lasting,
@@ -135,64 +139,99 @@ def turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
 
 
 def _require_turns(
-    pivoting: Pivoting, turns: Floats, directions: Floats, rules: PivotRules
+    pivoting: Pivoting, turns: Floats, directions: Floats, scale: float, rules: PivotRules
 ) -> None:
-    both = pivoting.covariances + pivoting.reference_covariances
-    noise = np.sqrt(2 * np.diagonal(both, axis1=1, axis2=2)[:, 3:].mean())
-    if turns[0] > rules.turned * noise:
+    """Raise a RecordingError where a direction swings no more than errors make it."""
+    both = scale * (pivoting.covariances + pivoting.reference_covariances)[:, 3:, 3:]
+    d = pivoting.poses[:, :3, :3] @ directions.T
+    # a turn by w moves a direction by w × d
+    along = np.einsum("kin,kij,kjn->kn", d, both, d)
+    noise = np.sqrt((np.trace(both, axis1=1, axis2=2)[:, None] - along).mean(axis=0))
+    swings = turns > rules.turned * noise
+    if swings[0]:
         return
-    least = np.degrees(rules.turned * noise)
-    found = np.degrees(turns)
-    if turns[1] <= rules.turned * noise:
+    least, found = np.degrees(rules.turned * noise), np.degrees(turns)
+    if not swings[1]:
         raise RecordingError(
-            f"the body hardly turns: found {found[2]:.3g} deg RMS; allowed: turns of 20 deg and "
-            "more about two axes, while the tip stays where it is"
+            f"the body hardly turns: found {found[2]:.3g} deg RMS, of which errors of the poses "
+            f"make {np.degrees(noise[2]):.2g}; allowed: turns of 20 deg and more about two axes, "
+            "while the tip stays where it is"
         )
     axis = ", ".join(f"{value:.2f}" for value in directions[0])
     raise RecordingError(
         f"the tip is not determined along the direction ({axis}) of the body: all turns are about "
-        f"it, it swings by {found[0]:.2g} deg RMS; allowed: at least {least:.2g}: tilt the tool, "
-        "too, so that this direction swings by 20 deg and more"
+        f"it, it swings by {found[0]:.2g} deg RMS; allowed: at least {least[0]:.2g}: tilt the "
+        "tool, too, so that this direction swings by 20 deg and more"
     )
 
 
-def _solved(some: Pivoting, of_all: Pivoting, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
-    """Tip and point (6,), their covariance, and squared residuals of all poses."""
-    A = np.concatenate([some.poses[:, :3, :3], -some.references[:, :3, :3]], axis=2)
-    b = some.references[:, :3, 3] - some.poses[:, :3, 3]
+def _solved(pivoting: Pivoting, kept: Mask, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
+    """Tip and point (6,) by the poses that are kept; information (N, 6, 6) and χ² (N,) of each."""
+    R, R_reference = pivoting.poses[kept, :3, :3], pivoting.references[kept, :3, :3]
+    b = pivoting.references[kept, :3, 3] - pivoting.poses[kept, :3, 3]
+    A = np.concatenate([R, -R_reference], axis=2)
     x = np.linalg.lstsq(A.reshape(-1, 6), b.ravel(), rcond=None)[0]
-    information = np.eye(6)
+    steps = np.zeros((len(pivoting.poses), 12))  # from the measured poses to those that fit
     for _ in range(rules.steps):
-        W = np.linalg.inv(_covariances(some, x))
-        weighed = A.swapaxes(1, 2) @ W
-        information = (weighed @ A).sum(axis=0)
-        before, x = x, np.linalg.solve(information, np.einsum("kij,kj->i", weighed, b))
-        if np.linalg.norm(x - before) <= 1e-12 * np.linalg.norm(x):
+        rest, by_poses, by_x = _at_tip(pivoting, x, steps)
+        W = np.linalg.inv(_covariances(pivoting, by_poses))
+        weighed = by_x.swapaxes(1, 2) @ W
+        information = weighed @ by_x
+        left = rest - np.einsum("kij,kj->ki", by_poses, steps)
+        pull = np.einsum("kij,kj->i", weighed[kept], left[kept])
+        step = -np.linalg.solve(information[kept].sum(axis=0), pull)
+        left += by_x @ step
+        pulls = np.einsum("kij,kj->ki", W, left)
+        steps = -_spread(pivoting, np.einsum("kji,kj->ki", by_poses, pulls)[:, :, None])[..., 0]
+        x = x + step
+        if np.linalg.norm(step) <= 1e-12 * np.linalg.norm(x):
             break
-    rest = _residuals(of_all, x)
-    solved = np.linalg.solve(_covariances(of_all, x), rest[..., None])[..., 0]
-    squared = np.einsum("ki,ki->k", rest, solved)
-    return x, np.asarray(np.linalg.inv(information)), np.asarray(squared)
+    return x, information, np.einsum("ki,ki->k", left, pulls)
 
 
-def _residuals(some: Pivoting, x: Floats) -> Floats:
-    """From the point to the tip, (N, 3)."""
-    tips = rigid.transform(some.poses, x[None, :3]) - rigid.transform(some.references, x[None, 3:])
-    return np.asarray(tips[:, 0])
+def _of_tip(information: Floats) -> Floats:
+    """Covariance (3, 3) of a tip by the information (n, 6, 6) of poses."""
+    return np.asarray(np.linalg.inv(information.sum(axis=0))[:3, :3])
 
 
-def _covariances(some: Pivoting, x: Floats) -> Floats:
-    """Of the residuals, (N, 3, 3)."""
-    tips = rigid.covariance_at(some.covariances, some.poses[:, :3, :3] @ x[:3])
-    points = rigid.covariance_at(some.reference_covariances, some.references[:, :3, :3] @ x[3:])
-    both = (tips + points)[:, :3, :3]
+def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
+    """From the point to the tip (N, 3) with poses moved by steps (N, 12), by steps and by x."""
+    by_poses, by_x, rest = [], [], np.zeros((len(steps), 3))
+    sides = ((pivoting.poses, x[:3], 1.0), (pivoting.references, x[3:], -1.0))
+    for (poses, place, sign), twists in zip(sides, np.split(steps, 2, axis=1), strict=True):
+        moved = rigid.perturb(poses, twists)
+        arms = moved[:, :3, :3] @ place
+        rest += sign * (arms + moved[:, :3, 3])
+        # a turn moves an arm across both; on top of another one, by the left Jacobian of SO(3)
+        by_turn = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)
+        by_turn = by_turn @ rigid.rotation_matrix(twists[:, 3:] / 2)  # which this is to 2nd order
+        J = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn], axis=2)
+        by_poses.append(sign * J)
+        by_x.append(sign * moved[:, :3, :3])
+    return rest, np.concatenate(by_poses, axis=2), np.concatenate(by_x, axis=2)
+
+
+def _spread(pivoting: Pivoting, columns: Floats) -> Floats:
+    """Covariances of both poses times columns (N, 12, n)."""
+    own, other = pivoting.covariances, pivoting.reference_covariances
+    return np.concatenate([own @ columns[:, :6], other @ columns[:, 6:]], axis=1)
+
+
+def _covariances(pivoting: Pivoting, by_poses: Floats) -> Floats:
+    """Of the distances from point to tip (N, 3, 3), with Jacobians (N, 3, 12) by the poses."""
+    both = by_poses @ _spread(pivoting, by_poses.swapaxes(1, 2))
     # directions that are held err by nothing, and nothing can be weighed by that
     least = 1e-9 * np.trace(both, axis1=1, axis2=2).mean() + 1e-300
     return np.asarray(both + least * np.eye(3))
 
 
+def _residuals(some: Pivoting, x: Floats) -> Floats:
+    """From the point to the tip, (N, 3)."""
+    return _at_tip(some, x, np.zeros((len(some.poses), 12)))[0]
+
+
 def _held_out(
-    some: Pivoting, tip: Floats, covariance: Floats, scale: float, rules: PivotRules
+    some: Pivoting, tip: Floats, information: Floats, scale: float, rules: PivotRules
 ) -> tuple[float, float]:
     """RMS residual of parts of the recording, each by a tip that was found without it.
 
@@ -203,11 +242,12 @@ def _held_out(
     for part in np.array_split(np.arange(len(some.poses)), rules.parts):
         others = np.ones(len(some.poses), bool)
         others[part] = False
-        x, own, _ = _solved(some.part(others), some, rules)
+        x, *_ = _solved(some, others, rules)
         rest.append(_residuals(some, x)[part])
         away = x[:3] - tip
         # of nested least squares the covariance of a difference is that of covariances
-        squared += float(away @ np.linalg.pinv(scale * own[:3, :3] - covariance) @ away)
+        differing = scale * (_of_tip(information[others]) - _of_tip(information))
+        squared += float(away @ np.linalg.pinv(differing) @ away)
     freedom = 3 * (rules.parts - 1)  # all of them differ from their own mean
     is_more = squared > chdtri(freedom, rules.accident)
     return _rms(np.concatenate(rest)), squared / freedom if is_more else 1.0

@@ -21,7 +21,12 @@ from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
-from mixpose.trajectories.intensity import SmoothingRules, fitted_model, local_scales
+from mixpose.trajectories.intensity import (
+    SmoothingRules,
+    fitted_model,
+    logs_of_wrong,
+    smooth_with_sudden_motion,
+)
 from mixpose.trajectories.track import (
     MotionModel,
     SmoothedTrack,
@@ -262,21 +267,27 @@ def _without_foreign(
 ) -> tuple[Track, SmoothedTrack]:
     """A track without poses that lie where those around them forbid, and the track smoothed."""
     limit = float(chdtri(int(track.free.sum()), rules.foreign))
+    wrong = logs_of_wrong(track, np.array([model.white]), rules)[:, 0]
+    result, logs = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
         # among motion that is steady a corner of the path looks foreign, too
         off = _off(track, smooth_track(track, model), model, -1)
         padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
         bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
         bad[[0, -1]] = False
-        if bad.any():
-            # but at a corner the others tell of sudden motion as well
-            rest = without(track, bad)
-            among = smooth_track(rest, model, local_scales(rest, model, rules))
-            bad &= _off(track, among, model, 1) > limit
+        if not bad.any():
+            break
+        # but at a corner the others tell of sudden motion as well
+        among, others = smooth_with_sudden_motion(without(track, bad), model, rules)
+        places = np.flatnonzero(bad)
+        parts = np.append(0, (places[1:] + places[:-1] + 1) // 2)  # what is next to each of them
+        likelier = np.add.reduceat(others - logs, parts) + wrong[places] > 0
+        bad[places] = likelier & (_off(track, among, model, 1)[places] > limit)
         if not bad.any():
             break
         track = without(track, bad)
-    return track, smooth_track(track, model, local_scales(track, model, rules))
+        result, logs = smooth_with_sudden_motion(track, model, rules)
+    return track, result
 
 
 def _off(track: Track, result: SmoothedTrack, model: MotionModel, sign: int) -> Floats:

@@ -89,15 +89,15 @@ def noise_of(track: Track, intensities: Floats) -> Floats:
     return np.where(track.free, intensities.repeat(3, axis=1), held)
 
 
-def white_part(track: Track, k: int, white: Floats) -> Floats:
-    """Covariances (G, 6, 6) of a pose without what it has in common with others."""
+def white_share(track: Track, white: Floats) -> Floats:
+    """Of covariances what is not in common with those of other poses, as factors (G, 6, 6)."""
     scale = np.where(track.free, np.sqrt(white)[:, None], 1.0)
-    return np.asarray(track.covariances[k] * scale[:, :, None] * scale[:, None])
+    return np.asarray(scale[:, :, None] * scale[:, None])
 
 
 def begun(track: Track, order: int, white: Floats) -> States:
     """G states at the first pose, of whose rates nothing is known."""
-    covariances = white_part(track, 0, white)
+    covariances = track.covariances[0] * white_share(track, white)
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     widths = _DIFFUSE * (track.moved + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
@@ -116,6 +116,7 @@ class SmoothedTrack:
     poses: Floats  # (N, 4, 4)
     covariances: Floats  # (N, 6, 6)
     passages: tuple[Passage, ...]  # what happened between each two times
+    logs: Floats  # (N,): log-likelihoods by those before; 0 where nothing is measured, or before
 
 
 def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
@@ -124,16 +125,18 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
     `scales` (N - 1, 2) is how much more noise there is between each two times than the model says.
     """
     white = np.array([model.white])
+    own = track.covariances[:, None] * white_share(track, white)
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
-    noises = [noise_of(track, (model.intensities * scale)[None]) for scale in scales]
+    noises = noise_of(track, model.intensities * scales)[:, None]
     states = [begun(track, model.order, white)]
     ahead: list[tuple[States, Floats]] = []
+    logs = np.zeros(len(track))
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
         ahead.append(foretold(states[-1], elapsed, noise))
         state = ahead[-1][0]
         if track.measured[k]:
-            state, *_ = updated(state, track.poses[k], white_part(track, k, white))
+            state, _, logs[k : k + 1] = updated(state, track.poses[k], own[k])
         states.append(state)
     passages: list[Passage] = []
     for k in range(len(steps) - 1, -1, -1):
@@ -145,6 +148,7 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
         np.concatenate([one.poses for one in states]),
         of_free(covariances, track.free),
         tuple(reversed(passages)),
+        logs,
     )
 
 
