@@ -148,10 +148,4 @@ HARMLESS: tuple[Harmless, ...] = (
         "(few,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
         "only speed: more poses are looked up, as counts are at least 1",
     ),
-    Harmless(
-        "trajectories/pivot.py",
-        "information = np.eye(6)",
-        "information = np.eye(12)",
-        "equivalent: it is replaced in the first step",
-    ),
 )
