@@ -137,6 +137,8 @@ class Matches:
 
     def summed(self, values: Floats) -> Floats:
         """Sums (S,) over the images of each sensor, of values (L,) at one pose."""
+        if self.owners is None:
+            return values
         return np.asarray(np.bincount(self.owner, values), dtype=np.float64)
 
     @property
