@@ -77,8 +77,8 @@ MUTANTS = (
     Mutant(
         "tracking-twin-forgotten",
         "tracking/tracker.py",
-        "other = -second.either if second and is_second else",
-        "other = None if second and is_second else",
+        "other = -second.either if second and one is second.pose else",
+        "other = None if second and one is second.pose else",
         "what stood beside the body is ok when the body goes",
         (_TWIN,),
     ),

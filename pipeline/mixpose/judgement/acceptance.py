@@ -258,9 +258,9 @@ def one_misses(
     used = judged.used
     if len(used.images) != 2 or (used.dimensions != 2).any():
         return False
-    names = "coverage", "unmatched_nearby", "missed", "count", "met"
     coverage, nearby, missed, count, met = (
-        used.summed(getattr(used, name)) / used.images for name in names
+        used.summed(each) / used.images
+        for each in (used.coverage, used.unmatched_nearby, used.missed, used.count, used.met)
     )
     least, most = sorted(range(2), key=coverage.tolist().__getitem__)
     if not coverage[least] < rules.agreeing <= coverage[most]:

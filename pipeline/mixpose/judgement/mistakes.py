@@ -152,9 +152,9 @@ def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: Noi
     columns[1, :, 0] = model.turned * (by_sensor[..., :3] @ away).ravel()
     squares = used.summed(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)))
     moved = np.sqrt(squares / np.maximum(used.summed(met), 1e-9))
-    # one sensor has the world stand as it does
-    deviations = np.full((S, 1, 6), model.turned * (S > 1))
-    deviations[..., :3] = (S > 1) * (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
+    deviations = np.full((S, 1, 6), model.turned)
+    deviations[..., :3] = (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
+    deviations *= S > 1  # one sensor has the world stand as it does
     each = rows.reshape(L, -1, 6) * deviations[used.owner]
     columns[2:].reshape(S, L, -1, 6)[used.owner, range(L)] = each
     return columns

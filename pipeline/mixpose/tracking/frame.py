@@ -200,6 +200,14 @@ class Frame(Setup):
             return np.zeros(len(poses))
         return self.expectation([*poses]) - self.anywhere[0]
 
+    def away_from(self, T_world_object: Floats) -> list[Floats]:
+        """How far the features (N,) of each prediction are from those at a pose."""
+        here, means = transform(T_world_object, self.body.means), self.body.means
+        return [
+            np.linalg.norm(transform(one.T_world_object, means) - here, axis=1)
+            for one in self.predictions
+        ]
+
     def other_at(self, T_world_object: Floats) -> float | None:
         """Log odds that what is at a pose is not the body, by the prediction that it goes on from.
 
@@ -207,11 +215,7 @@ class Frame(Setup):
         """
         if all(one.other is None for one in self.predictions):
             return None
-        here, means = transform(T_world_object, self.body.means), self.body.means
-        away = [
-            np.linalg.norm(transform(one.T_world_object, means) - here, axis=1)
-            for one in self.predictions
-        ]
+        away = self.away_from(T_world_object)
         near = [k for k, off in enumerate(away) if off.min() <= self.body.radius]
         return self.predictions[min(near, key=lambda k: away[k].mean())].other if near else None
 

@@ -263,10 +263,9 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         belief = weight * float(expit(one.log_evidence))
         momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
         spread = one.spread if data.options.fuse else None
-        second = verdict.second
-        is_second = second is not None and one is second.pose
-        other = -second.either if second and is_second else data.other_at(one.T_world_object)
-        branch = Branch(one.T_world_object, belief, spread=spread, deviation=momentary, other=other)
+        T, second = one.T_world_object, verdict.second
+        other = -second.either if second and one is second.pose else data.other_at(T)
+        branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
         found.append(branch)
     used = best.used
     met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))

@@ -18,7 +18,6 @@ from scipy.special import expit, logit
 from mixpose.body import thickness
 from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
 from mixpose.objective import View
-from mixpose.rigid import transform
 from mixpose.search import Candidate, Copy, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
@@ -156,9 +155,7 @@ def _where_it_was(data: Frame, best: ScoredPose, views: Sequence[View]) -> Score
 
 def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
     """Where else than at the best pose the body is expected."""
-    here = transform(best.T_world_object, data.body.means)
-    for branch in data.predictions:
-        off = np.linalg.norm(transform(branch.T_world_object, data.body.means) - here, axis=1)
+    for branch, off in zip(data.predictions, data.away_from(best.T_world_object), strict=True):
         if off.min() > data.body.radius:
             yield Start(branch.T_world_object, branch.uncertainty)
 

@@ -18,7 +18,7 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, foretold, updated
-from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_share
+from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_parts
 
 _NONE = -1  # a choice: the frame shows something else
 
@@ -67,14 +67,15 @@ def _followed(
     track: Track, alternatives: Sequence[Alternatives], model: MotionModel, rules: SmoothingRules
 ) -> tuple[list[tuple[int, ...]], Floats]:
     """The likeliest paths, each a choice per time, and their log likelihoods."""
-    first, white = alternatives[0], np.array([model.white])
-    noise, share = noise_of(track, model.intensities[None]), white_share(track, white)
-    states = begun(track, model.order, white.repeat(len(first.poses)))._replace(poses=first.poses)
+    first, white = alternatives[0], white_parts(track, np.array([model.white]))
+    noise = noise_of(track, model.intensities[None])
+    states = begun(track, model.order, white[0].repeat(len(first.poses), axis=0))
+    states = states._replace(poses=first.poses)
     paths: list[tuple[int, ...]] = [(k,) for k in range(len(first.poses))]
     logs: Floats = np.log(first.weights)
     for k, elapsed in enumerate(np.diff(track.times).tolist(), 1):
         ahead, _ = foretold(states, elapsed, np.repeat(noise, len(logs), axis=0))
-        R = track.covariances[k] * share
+        R = white[k]
         S = ahead.covariances[:, :6, :6] + R
         off_track = -0.5 * (rules.none + np.linalg.slogdet(S)[1])
         one = alternatives[k]

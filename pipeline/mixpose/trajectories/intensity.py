@@ -20,7 +20,7 @@ from mixpose.trajectories.track import (
     begun,
     noise_of,
     smooth_track,
-    white_share,
+    white_parts,
 )
 
 
@@ -202,11 +202,10 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
 
     Now and then a pose that is ok is a wrong one: it may be anywhere where the body gets in a step.
     """
-    white = np.exp(x[:, 2])
+    own = white_parts(track, np.exp(x[:, 2]))
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
-    own = track.covariances[:, None] * white_share(track, white)
-    logs_wrong = logs_of_wrong(track, white, rules)
-    states = begun(track, order, white)
+    logs_wrong = logs_of_wrong(track, own, rules)
+    states = begun(track, order, own[0])
     steps = np.diff(track.times).tolist()
     total, was_wrong = np.zeros(len(x)), np.zeros(len(x), bool)
     for k, elapsed in enumerate(steps, 1):
@@ -223,8 +222,10 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
     return np.asarray(total)
 
 
-def logs_of_wrong(track: Track, white: Floats, rules: SmoothingRules) -> Floats:
-    """Log-likelihoods (N, G), without −3 log 2π, of poses that are ok, and wrong."""
-    own = track.covariances[:, None] * white_share(track, white)
+def logs_of_wrong(track: Track, own: Floats, rules: SmoothingRules) -> Floats:
+    """Log-likelihoods (N, G), without −3 log 2π, of poses that are ok, and wrong.
+
+    By their `white_parts` (N, G, 6, 6).
+    """
     anywhere = np.diagonal(own, axis1=2, axis2=3) + (rules.reach * track.moved) ** 2
     return np.asarray(np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=2))

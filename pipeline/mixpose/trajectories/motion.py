@@ -91,8 +91,7 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     F[:, 0, 3:, 0, 3:] = turn
     F[:, 0, 3:, 1:, 3:] += across[:, :, None] * by_rate[:, None]
     F = F.reshape(states.covariances.shape)
-    covariances = F @ states.covariances @ F.swapaxes(1, 2)
-    _add_process_noise(covariances, elapsed, p, noise)
+    covariances = F @ states.covariances @ F.swapaxes(1, 2) + _process_noise(elapsed, p, noise)
     rates = by_taylor[: p - 1, 0, : p - 1, 0] @ states.rates
     return States(_perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
 
@@ -146,9 +145,7 @@ def smoothed(
     N = inverse @ (foretold_ - later.covariances[0]) @ inverse
     gain = P @ F[0].T
     covariance = P - gain @ N @ gain.T
-    Q = np.zeros_like(here.covariances)
-    _add_process_noise(Q, elapsed, here.order, noise)
-    Q = Q[0]
+    Q = _process_noise(elapsed, here.order, noise)[0]
     is_turn = np.arange(len(b)) % 6 >= 3
     # the noise that followed has the mean Q b and the covariance Q - Q N Q
     told = b * (Q @ b), (N * Q).sum(axis=1)
@@ -203,11 +200,11 @@ def _step(elapsed: float, p: int) -> tuple[Floats, Floats, Floats]:
     return powers, F, powers[1:p] / np.arange(2, p + 1)
 
 
-def _add_process_noise(covariances: Floats, elapsed: float, p: int, noise: Floats) -> None:
-    """Add Q to covariances (G, 6 p, 6 p)."""
+def _process_noise(elapsed: float, p: int, noise: Floats) -> Floats:
+    """Q (G, 6 p, 6 p)."""
     by_axis = (noise[:, :, None] * np.eye(6))[:, None, :, None]
     Q = _noise_of_step(elapsed, p)[:, None, :, None] * by_axis
-    covariances += Q.reshape(covariances.shape)
+    return np.asarray(Q.reshape(len(noise), 6 * p, 6 * p))
 
 
 @lru_cache(maxsize=64)

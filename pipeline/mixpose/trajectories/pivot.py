@@ -103,9 +103,8 @@ def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
             break
         kept = now
     some = pivoting.part(kept)
-    rest = _residuals(some, x)
-    still = np.zeros((len(rest), 12))
-    expected = _covariances(some, _at_tip(some, x, still)[1])
+    rest, by_poses, _ = _at_tip(some, x, np.zeros((len(some.poses), 12)))
+    expected = _covariances(some, by_poses)
     scale = float(squared[kept].sum() / (3 * len(rest) - 6))
     told = max(1.0, scale)
     _require_turns(pivoting, turns, directions, told, rules)

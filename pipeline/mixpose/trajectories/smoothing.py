@@ -34,6 +34,7 @@ from mixpose.trajectories.track import (
     of_free,
     smooth_track,
     track_of,
+    white_parts,
     without,
 )
 
@@ -267,7 +268,7 @@ def _without_foreign(
 ) -> tuple[Track, SmoothedTrack]:
     """A track without poses that lie where those around them forbid, and the track smoothed."""
     limit = float(chdtri(int(track.free.sum()), rules.foreign))
-    wrong = logs_of_wrong(track, np.array([model.white]), rules)[:, 0]
+    wrong = logs_of_wrong(track, white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
         # among motion that is steady a corner of the path looks foreign, too

@@ -89,19 +89,18 @@ def noise_of(track: Track, intensities: Floats) -> Floats:
     return np.where(track.free, intensities.repeat(3, axis=1), held)
 
 
-def white_share(track: Track, white: Floats) -> Floats:
-    """Of covariances what is not in common with those of other poses, as factors (G, 6, 6)."""
+def white_parts(track: Track, white: Floats) -> Floats:
+    """Covariances (N, G, 6, 6) of poses without what they have in common with others."""
     scale = np.where(track.free, np.sqrt(white)[:, None], 1.0)
-    return np.asarray(scale[:, :, None] * scale[:, None])
+    return np.asarray(track.covariances[:, None] * (scale[:, :, None] * scale[:, None]))
 
 
-def begun(track: Track, order: int, white: Floats) -> States:
-    """G states at the first pose, of whose rates nothing is known."""
-    covariances = track.covariances[0] * white_share(track, white)
+def begun(track: Track, order: int, covariances: Floats) -> States:
+    """G states at the first pose, of these covariances (G, 6, 6); of rates nothing is known."""
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     widths = _DIFFUSE * (track.moved + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
-    G = len(white)
+    G = len(covariances)
     P = np.zeros((G, 6 * order, 6 * order))
     P[:, range(6 * order), range(6 * order)] = np.concatenate([deviation, *rates], axis=1) ** 2
     P[:, :6, :6] = covariances
@@ -124,12 +123,11 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
 
     `scales` (N - 1, 2) is how much more noise there is between each two times than the model says.
     """
-    white = np.array([model.white])
-    own = track.covariances[:, None] * white_share(track, white)
+    own = white_parts(track, np.array([model.white]))
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
     noises = noise_of(track, model.intensities * scales)[:, None]
-    states = [begun(track, model.order, white)]
+    states = [begun(track, model.order, own[0])]
     ahead: list[tuple[States, Floats]] = []
     logs = np.zeros(len(track))
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
