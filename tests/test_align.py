@@ -59,9 +59,14 @@ def on_floor(xy: list[list[float]]) -> Floats:
     return rigid.from_parts(np.eye(3), places)
 
 
-def test_a_body_that_rests_is_the_frame_of_the_world() -> None:
-    found = floor_of(estimates_at(np.repeat(FLOOR[None], 5, 0)), "z", ABOVE)
-    np.testing.assert_allclose(found.T_old_new, FLOOR, atol=1e-9)
+@pytest.mark.parametrize("frames", [2, 3, 5])
+def test_a_body_that_rests_is_the_frame_of_the_world(frames: int) -> None:
+    # its places differ by errors, 0.01 along each axis, in which three frames span a triangle
+    errors = np.random.default_rng(frames).normal(size=(frames, 3)) * 0.01
+    poses = rigid.from_parts(np.repeat(FLOOR[None, :3, :3], frames, 0), FLOOR[:3, 3] + errors)
+    found = floor_of(estimates_at(poses), "z", ABOVE)
+    np.testing.assert_allclose(found.T_old_new, FLOOR, atol=0.03)
+    np.testing.assert_allclose(found.T_old_new[:3, :3], FLOOR[:3, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize("names", [None, ["a", "b", "c"]])
@@ -106,6 +111,14 @@ def test_what_spans_no_floor_is_refused() -> None:
         floor_of(estimates_at(on_floor([[0, 0], [100, 0], [250, 0]])), "z", ABOVE)
     with pytest.raises(RecordingError, match="found 2 points"):
         floor_of(estimates_at(on_floor([[0, 0], [100, 0]])), "z", ABOVE)
+    # moved along a line, and 3 to and fro for errors along it that one camera leaves in its depth
+    astray = rigid.from_rotation_vector(np.zeros(3), [0.0, 3.0, 0.0]) @ FLOOR
+    lines = estimates_at(np.stack([FLOOR, astray, on_floor([[100, 0]])[0], on_floor([[250, 0]])[0]]))
+    unsure = np.diag([0.01, 3.0, 0.01, 1e-4, 1e-4, 1e-4]) ** 2
+    for count in (3, 4):
+        told = [replace(each, covariance=unsure) for each in lines[-count:]]
+        with pytest.raises(RecordingError, match="may be errors"):
+            floor_of(told, "z", ABOVE)
     anywhere = rigid.from_parts(np.eye(3), np.random.default_rng(0).normal(size=(9, 3)) * 100)
     with pytest.raises(RecordingError, match="no plane"):
         floor_of(estimates_at(anywhere), "z", ABOVE)

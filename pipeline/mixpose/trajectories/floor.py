@@ -16,7 +16,8 @@ from mixpose.records import Estimate, Floats
 Axis: TypeAlias = Literal["x", "y", "z"]
 
 _RESTS = 5.0  # times its deviation: a body that is nowhere farther off its mean rests
-_FLAT = 1e-6  # of the largest distance: points on a line span no plane
+_FLAT = 1e-6  # of the largest spread: points on a line span no plane
+_SURELY = 3.0  # times what they are off the plane, or err by: points on a line span none by chance
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class Floor:
 def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     """The frame that bodies on the floor tell.
 
-    One body that rests is the frame of the world.  Three that rest, or three poses, are three
-    points: the origin, where the first axis leads to, and any other of the floor.  More are a
+    One body that rests is the frame of the world.  Three that rest, or three poses apart, are
+    three points: the origin, where the first axis leads to, and any other of the floor.  More are a
     plane, in which the origin and the first axis are as near to where they were as can be.  Of a
     body with a tip the tip is the point, of others the origin.
 
@@ -44,19 +45,20 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     for each in estimates:
         bodies.setdefault(each.label, []).append(each)
     rests = [_rests(own) for own in bodies.values()]
-    if len(bodies) == 1 and (len(estimates) == 1 or (rests[0] and len(estimates) != 3)):
+    if len(bodies) == 1 and rests[0]:
         return Floor(_mean_pose(estimates), f"the body {estimates[0].label!r}")
     if all(rests):
         points = np.stack([np.mean([_point(e) for e in own], axis=0) for own in bodies.values()])
     if not all(rests) or len(points) < 3:
         points = np.stack([_point(each) for each in estimates])
-    if len(points) == 3:
-        return Floor(_frame(points, up, sensors), "three points")
     if len(points) < 3:
         raise RecordingError(
             f"found {len(points)} points; allowed: one body, three points, or more in a plane"
         )
-    T, off = _plane(points, up, sensors)
+    normal, off = _normal(points, sensors, np.mean([_covariance(e) for e in estimates], axis=0))
+    if len(points) == 3:
+        return Floor(_axes(points[0], points[1] - points[0], normal, up), "three points")
+    T = _plane(points.mean(axis=0), normal, up)
     return Floor(T, f"a plane through {len(points)} points", off)
 
 
@@ -65,15 +67,16 @@ def _point(one: Estimate) -> Floats:
     return one.T_world_object[:3, 3] if one.tip is None else one.tip
 
 
+def _covariance(one: Estimate) -> Floats:
+    """That of the point (3, 3); 0 of true poses."""
+    C = one.covariance if one.tip is None else one.tip_covariance
+    return np.zeros((3, 3)) if C is None else np.asarray(C[:3, :3])
+
+
 def _rests(estimates: Sequence[Estimate]) -> bool:
     points = np.stack([_point(each) for each in estimates])
     away = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
-    variances = [
-        np.trace(C[:3, :3])
-        for each in estimates
-        if (C := each.covariance if each.tip is None else each.tip_covariance) is not None
-    ]
-    return bool(away <= _RESTS * np.sqrt(np.mean(variances)) if variances else away == 0)
+    return bool(away <= _RESTS * np.sqrt(np.mean([np.trace(_covariance(e)) for e in estimates])))
 
 
 def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
@@ -84,31 +87,30 @@ def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
     return rigid.from_parts(R, poses[:, :3, 3].mean(axis=0))
 
 
-def _frame(points: Floats, up: Axis, sensors: Floats) -> Floats:
-    """Of an origin, a point along the first axis, and any other (3, 3)."""
-    along, other = points[1] - points[0], points[2] - points[0]
-    normal = np.cross(along, other)
-    size = np.linalg.norm(along) * np.linalg.norm(other)
-    if not np.linalg.norm(normal) > _FLAT * size:
-        raise RecordingError("the three points lie on a line; allowed: the corners of a triangle")
-    return _axes(points[0], along, _upwards(normal, points[0], sensors), up)
+def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float]:
+    """Normal of the plane with the least squares of distances (n, 3), and their root mean square.
 
-
-def _plane(points: Floats, up: Axis, sensors: Floats) -> tuple[Floats, float]:
-    """The plane with the least squares of distances (n, 3), and their root mean square."""
+    Raises a RecordingError where the points, with a covariance (3, 3) each, span none.
+    """
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle)
-    if not sizes[1] > max(_FLAT * sizes[0], 3 * sizes[2]):
+    errors = np.sqrt(len(points) * (directions[1] @ covariance @ directions[1]))
+    if not sizes[1] > max(_FLAT * sizes[0], _SURELY * sizes[2], _SURELY * errors):
         raise RecordingError(
-            f"the points are no plane: they spread by {sizes[0]:.3g}, {sizes[1]:.3g} and "
-            f"{sizes[2]:.3g}; allowed: points all over the floor, and nothing but these"
+            f"the points lie on a line, or in no plane: they spread by {sizes[0]:.3g}, "
+            f"{sizes[1]:.3g}, of which {errors:.2g} may be errors, and {sizes[2]:.3g}; allowed: "
+            "points all over the floor, or the corners of a triangle, and nothing but these"
         )
-    normal = _upwards(directions[2], middle, sensors)
+    return _upwards(directions[2], middle, sensors), float(sizes[2] / np.sqrt(len(points)))
+
+
+def _plane(middle: Floats, normal: Floats, up: Axis) -> Floats:
+    """The frame of a plane through a point, as near to the old one as can be."""
     origin = normal * (normal @ middle)  # the old origin, moved onto the plane
     first = np.eye(3)[0 if up != "x" else 1]
     if abs(normal @ first) > 0.99:  # it stands on the floor
         first = np.eye(3)["xyz".index(up)]
-    return _axes(origin, first, normal, up), float(sizes[2] / np.sqrt(len(points)))
+    return _axes(origin, first, normal, up)
 
 
 def _upwards(normal: Floats, point: Floats, sensors: Floats) -> Floats:
