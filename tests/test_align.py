@@ -113,7 +113,7 @@ def test_what_spans_no_floor_is_refused() -> None:
         floor_of(estimates_at(on_floor([[0, 0], [100, 0]])), "z", ABOVE)
     # moved along a line, and 3 to and fro for errors along it that one camera leaves in its depth
     astray = rigid.from_rotation_vector(np.zeros(3), [0.0, 3.0, 0.0]) @ FLOOR
-    lines = estimates_at(np.stack([FLOOR, astray, on_floor([[100, 0]])[0], on_floor([[250, 0]])[0]]))
+    lines = estimates_at(np.stack([FLOOR, astray, *on_floor([[100, 0], [250, 0]])]))
     unsure = np.diag([0.01, 3.0, 0.01, 1e-4, 1e-4, 1e-4]) ** 2
     for count in (3, 4):
         told = [replace(each, covariance=unsure) for each in lines[-count:]]

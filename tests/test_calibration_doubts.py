@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated_rigs import FPS, PLACES, alone, bumped, cameras, motion, recording, task_of
+from simulated_rigs import (
+    BODY,
+    FPS,
+    PLACES,
+    POINTS,
+    alone,
+    bumped,
+    cameras,
+    motion,
+    recording,
+    task_of,
+)
 
 from mixpose.calibration import calibrate
 from mixpose.calibration.task import NOTHING, Hypotheses
@@ -72,6 +83,32 @@ def test_biases_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     assert len(told) == 1
     # a bias of 5 mm moves a sensor about 5 mm along its line of sight, or more across
     assert 5 <= found.moved_by_biases.max() < 30
+
+
+def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it() -> None:
+    sensors = cameras(2)
+    off = POINTS + np.eye(6)[:, 3:4] * [0.0, 0.0, 2.0]
+    exact, wrong = (recording(sensors, 16, 0.05, points=each) for each in (POINTS, off))
+    assert calibrate(task_of(sensors, exact), found=alone(sensors, exact)).contradicted is None
+    found = calibrate(task_of(sensors, wrong), found=alone(sensors, wrong))
+    true, T = (s[1].T_sensor_world for s in (sensors, found.after.sensors))  # type: ignore[attr-defined]
+    away = np.abs(T[:3, 3] - true[:3, 3]) / found.deviations[:3]
+    assert away.max() > 2.5  # 0.5 % of cameras whose deviations hold are that far off
+    held = found.contradicted
+    assert held is not None
+    assert (held.words, held.most) == ("body", f"{BODY.labels[3]}.z")
+    assert held.moves > 2.5
+    assert any("add --free body to what is free" in text for text in doubts_of(found, "mm"))
+    freed = task_of(sensors, wrong, body_free=True)
+    assert calibrate(freed, found=alone(sensors, wrong)).contradicted is None
+
+
+def test_a_late_camera_whose_delay_is_held_is_named() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 16, 0.05, late=0.004)
+    held = calibrate(task_of(sensors, frames), found=alone(sensors, frames)).contradicted
+    assert held is not None
+    assert held.words.endswith(":delay")  # of one or the other: only their difference is told
 
 
 def test_a_camera_that_was_linked_wrongly_is_placed_by_the_others() -> None:

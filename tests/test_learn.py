@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +22,18 @@ from moving_bodies import (
     write_recording,
 )
 
-from mixpose.calibration import SeenFrame
+from mixpose.body import Body, PointFeature
+from mixpose.calibration import Rig, SeenFrame
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import Eyes, Lesson, by_markers, learn, learn_from, like
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import doubts_of
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import CalibrationError, PinholeCamera
 from mixpose.session import load_scene, load_session
 
 CAMERAS = [camera(20.0), camera(85.0)]
-EYES = Eyes(
-    ("a", "b"),
-    tuple(PinholeCamera(CAMERA_MATRIX, np.zeros(0), RESOLUTION, T) for T in CAMERAS),
-    np.ones(2),
-)
+SENSORS = [PinholeCamera(CAMERA_MATRIX, np.zeros(0), RESOLUTION, T) for T in CAMERAS]
+EYES = Eyes(Rig.of(("a", "b"), SENSORS, Body("none", (PointFeature(np.zeros(3)),))), np.ones(2))
 SHORT = Scene(frames=40)
 
 
@@ -109,6 +108,32 @@ def test_an_older_table_gives_axes_names_and_order(five: tuple[Array, Lesson]) -
     # the ruler's errors of 0.5 mm turn and shift the frame by as much at most
     assert np.abs(likeness.learnt.points - points).max() < 1.5
     assert like(lesson.bodies[0], 1.5 * ruler, []) is None
+
+
+def test_a_body_before_late_cameras_that_may_be_off_is_within_its_deviations() -> None:
+    # the second camera looks 1/40 of a frame later, when markers are up to a pixel further
+    fine = replace(SHORT, frames=40 * SHORT.frames, noise=0.03, still=0, false=0)
+    points, poses = moving(5, 3, fine)
+    a, b = (
+        detections([(points, poses[start::40])], CAMERAS, replace(fine, frames=40), 1)
+        for start in (0, 1)
+    )
+    seen = zip(a, b, strict=True)
+    frames = [
+        SeenFrame(k, float(k), {0: first[0], 1: second[1]}, dict.fromkeys((0, 1), float(k)))
+        for k, (first, second) in enumerate(seen)
+    ]
+    late = replace(EYES, rig=replace(EYES.rig, delays=np.array([0.0, 1 / 40])))
+    (told,) = learn_from(frames, late).bodies
+    (not_told,) = learn_from(frames, EYES).bodies
+    doubted = replace(late, errors={1: CalibrationError(position=1.0)})
+    (unsure,) = learn_from(frames, doubted).bodies
+    off, too_far = (aligned_errors(one.points, points) for one in (told, not_told))
+    # 0.03 px are 0.006 mm of 40 frames
+    assert (np.linalg.norm(off, axis=1) < 3 * np.linalg.norm(told.deviations, axis=1)).all()
+    assert np.abs(off).max() < 0.02 < np.abs(too_far).max()
+    # a millimetre at a metre turns lines of sight by 0.06 deg, which is 0.1 mm and more on the body
+    assert unsure.deviations.mean() > 2 * told.deviations.mean()
 
 
 def test_two_bodies_are_told_apart() -> None:

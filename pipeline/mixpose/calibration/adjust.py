@@ -17,6 +17,7 @@ import numpy as np
 from mixpose.calibration.bundle import Bundle, Step, Weighted, rows_of, solved, stepped
 from mixpose.calibration.matching import feature_spacing, match, nearest_distance
 from mixpose.calibration.rig import Rig, State
+from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats, Mask
 
 _MOST_BLURS = 40
@@ -102,14 +103,13 @@ def _ended(
     rules = bundle.rules
     most = rules.unlike * noise
     for _ in range(rules.last_steps):
-        weighted, _ = _weighted(bundle, state, rules.blur * noise, noise, last=True)
+        weighted, _ = weighted_at_the_end(bundle, state, noise)
         state, size = _climbed(bundle, state, weighted)
         before, noise = noise, np.minimum(learnt(state, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
     weighted, alone, step = _at_the_end(bundle, state, noise)
-    dimension = float(np.mean([eye.dimension for eye in state.rig.sensors]))
-    scattered = step.covariance * _of_cauchy(dimension, rules.tail)
+    scattered = step.covariance * variance_ratio(state.rig, rules)
     inflation = _inflation(bundle, weighted, scattered)
     covariance = scattered * inflation + step.of_held
     pairs = tuple((rows, weight) for (rows, _), weight in zip(weighted, alone, strict=True))
@@ -120,8 +120,15 @@ def _at_the_end(
     bundle: Bundle, state: State, noise: Floats
 ) -> tuple[list[Weighted], list[Floats], Step]:
     """What is weighed at the maximum, and the step that is left."""
-    weighted, alone = _weighted(bundle, state, bundle.rules.blur * noise, noise, last=True)
+    weighted, alone = weighted_at_the_end(bundle, state, noise)
     return weighted, alone, solved(bundle, state, weighted)
+
+
+def weighted_at_the_end(
+    bundle: Bundle, state: State, noise: Floats
+) -> tuple[list[Weighted], list[Floats]]:
+    """Pairs as the last steps weigh them; and by the objective alone."""
+    return _weighted(bundle, state, bundle.rules.blur * noise, noise, last=True)
 
 
 def moved_by_held(bundle: Bundle, found: Adjusted) -> Floats:
@@ -199,8 +206,9 @@ def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
     return found
 
 
-def _of_cauchy(dimension: float, tail: float) -> float:
+def variance_ratio(rig: Rig, rules: CalibrationRules) -> float:
     """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations."""
+    dimension, tail = float(np.mean([eye.dimension for eye in rig.sensors])), rules.tail
     # of Gaussian errors with radius r in their deviations, whose weight is w = 1/(1 + r²/c²):
     # E[w² r²/m] E[w] / E[w + w' r/m]²
     r = np.linspace(0, 10, 2001)

@@ -110,7 +110,7 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
     return Rows(pairs, pairs.y - y, by_pose, shares, by_rig, by_held, known & visible)
 
 
-def _normal_equations(
+def normal_equations(
     bundle: Bundle, weighted: Sequence[Weighted], damping: float
 ) -> tuple[Floats, Floats, Floats, Callable[[Floats], Floats]]:
     """The normal equations S δ = b of the rig (G, G), poses eliminated."""
@@ -178,7 +178,7 @@ def solved(
     bundle: Bundle, state: State, weighted: Sequence[Weighted], damping: float = 0.0
 ) -> Step:
     """Solve within the gauge, leaving alone what the data do not determine."""
-    S, held, b, poses_step = _normal_equations(bundle, weighted, damping)
+    S, held, b, poses_step = normal_equations(bundle, weighted, damping)
     scales = bundle.scales
     S = S * np.outer(scales, scales)
     basis = _complement(bundle.gauge(state.rig), len(scales))

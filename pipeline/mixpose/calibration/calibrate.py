@@ -10,6 +10,7 @@ import numpy as np
 from mixpose.calibration import result
 from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
 from mixpose.calibration.bundle import Bundle
+from mixpose.calibration.contradicted import contradiction
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.recorded import held_back_with
@@ -131,8 +132,8 @@ class _Run:
         centres = np.array([centre_of(s) for s in rig.sensors])
         places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
         away = np.linalg.norm(places[:, None] - centres[None], axis=2)
-        body, length = self._task.body_free, float(max(np.median(away), 1e-9))
-        self._blocks = blocks_of(rig, free, body=body, length=length, interval=self._interval)
+        body, self._length = self._task.body_free, float(max(np.median(away), 1e-9))
+        self._blocks = blocks_of(rig, free, body=body, length=self._length, interval=self._interval)
 
     def _result(self) -> result.Calibration:
         """The calibration, but for its residuals."""
@@ -263,6 +264,9 @@ class _Run:
             residuals={},
             noise=adjusted.noise,
             inflation=adjusted.inflation,
+            contradicted=contradiction(
+                self._bundle(part), adjusted, length=self._length, interval=self._interval
+            ),
             certainty=adjusted.certainty,
             moved_by_biases=self._moved_by_biases(part, adjusted),
             explained=result.explained_share(adjusted, part.frames, task),

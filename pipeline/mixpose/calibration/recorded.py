@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 from scipy.signal import find_peaks
 
 from mixpose.body import Body
+from mixpose.calibration.rig import Rig
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import Progress, SeenFrame
 from mixpose.errors import RecordingError, SessionError
@@ -24,6 +26,15 @@ _RUN = 8  # frames read together where motion between them counts
 _HELD_RUN = 4  # frames held back together likewise
 _FARTHEST = 2.5  # spreads from the middle: what lies beyond is as likely clutter
 _MEANS = 1e-3  # information before the first frame, of a descriptor's spread
+
+
+def rig_of(session: Session) -> Rig:
+    """Sensors and body as a session has them; a delay that is to be estimated is 0."""
+    setups = session.sensors
+    rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
+    late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
+    readouts = np.array([one.readout for one in setups], dtype=np.float64)
+    return replace(rig, delays=np.array(late, dtype=np.float64), readouts=readouts)
 
 
 def require_points(body: Body) -> None:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.body.symmetry import motions
 from mixpose.calibration.adjust import Adjusted
 from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
+from mixpose.calibration.contradicted import Contradiction
 from mixpose.calibration.rig import Block, Rig, State, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame, Task
@@ -66,6 +67,7 @@ class Calibration:
     residuals: Mapping[int, Residual]
     noise: Floats  # (L,)
     inflation: float
+    contradicted: Contradiction | None  # what of that is held the recording contradicts most
     # share of the weight of pairs of which each is the nearest that the other has: near 1, or
     # detections cannot be told apart
     certainty: float

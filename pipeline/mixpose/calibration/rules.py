@@ -78,6 +78,11 @@ class CalibrationRules:
         "of simulated range sensors have 0.98 and more, wrong ones 0.4, ranges that do not tell "
         "tags apart 0.5",
     )
+    by_chance: float = constant(
+        1e-6,
+        "chance that a recording contradicts what is held as much, though it is right: up to a "
+        "hundred things are asked",
+    )
     rising: float = constant(
         1.5,
         "times the residual of the other frames that that of frames held back may be: six or more "

@@ -68,6 +68,13 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
             "detections do not tell features apart, so that the deviations hold only if the start "
             "was right"
         )
+    held = found.contradicted
+    if held is not None:
+        told.append(
+            f"the recording contradicts what is held of {held.words}, most of all {held.most}: "
+            f"freed, it would move what was found by {held.moves:.2g} deviations, which do not "
+            f"know of it; add --free {held.words} to what is free"
+        )
     for sensor in found.doubtful(rules):
         told.append(
             f"{found.after.names[sensor]}: {100 * found.explained[sensor]:.0f} % of its detections "

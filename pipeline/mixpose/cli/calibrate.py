@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mixpose import __version__
-from mixpose.calibration import Calibration, CalibrationRules, Rig, Task, calibrate, free_parameters
-from mixpose.calibration.recorded import read_frames, require_points
+from mixpose.calibration import Calibration, CalibrationRules, Task, calibrate, free_parameters
+from mixpose.calibration.recorded import read_frames, require_points, rig_of
 from mixpose.calibration.searching import MARK as SAVED_MARK
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
@@ -109,11 +108,7 @@ def task_of(
 ) -> Task:
     """Read the recording, and the poses where they are known."""
     require_points(session.body)
-    setups = session.sensors
-    rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
-    late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
-    readouts = np.array([one.readout for one in setups], dtype=np.float64)
-    rig = replace(rig, delays=np.array(late, dtype=np.float64), readouts=readouts)
+    setups, rig = session.sensors, rig_of(session)
     known = None if request.poses is None else known_poses(request.poses, session)
     # one word of --free may hold several
     free_words = [part for word in request.free or () for part in word.split()]

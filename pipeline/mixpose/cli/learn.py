@@ -29,7 +29,6 @@ def learn_session(request: LearnRequest) -> None:
     inputs = [path] if request.like is None else [path, request.like]
     refuse_to_overwrite_but(request.output, inputs, MARK)
     older = None if request.like is None else _older(request.like, session)
-    _warn_of_late(session)
     rules = LearningRules()
     with watched() as progress:
         lesson = learn(session, named_sources(request.source or ()), rules, progress)
@@ -99,16 +98,18 @@ def _tell(
     names = [file.name for file in called]
     pairs = zip(bodies, names, strict=True)
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit, rules)]
-    for doubt in (*doubts, *look_alikes(bodies, names)):
+    for doubt in (*doubts, *look_alikes(bodies, names), *_late_ones(session, bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(shown, files))}{others}")
 
 
-def _warn_of_late(session: Session) -> None:
+def _late_ones(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+    """Bodies whose motion is not known, where late sensors ask for it."""
     late = [one.name for one in session.sensors if one.delay or one.readout]
-    if late:
-        warn(
-            f"{', '.join(late)}: delay and readout are not looked at here; move slowly, or learn "
-            "and then let mixpose calibrate --free body adjust what was learnt"
-        )
+    return [
+        f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, of "
+        "which none is followed: move slowly, or learn from a recording of one alone"
+        for name, body in zip(names, bodies, strict=True)
+        if late and body.count > 1
+    ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
-from mixpose.sensors import Sensor
+from mixpose.sensors import CalibrationError
 
 _MET = 0.2  # weight of a pair that counts as seen: within 2.5 deviations
 
@@ -29,9 +29,10 @@ _MET = 0.2  # weight of a pair that counts as seen: within 2.5 deviations
 class Eyes:
     """The sensors of a recording."""
 
-    names: tuple[str, ...]
-    sensors: tuple[Sensor, ...]
+    rig: Rig  # its body is none of those that are learnt
     sigmas: Floats  # (L,): σ_ε of each
+    # by sensor, how far what is told of it may be off
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,32 +123,34 @@ def _frames_of(
     frames, poses = list[SeenFrame](), dict[int, Floats]()
     for k, one in body.places:
         others = [own for owner, own in taken[k] if owner is not one]
-        frame = _left(clouds[k].seen, others)
+        frame = _left(clouds[k].seen, others, timed=body.count == 1)
         frames.append(frame)
         poses[id(frame)] = one.T_world_shape
-    chosen = informative(frames, len(eyes.sensors), rules.adjusted, runs=False)
+    chosen = informative(frames, len(eyes.sigmas), rules.adjusted, runs=eyes.rig.is_late)
     return chosen, np.array([poses[id(frame)] for frame in chosen])
 
 
-def _left(seen: SeenFrame, others: Sequence[Indices]) -> SeenFrame:
-    """A frame without the detections (n, L) of other bodies, and out of time."""
+def _left(seen: SeenFrame, others: Sequence[Indices], *, timed: bool) -> SeenFrame:
+    """A frame without the detections (n, L) of other bodies, and in time where these are told."""
+    # of bodies alike no one knows which one went where, so that their motion is not known
     points = {}
     for sensor, pixels in seen.points.items():
         left = np.ones(len(pixels), dtype=np.bool_)
         for own in others:
             left[own[own[:, sensor] >= 0, sensor]] = False
         points[sensor] = pixels[left]
-    return SeenFrame(seen.number, None, points, {})
+    return SeenFrame(seen.number, seen.time_s if timed else None, points, seen.times)
 
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
     rules = CalibrationRules()
-    rig = Rig.of(eyes.names, eyes.sensors, Body("", tuple(map(PointFeature, points))))
+    rig = replace(eyes.rig, points=points, body=Body("", tuple(map(PointFeature, points))))
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
     free = np.ones(6, dtype=np.bool_)
     state = State(rig, poses)
     gauge, _ = gauge_rows(state, blocks, free)
-    return adjust(Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules), state)
+    bundle = Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules, eyes.errors)
+    return adjust(bundle, state)
 
 
 def _seen(found: Adjusted, markers: int, frames: int) -> Indices:

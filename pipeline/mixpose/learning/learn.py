@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose.calibration import CalibrationRules, SeenFrame
-from mixpose.calibration.recorded import read_frames
+from mixpose.calibration.recorded import read_frames, rig_of
 from mixpose.calibration.task import Progress, silent
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning.adjusting import Eyes, Learnt, adjusted
@@ -41,11 +41,8 @@ def eyes_of(session: Session) -> Eyes:
             "allowed: two or more that see the body at the same time. With one, put a rough guess "
             "of the markers into [object] and let mixpose calibrate --free body adjust it"
         )
-    return Eyes(
-        tuple(one.name for one in setups),
-        tuple(one.sensor for one in setups),
-        np.array([one.extract.sigma for one in setups]),
-    )
+    errors = {k: one.calibration_error for k, one in enumerate(setups) if one.calibration_error}
+    return Eyes(rig_of(session), np.array([one.extract.sigma for one in setups]), errors)
 
 
 def learn(
@@ -64,7 +61,13 @@ def learn(
     read = replace(
         CalibrationRules(), most_read=rules.most_frames, most_candidates=rules.most_frames
     )
-    frames = read_frames(session, sources or {}, read, progress, runs=False, known=None)
+    runs = eyes.rig.is_late
+    frames = read_frames(session, sources or {}, read, progress, runs=runs, known=None)
+    if runs and any(frame.time_s is None for frame in frames):
+        raise SessionError(
+            f"{session.path}: learn: found delay or readout, and frames without times; allowed: "
+            "fps or times for every sensor, or a video"
+        )
     return learn_from(frames, eyes, rules, progress, name=str(session.path))
 
 
@@ -82,7 +85,7 @@ def learn_from(
     Raises a RecordingError if no body is seen to move.
     """
     progress("triangulating", 0, 1)
-    clouds, noise = clouds_of(frames, eyes.sensors, eyes.sigmas, rules)
+    clouds, noise = clouds_of(frames, eyes.rig.sensors, eyes.sigmas, rules)
     if not any(len(cloud) for cloud in clouds):
         raise RecordingError(_seen_by_one(frames, eyes, name))
     moving, still = without_still(clouds, rules)
@@ -97,7 +100,9 @@ def learn_from(
 def _seen_by_one(frames: Sequence[SeenFrame], eyes: Eyes, name: str) -> str:
     """Why there is no point in space."""
     shared = sum(sum(len(points) > 0 for points in f.points.values()) > 1 for f in frames)
-    seen = sorted({eyes.names[s] for f in frames for s, points in f.points.items() if len(points)})
+    seen = sorted(
+        {eyes.rig.names[s] for f in frames for s, points in f.points.items() if len(points)}
+    )
     if not shared:
         return (
             f"{name}: learn: found no frame in which two cameras see anything; {', '.join(seen)} "
