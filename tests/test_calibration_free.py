@@ -161,6 +161,27 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
         known_length(ranging, f"s0:s1={length}")
 
 
+def test_what_the_known_length_errs_by_is_in_all_deviations() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 8, 0.02)
+    free: dict[int, Any] = {1: ("pose",), 2: ("pose", "focal")}
+    found = calibrate(task_of(sensors, frames, free=free), found=alone(sensors, frames))
+    words = f"s0:s1={2 * np.linalg.norm(centre_of(sensors[1]) - centre_of(sensors[0]))}"
+    rng = np.random.default_rng(0)
+    for _ in range(4):  # one error of the rig, small enough to be linear, and what comes of it
+        error = 1e-6 * rng.normal(size=13)
+        off = replace(found, after=rig_moved(found.after, found.blocks, error))
+        one = replace(found, covariance=np.outer(error, error), deviations=np.abs(error))
+        told = in_length(one, words).deviations
+        rigs: list[Any] = [in_length(each, words).after.sensors for each in (found, off)]
+        for block in found.blocks[:2]:
+            T, T_off = (rig[block.sensor].T_sensor_world for rig in rigs)
+            turn = T_off[:3, :3] @ T[:3, :3].T
+            away = [*(T_off[:3, 3] - turn @ T[:3, 3]), *Rotation.from_matrix(turn).as_rotvec()]
+            np.testing.assert_allclose(told[block.place], np.abs(away), rtol=1e-3, atol=1e-10)
+        assert told[-1] == pytest.approx(abs(error[-1]))  # a focal length is in px
+
+
 def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None:
     sensors = cameras(2)
     frames = recording(sensors, 12, 0.05)

@@ -63,7 +63,7 @@ def _generators(
         told(place.get((index, kind)), sensor_change(sensor))
         if not hasattr(sensor, "camera_matrix"):
             held.append(np.eye(_GENERATORS)[12:])  # it measures lengths
-    told(place.get((None, "body")), _body_change(state.rig.points))
+    told(place.get((None, "body")), body_change(state.rig.points))
     fixed = ~pose_free
     if fixed.any():
         poses = state.poses[:: max(len(state.poses) // _MOST_POSES, 1)]
@@ -92,7 +92,8 @@ def sensor_change(sensor: Any) -> Floats:
     return change
 
 
-def _body_change(points: Floats) -> Floats:
+def body_change(points: Floats) -> Floats:
+    """Change of the coordinates of points (n, 3), one after the other, by all generators."""
     change = np.zeros((len(points), 3, _GENERATORS))
     change[:, :, 6:12] = _by_motion(points)
     change[:, :, 12] = points
@@ -127,12 +128,12 @@ def _conditions(
             add(text, (block, values))
     body = next((b for b in blocks if b.kind == "body"), None)
     if body is not None:
-        change = _body_change(rig.points)
+        change = body_change(rig.points)
         text = "the body's own frame stays where its features are on average"
         for k in range(6, 12):
             add(text, (body, change[:, k]))
         if length is not None:
-            parts = _length_parts(rig, blocks, length)
+            parts = length_parts(rig, blocks, length)
             add("the known length between two sensors stays", *parts)
         else:
             text = "the body keeps its size: cameras alone do not tell scale"
@@ -142,7 +143,7 @@ def _conditions(
     return found
 
 
-def _length_parts(
+def length_parts(
     rig: Rig, blocks: Sequence[Block], length: tuple[int, int]
 ) -> list[tuple[Block, Floats]]:
     """The change of the distance between two sensors by their places."""

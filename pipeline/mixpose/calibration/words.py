@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.calibration.gauge import sensor_change
+from mixpose.calibration.gauge import body_change, length_parts, sensor_change
 from mixpose.calibration.result import Calibration
-from mixpose.calibration.rig import KINDS, Kind, Rig, centre_of, kinds_of
+from mixpose.calibration.rig import KINDS, Block, Kind, Rig, centre_of, kinds_of
 from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
@@ -144,15 +144,37 @@ def in_length(found: Calibration, words: str) -> Calibration:
     pair, length = known_length(found.after, words)
     factor = length / _apart(found.after, pair)
     units = [unit for block in found.blocks for unit in block.units]
-    sizes = np.array([factor if unit == "length" else 1.0 for unit in units])
+    sizes = [factor if unit == "length" else 1.0 for unit in units]
+    changes = [_scale_change(found.after, block) for block in found.blocks]
+    along = np.zeros(len(units))
+    for block, values in length_parts(found.after, found.blocks, pair):
+        along[block.place] += values
+    # what the distance errs by scales all
+    share = factor / _apart(found.after, pair)
+    by_old = np.diag(sizes) - share * np.outer(np.concatenate(changes), along)
     return replace(
-        found,
+        _by_linear(found, by_old),
         before=_scaled(found.before, factor),
         after=_scaled(found.after, factor),
-        deviations=found.deviations * sizes,
-        covariance=found.covariance * np.outer(sizes, sizes),
         poses={number: _shifted(T, factor) for number, T in found.poses.items()},
     )
+
+
+def _scale_change(rig: Rig, block: Block) -> Floats:
+    """Change of a block's parameters by a scale of all lengths."""
+    if block.kind == "body":
+        return body_change(rig.points)[:, -1]
+    if block.kind == "pose" and block.sensor is not None:
+        return sensor_change(rig.sensors[block.sensor])[:, -1]
+    return np.zeros(len(block.names))
+
+
+def _by_linear(found: Calibration, by_old: Floats) -> Calibration:
+    """The calibration with the deviations of parameters that depend linearly (G, G) on the old."""
+    covariance = by_old @ found.covariance @ by_old.T
+    told = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    told = np.where(np.isfinite(found.deviations), told, np.inf)
+    return replace(found, covariance=covariance, deviations=told)
 
 
 def _scaled(rig: Rig, factor: float) -> Rig:
@@ -197,12 +219,8 @@ def in_world(found: Calibration, words: str) -> Calibration:
         if own is not None and sensor is not None:  # the others move as this one errs
             change = sensor_change(moved[sensor])[:, :6]
             by_old[block.place, own.place] = change if block is not own else 0.0
-    covariance = by_old @ found.covariance @ by_old.T
-    told = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
     return replace(
-        found,
-        covariance=covariance,
-        deviations=np.where(np.isfinite(found.deviations), told, np.inf),
+        _by_linear(found, by_old),
         after=replace(found.after, sensors=moved),
         poses={number: T_new_world @ T for number, T in found.poses.items()},
         gauge=(*found.gauge, f"the world is that of {words}"),

@@ -133,7 +133,8 @@ def _nothing_moves(
     if left < 3 <= seen or (still and left < len(still)):
         return (
             f"{name}: learn: found {seen:.0f} points in space in most frames, {len(still)} of "
-            f"which never move; what moves and turns is missing: {wanted}"
+            f"which never move; what moves and turns is missing, or frames are of different "
+            f"moments: {wanted}"
         )
     if seen < 3:
         return (
