@@ -145,13 +145,14 @@ def in_length(found: Calibration, words: str) -> Calibration:
     factor = length / _apart(found.after, pair)
     units = [unit for block in found.blocks for unit in block.units]
     sizes = [factor if unit == "length" else 1.0 for unit in units]
-    changes = [_scale_change(found.after, block) for block in found.blocks]
-    along = np.zeros(len(units))
+    change, along = np.zeros((2, len(units)))
+    for block in found.blocks:
+        change[block.place] = _scale_change(found.after, block)
     for block, values in length_parts(found.after, found.blocks, pair):
         along[block.place] += values
     # what the distance errs by scales all
     share = factor / _apart(found.after, pair)
-    by_old = np.diag(sizes) - share * np.outer(np.concatenate(changes), along)
+    by_old = np.diag(sizes) - share * np.outer(change, along)
     return replace(
         _by_linear(found, by_old),
         before=_scaled(found.before, factor),
