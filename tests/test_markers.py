@@ -21,7 +21,7 @@ from mixpose.density import Observation
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, rate_of
+from mixpose.poses.trajectories import Trajectories, numbers_of, rate_of
 from mixpose.records import Estimate, Floats, Offsets, PointPattern, SensorReport
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.sensors import ParallelBeam
@@ -235,14 +235,18 @@ def test_frames_that_are_not_there_are_gaps(session: Session) -> None:
     assert not found.is_measured.any()
 
 
+def rate(lines: list[PoseLine]) -> tuple[float, float] | None:
+    return rate_of(lines, numbers_of(lines))
+
+
 def test_rate_is_that_of_the_times_and_unevenness_is_told() -> None:
-    assert rate_of([line(frame) for frame in range(3)]) is None
-    even = rate_of([line(frame, time_s=5 + frame / 30) for frame in (0, 1, 5)])
+    assert rate([line(frame) for frame in range(3)]) is None
+    even = rate([line(frame, time_s=5 + frame / 30) for frame in (0, 1, 5)])
     np.testing.assert_allclose(np.array(even, dtype=np.float64), [30, 0], atol=1e-9)
-    late = rate_of([line(0, time_s=0.0), line(1, time_s=1.6), line(2, time_s=2.0)])
+    late = rate([line(0, time_s=0.0), line(1, time_s=1.6), line(2, time_s=2.0)])
     np.testing.assert_allclose(np.array(late, dtype=np.float64), [1, 0.6], atol=1e-9)
     with pytest.raises(RecordingError, match="--fps"):
-        rate_of([line(0, time_s=1.0), line(1, time_s=1.0)])
+        rate([line(0, time_s=1.0), line(1, time_s=1.0)])
 
 
 def trajectories(frames: int, markers: int = 2, first: int = 0) -> Trajectories:

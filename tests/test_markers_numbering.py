@@ -12,7 +12,7 @@ from mixpose.cli.session_formats import trajectories_of
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import Trajectories, rate_of, write_trc
+from mixpose.poses.trajectories import Trajectories, numbers_of, rate_of, write_trc
 from mixpose.session import Session, load_session
 
 FOLDER = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
@@ -53,9 +53,9 @@ def test_frames_that_are_numbered_by_stamps_count_from_0_and_gaps_stay(
 
 def test_frames_of_very_large_numbers_have_a_rate(session: Session) -> None:
     lines = [line(10**30 + k, 0.1 * k) for k in range(5)]
-    rate = rate_of(lines)
-    assert rate is not None
-    assert rate[0] == pytest.approx(10)
+    found = rate_of(lines, numbers_of(lines))
+    assert found is not None
+    assert found[0] == pytest.approx(10)
     assert collected(session, lines).first == 10**30
 
 
@@ -68,8 +68,9 @@ def test_a_gap_of_more_frames_than_there_is_room_for_is_refused(session: Session
 
 
 def test_times_that_do_not_ascend_are_told_by_the_number_of_the_frame() -> None:
+    lines = [line(EPOCH_NS, 1.0), line(EPOCH_NS + 1, 0.5)]
     with pytest.raises(RecordingError, match=r"frame 1700000000000000001 is at 0\.5 s"):
-        rate_of([line(EPOCH_NS, 1.0), line(EPOCH_NS + 1, 0.5)])
+        rate_of(lines, numbers_of(lines))
 
 
 def test_names_of_markers_stay_different_where_blanks_cannot_be_written() -> None:

@@ -254,7 +254,7 @@ def test_right_covariances_have_a_squared_error_of_one_per_dimension(free: list[
     nees = evaluate(poses, truth).nees
     assert nees is not None
     assert nees.frames == 1000
-    assert nees.nees_per_dimension == pytest.approx(1.0, abs=0.08)
+    assert nees.mean_per_dimension == pytest.approx(1.0, abs=0.08)
     assert nees.inside_95 == pytest.approx(0.95, abs=0.021)
 
 
@@ -271,7 +271,7 @@ def test_covariances_that_promise_too_much_are_found_out() -> None:
     honest, boasted = evaluate(poses, truth).nees, evaluate(boasting, truth).nees
     assert honest is not None
     assert boasted is not None
-    assert boasted.nees_per_dimension == pytest.approx(4 * honest.nees_per_dimension)
+    assert boasted.mean_per_dimension == pytest.approx(4 * honest.mean_per_dimension)
     assert boasted.inside_95 < 0.5
 
 

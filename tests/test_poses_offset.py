@@ -49,7 +49,7 @@ def test_another_origin_of_the_object_is_told_with_what_is_left(motion: list[Flo
     assert found.offset is not None
     assert found.offset.of == "object"
     np.testing.assert_allclose(found.offset.T, TRANSFORM, atol=3 * NOISE_MM)
-    assert found.offset.translation < 3 * NOISE_MM
+    assert found.offset.translation_rms < 3 * NOISE_MM
     table = as_table(found)
     assert "in the axes of the object: turned by 12 deg, moved by (50" in table
     assert "has the truth another origin or other axes of the object?" in table

@@ -126,7 +126,7 @@ def test_page_has_the_figures_of_evaluate(full: Path) -> None:
     ):
         row = f"{name} {spread.rms:.4g} {spread.median:.4g} {spread.p95:.4g} {spread.max:.4g}"
         assert row in page.text
-    assert f"squared error per dimension {found.nees.nees_per_dimension:.3g}" in page.text
+    assert f"squared error per dimension {found.nees.mean_per_dimension:.3g}" in page.text
 
 
 def test_page_shows_the_session_and_frames_of_both_cameras(full: Path) -> None:

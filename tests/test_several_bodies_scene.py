@@ -51,7 +51,7 @@ def test_a_recording_of_two_different_and_two_identical_bodies() -> None:
         assert each.rotation_deg.rms < 0.15
         assert each.translation.rms < 0.06
     assert found.nees is not None
-    assert found.nees.nees_per_dimension < 1.5
+    assert found.nees.mean_per_dimension < 1.5
 
 
 def test_bodies_found_from_nothing_are_those_that_are_there() -> None:

@@ -346,7 +346,7 @@ def test_poses_of_recordings_err_by_at_most_0_7_of_what_they_did(
     # 0.92 where ranges were off by the same from frame to frame, with a squared error of 1.7
     assert after.translation.rms < 0.7 * before.translation.rms
     assert after.nees is not None
-    assert after.nees.nees_per_dimension < 1.25
+    assert after.nees.mean_per_dimension < 1.25
     (header,) = read_poses(output).header["smoothed"].values()
     assert header["motion"] == "crackle"
     again = mixpose("smooth", output, "-o", tmp_path / "twice.jsonl")

@@ -77,7 +77,7 @@ def figures_of(name: str, seed: int) -> Figures:
         position=found.translation.rms if found.translation else nan,
         ok=found.ok / found.frames,
         inside_95=found.nees.inside_95 if found.nees else nan,
-        squared=found.nees.nees_per_dimension if found.nees else nan,
+        squared=found.nees.mean_per_dimension if found.nees else nan,
     )
 
 

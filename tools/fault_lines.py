@@ -77,7 +77,7 @@ def row(change: Change) -> list[str]:
         " and ".join(_mean(lines, side, "explained") for side in ("left", "right")),
         " and ".join(_mean(lines, side, "rms") for side in ("left", "right")) + " px",
         f"{off.rms:.2g} mm" if off is not None and found.ok else "",
-        f"{found.nees.nees_per_dimension:.2g}" if found.nees is not None else "",
+        f"{found.nees.mean_per_dimension:.2g}" if found.nees is not None else "",
         f"{np.median(deviations):.2g} mm" if deviations else "",
     ]
 

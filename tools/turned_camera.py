@@ -55,7 +55,7 @@ def cell(side: str, axis: str, degrees: float) -> str:
     assert distance is not None
     assert found.nees is not None
     off = f"{angle.max:.2g}°, {distance.max:.2g} mm"
-    return f"{found.ok} ok: {off}, squared {found.nees.nees_per_dimension:.2g}, {warned}"
+    return f"{found.ok} ok: {off}, squared {found.nees.mean_per_dimension:.2g}, {warned}"
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ class Consistency:
     frames: int
     # mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they promise
     # too much
-    nees_per_dimension: float
+    mean_per_dimension: float
     inside_95: float  # share of frames whose truth lies inside the 95 % ellipsoid
 
 
@@ -39,7 +39,7 @@ def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
     limits = chdtri(dimensions, 1.0 - CONFIDENCE)
     return Consistency(
         frames=len(measured),
-        nees_per_dimension=float(np.mean(nees / dimensions)),
+        mean_per_dimension=float(np.mean(nees / dimensions)),
         inside_95=float(np.mean(nees <= limits)),
     )
 
@@ -72,9 +72,9 @@ class ConstantOffset:
     # whether it stands right of the poses, ``T_truth = T_pose T``, or left of them
     of: Literal["object", "world"]
     T: Floats  # (4, 4)
-    # RMS errors that are left with it
-    rotation_deg: float
-    translation: float
+    # errors that are left with it
+    rotation_deg_rms: float
+    translation_rms: float
 
     def text(self, unit: str) -> str:
         """In words."""
@@ -88,7 +88,8 @@ class ConstantOffset:
         return (
             f"one transform explains most of this, in the axes of the {self.of}: turned by "
             f"{turn:.4g} deg, moved by ({shift}) {unit}; with it errors are "
-            f"{self.rotation_deg:.4g} deg and {self.translation:.4g} {unit} RMS: {asked[self.of]}"
+            f"{self.rotation_deg_rms:.4g} deg and {self.translation_rms:.4g} {unit} RMS: "
+            f"{asked[self.of]}"
         )
 
 
@@ -112,17 +113,15 @@ def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | 
     ]
     good = []
     for each in found:  # one kind of error nearly vanishes, and the other grows no larger
-        after = np.array([each.rotation_deg, each.translation])
+        after = np.array([each.rotation_deg_rms, each.translation_rms])
         if (after < _LEFT * before).any() and (after < 1.1 * before).all():
             good.append(each)
-    return min(good, key=lambda each: each.translation) if good else None
+    return min(good, key=lambda each: each.translation_rms) if good else None
 
 
 def _mean(motions: Floats) -> Floats:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
-    T[:3, 3] = motions[:, :3, 3].mean(axis=0)
-    return T
+    R = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    return rigid.from_parts(R, motions[:, :3, 3].mean(axis=0))
 
 
 def _rms(one: Floats, other: Floats) -> Floats:

@@ -21,7 +21,8 @@ from mixpose.records import Floats
 
 _CLEARLY = 0.5  # of the distance to the body before: nearer to another by so much is a swap
 
-Pairs: TypeAlias = list[tuple[int, int, float]]
+_Paired: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
+"""By frame: numbers of the poses, numbers of the truth, and distances between them."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,7 @@ def renumbered(
 
 def _paired(
     found: Sequence[PoseLine], right: Sequence[PoseLine], symmetries: Floats | None
-) -> dict[int, tuple[list[int], list[int], Floats]]:
-    """By frame: numbers of the poses, numbers of the truth, and distances between them."""
+) -> _Paired:
     truths = _by_frame(right)
     paired = {}
     for frame, lines in _by_frame(found).items():
@@ -89,9 +89,7 @@ def _by_frame(lines: Sequence[PoseLine]) -> dict[int, list[PoseLine]]:
 
 
 def _assigned(
-    found: Sequence[PoseLine],
-    right: Sequence[PoseLine],
-    frames: Mapping[int, tuple[list[int], list[int], Floats]],
+    found: Sequence[PoseLine], right: Sequence[PoseLine], frames: _Paired
 ) -> dict[int, int]:
     """The number of the truth that each number of the poses stands for."""
     mine = sorted({line.instance or 0 for line in found})
@@ -107,9 +105,7 @@ def _assigned(
     return {number: numbers[number] if number in numbers else next(spare) for number in mine}
 
 
-def _swaps(
-    found: Sequence[PoseLine], frames: Mapping[int, tuple[list[int], list[int], Floats]]
-) -> Swaps:
+def _swaps(found: Sequence[PoseLine], frames: _Paired) -> Swaps:
     status = {(line.frame, line.instance or 0): line.status for line in found}
     holds: dict[int, int] = {}
     doubted: dict[int, bool] = {}

@@ -27,13 +27,7 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "per_axis": None if per_axis is None else dict(per_axis),
         "ok_frames": _errors(evaluation, "ok_") if evaluation.ok_rotation_deg else None,
         "best_hypothesis": best if evaluation.best_rotation_deg else None,
-        "nees": None
-        if nees is None
-        else {
-            "frames": nees.frames,
-            "mean_per_dimension": nees.nees_per_dimension,
-            "inside_95": nees.inside_95,
-        },
+        "nees": None if nees is None else asdict(nees),
         **_sometimes(evaluation),
     }
 
@@ -42,12 +36,7 @@ def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
     """What an evaluation says only where there are several bodies, or something is odd."""
     found: dict[str, Any] = {}
     if evaluation.offset is not None:
-        found["constant_offset"] = {
-            "of": evaluation.offset.of,
-            "T": evaluation.offset.T.tolist(),
-            "rotation_deg_rms": evaluation.offset.rotation_deg,
-            "translation_rms": evaluation.offset.translation,
-        }
+        found["constant_offset"] = asdict(evaluation.offset) | {"T": evaluation.offset.T.tolist()}
     if evaluation.exchanged:
         found["exchanged"] = True
     if evaluation.bodies:
@@ -111,7 +100,7 @@ def _one_body(evaluation: Evaluation) -> list[str]:
         lines += [
             "",
             f"covariance, {counted}: "
-            f"squared error per dimension {nees.nees_per_dimension:.3g} (right: 1), "
+            f"squared error per dimension {nees.mean_per_dimension:.3g} (right: 1), "
             f"inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %",
         ]
     if evaluation.offset is not None:

@@ -88,20 +88,17 @@ def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
     return dict(zip(stamps, accumulate((max(each, 1) for each in passed), initial=0), strict=True))
 
 
-def rate_of(
-    lines: Sequence[PoseLine], numbers: Mapping[int, int] | None = None
-) -> tuple[float, float] | None:
+def rate_of(lines: Sequence[PoseLine], numbers: Mapping[int, int]) -> tuple[float, float] | None:
     """Frames per second by the times of pose lines, and how far off the times are, in frames.
 
-    `numbers` are those of `numbers_of`; else frames are as lines have them. None where lines have
-    no times, or all are of one frame. Raises RecordingError if times do not ascend with the frames.
+    `numbers` are those of `numbers_of`. None where lines have no times, or all are of one frame.
+    Raises RecordingError if times do not ascend with the frames.
     """
     times = {line.frame: line.time_s for line in lines if line.time_s is not None}
     if len(times) < 2:
         return None
     known = sorted(times)
-    places = [number if numbers is None else numbers[number] for number in known]
-    frames = np.array([place - places[0] for place in places], dtype=np.float64)
+    frames = np.array([numbers[each] - numbers[known[0]] for each in known], dtype=np.float64)
     seconds = np.array([times[number] for number in known])
     if (np.diff(seconds) <= 0).any():
         k = int(np.argmax(np.diff(seconds) <= 0))
