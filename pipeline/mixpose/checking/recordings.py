@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
+from mixpose.frames.source import Frames
 from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
 from mixpose.records import Image, PointPattern, RawFrame
@@ -23,6 +25,9 @@ _QUICK = 5  # frames that are looked at where not all are
 # images of a sensor in which features are counted: to find them takes five times as long as to read
 # an image, and the median of so many is as good as that of all
 _COUNTED = 20
+
+Damage: TypeAlias = list[tuple[int | None, str]]
+"""Numbers of frames that cannot be read, as far as known, and why."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ def survey(
     frame. A `SessionError` if a function of the user's that extracts features fails.
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
-    damage: list[tuple[int | None, str]] = []
+    damage: Damage = []
     counts: dict[int, int | None] = {}
     numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
     size: tuple[int, int] | None = None
@@ -136,9 +141,7 @@ def numbers_of(source: Source) -> set[int] | None:
     return None if source.length is None else set(range(source.length))
 
 
-def _frames(
-    source: Source, damage: list[tuple[int | None, str]], *, quick: bool
-) -> Generator[RawFrame, None, None]:
+def _frames(source: Source, damage: Damage, *, quick: bool) -> Frames:
     """The frames that can be read; what is said of the others is put into `damage`."""
     if isinstance(source, ImageSequence):
         frames = _images(source, damage, quick=quick)
@@ -148,16 +151,14 @@ def _frames(
     yield from prefetch(frames, source.ahead) if source.ahead and not quick else frames
 
 
-def _whole(source: Source, damage: list[tuple[int | None, str]]) -> Iterator[RawFrame]:
+def _whole(source: Source, damage: Damage) -> Iterator[RawFrame]:
     try:
         yield from source.frames()
     except RecordingError as error:
         damage.append((None, str(error)))
 
 
-def _images(
-    source: ImageSequence, damage: list[tuple[int | None, str]], *, quick: bool
-) -> Iterator[RawFrame]:
+def _images(source: ImageSequence, damage: Damage, *, quick: bool) -> Iterator[RawFrame]:
     """Each image by itself: after a damaged one the next can be read all the same."""
     numbers = source.numbers
     for number in _spread(numbers, _QUICK) if quick else numbers:

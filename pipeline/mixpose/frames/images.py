@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import stat
 import zlib
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
@@ -15,7 +15,7 @@ import numpy as np
 
 from mixpose.errors import RecordingError, reporting
 from mixpose.frames.capture import quieten_opencv
-from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
 from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS
 from mixpose.records import Image, RawFrame
@@ -98,9 +98,7 @@ class ImageSequence(Source):
         """See that each image in the range has a time."""
         require_times(self.clock, (number for number in self.numbers if number in wanted))
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Decode the images whose numbers lie in the range; the others are not even opened."""
         wanted = selection(start, stop, step, self.first)
         size, like = self.resolution, "the sensor's resolution"

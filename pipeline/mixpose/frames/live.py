@@ -34,7 +34,7 @@ from mixpose.frames.capture import (
     opened,
     retrieve,
 )
-from mixpose.frames.source import Source, SourceKind, selection
+from mixpose.frames.source import Frames, Source, SourceKind, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, Moment, RawFrame
 
@@ -93,9 +93,7 @@ class LiveSource(Source):
     def check_times(self, wanted: range) -> None:
         """Nothing to look for: nobody knows which frames will come."""
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Each time the newest frame, once there is one that has not been given yet.
 
         Raises RecordingError if the source does not open or falls silent.

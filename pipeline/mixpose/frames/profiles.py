@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, csv_rows, finite, require_times
 from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
@@ -63,9 +63,7 @@ class RangeProfiles(Source):
         """See that each profile in the range has a time."""
         require_times(self.clock, (number for number in range(self.length) if number in wanted))
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Read the profiles in the range; the others are not converted."""
         wanted = selection(start, stop, step, self.first)
         rows = _npy_rows if _is_npy(self.path) else _csv_rows

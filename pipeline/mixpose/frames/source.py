@@ -12,6 +12,7 @@ from mixpose.records import RawFrame
 
 SensorKind: TypeAlias = Literal["camera", "lateration", "cloud"]
 SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profiles"]
+Frames: TypeAlias = Generator[RawFrame, None, None]
 
 # Frame numbers come from file names, which hold at most 255 digits.
 _BEYOND_ALL_NUMBERS = 10**256
@@ -74,9 +75,7 @@ class Source(Protocol):
         known in advance.
         """
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Frames by ascending number, those of ``range(start, stop, step)`` only.
 
         Skipped frames are not decoded. Without `start` the range begins at the first frame. Raises

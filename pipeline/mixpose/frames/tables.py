@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +16,7 @@ import numpy as np
 
 from mixpose.errors import RecordingError
 from mixpose.frames.source import (
+    Frames,
     SensorKind,
     Source,
     SourceKind,
@@ -125,9 +126,7 @@ class DetectionTable(Source):
             keys.update(key for key, _, _ in self._rows())
         return sorted(keys)
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Group the rows to frames; skipped frames are not converted.
 
         The time of a frame is that of its earliest detection.  A row of weight 0 says no more

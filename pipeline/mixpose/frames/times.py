@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import NoReturn, TypeAlias
 
-from mixpose.errors import RecordingError, SessionError
+from mixpose.errors import RecordingError, SessionError, reporting
 from mixpose.frames.source import SourceSpec
 
 Clock: TypeAlias = Callable[[int], float]
@@ -102,7 +102,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
     if spec.fps is None:
         return None
     fps = spec.fps
-    if not (math.isfinite(fps) and fps > 0):
+    if not 0 < fps < math.inf:
         raise SessionError(f"sensor {spec.sensor!r}: fps: found {fps}, allowed is above 0")
     return lambda number: number / fps
 
@@ -114,8 +114,9 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     the first.
     """
     width = None
+    cannot = reporting(RecordingError, f"{path}: cannot be read")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with cannot, path.open(encoding="utf-8-sig", newline="") as file:
             # a line that is longer comes in pieces, and has not as many cells as the first
             pieces = iter(partial(file.readline, _LONGEST_LINE), "")
             reader = csv.reader(pieces, skipinitialspace=True)
@@ -130,8 +131,6 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
                         f"the first row has {width}"
                     )
                 yield reader.line_num, cells
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise RecordingError(f"{path}: not a text file in UTF-8") from error
     except csv.Error as error:

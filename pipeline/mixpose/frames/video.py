@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from mixpose.frames.capture import (
     retrieve,
 )
 from mixpose.frames.containers import container_of, missing_bytes
-from mixpose.frames.source import Source, SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
 from mixpose.limits import MOST_PIXELS
 from mixpose.records import Moment, RawFrame
@@ -79,9 +79,7 @@ class Video(Source):
                 count += 1
         return count
 
-    def frames(
-        self, start: int | None = None, stop: int | None = None, step: int = 1
-    ) -> Generator[RawFrame, None, None]:
+    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Decode the frames in the range; those between are passed over, not converted.
 
         Raises RecordingError after the frames that can be read: if the file is cut short or frames
@@ -149,7 +147,7 @@ class Video(Source):
         # rate, but not where frames are lost
         fps = capture.get(cv2.CAP_PROP_FPS)
         promised = self.promised or 0
-        if count >= promised or last_time_s is None or not _positive(fps):
+        if count >= promised or last_time_s is None or not 0 < fps < math.inf:
             return False
         container = container_of(Path(self.address))
         if container in ("mp4", "matroska"):
@@ -219,8 +217,4 @@ def _time(capture: cv2.VideoCapture, number: int, before: float | None) -> float
     if math.isfinite(own) and (number == 0 or before is None or own > before):
         return own
     fps = capture.get(cv2.CAP_PROP_FPS)
-    return number / fps if _positive(fps) else None
-
-
-def _positive(value: float) -> bool:
-    return math.isfinite(value) and value > 0
+    return number / fps if 0 < fps < math.inf else None
