@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse, rotation_matrix
+from mixpose.rigid import from_parts, inverse, rotation_matrix, transform
 from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.motion import Motion, plan_motion
@@ -86,13 +86,10 @@ def pivot_of(body: Body) -> Floats:
 
 def count_seen(session: Session, T_world_object: Floats) -> int:
     """How many features are in view, summed over the sensors."""
-    body = session.body
-    points = body.means @ T_world_object[:3, :3].T + T_world_object[:3, 3]
-    seen = 0
-    for setup in session.sensors:
-        visible = setup.sensor.project(points)[1] & facing(setup.sensor, body, T_world_object)
-        seen += int(visible.sum())
-    return seen
+    body, points = session.body, transform(T_world_object, session.body.means)
+    sensors = [setup.sensor for setup in session.sensors]
+    seen = [one.project(points)[1] & facing(one, body, T_world_object) for one in sensors]
+    return int(np.sum(seen))
 
 
 def places(session: Session) -> list[Floats]:

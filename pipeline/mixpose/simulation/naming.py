@@ -78,7 +78,8 @@ class SourceFiles:
         return name in (self.listed.values() if self.listed else [self.path])
 
 
-Sources: TypeAlias = Sequence[tuple[SensorSetup, str | tuple[str, ...]]]
+Source: TypeAlias = str | tuple[str, ...]
+Sources: TypeAlias = Sequence[tuple[SensorSetup, Source]]
 
 
 def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[SourceFiles, ...]]:
@@ -135,7 +136,7 @@ def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
     return numbers
 
 
-def _image_names(source: str | tuple[str, ...]) -> tuple[str, ...]:
+def _image_names(source: Source) -> tuple[str, ...]:
     """Names of images that the session states one by one."""
     if isinstance(source, tuple):
         return source
@@ -143,9 +144,7 @@ def _image_names(source: str | tuple[str, ...]) -> tuple[str, ...]:
     return (source,) if is_image and not _WILD.search(source) else ()
 
 
-def _source_files(
-    setup: SensorSetup, source: str | tuple[str, ...], numbers: Sequence[int]
-) -> SourceFiles:
+def _source_files(setup: SensorSetup, source: Source, numbers: Sequence[int]) -> SourceFiles:
     if not source:
         raise SessionError(
             f'{_where(setup.name)}: missing; name what is to be written, like "{setup.name}*.png"'
@@ -161,7 +160,7 @@ def _source_files(
     return files
 
 
-def _table_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
+def _table_files(setup: SensorSetup, source: Source) -> SourceFiles:
     path = _filled(source) if isinstance(source, str) else ""
     suffix = PurePosixPath(path).suffix.casefold()
     are_ranges, binned = setup.sensor.dimension == 1, setup.bin_size is not None
@@ -179,9 +178,7 @@ def _table_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFil
     raise SessionError(f"{_where(setup.name)}: found {source!r}; allowed for {allowed}")
 
 
-def _camera_files(
-    sensor: str, source: str | tuple[str, ...], numbers: Sequence[int]
-) -> SourceFiles:
+def _camera_files(sensor: str, source: Source, numbers: Sequence[int]) -> SourceFiles:
     names = _image_names(source)
     if names:
         if len(set(names)) != len(names):
@@ -222,10 +219,9 @@ def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> Source
     ends = [numbers[0], numbers[-1]] if len(numbers) > 1 else [numbers[0]]
     names = [files.name(number) for number in ends]
     # images that do not end in their number are counted, two of them as 0 and 1
-    read_as = list(range(len(ends))) if files.counts_from_zero else ends
-    if not all(_matches(pattern, name) for name in names) or read_as != frame_numbers(
-        [Path(name) for name in names]
-    ):
+    wanted = list(range(len(ends))) if files.counts_from_zero else ends
+    read_as = frame_numbers([Path(name) for name in names])
+    if not all(_matches(pattern, name) for name in names) or read_as != wanted:
         raise SessionError(
             f"{_where(sensor)}: found {pattern!r}, which leaves no room for the numbers of "
             f'{len(numbers)} frames; use a glob like "{sensor}*.png"'

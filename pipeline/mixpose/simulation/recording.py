@@ -176,10 +176,7 @@ def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
 
 
 def _write_times(plan: _Plan, folder: Path) -> None:
-    steps = {
-        setup.name: channel.step_s
-        for setup, channel in zip(plan.session.sensors, plan.channels, strict=True)
-    }
+    steps = {channel.files.sensor: channel.step_s for channel in plan.channels}
     for name, sensor in plan.copied.times.items():
         times = [number / plan.fps + steps[sensor] for number in plan.numbers]
         rows = [f"{n},{t:.6f}\n" for n, t in zip(plan.numbers, times, strict=True)]
