@@ -327,7 +327,8 @@ def test_ranges_of_a_body_far_away_are_drawn_apart() -> None:
     points = ((0.2, 0.15, 0.0), (-0.1, 0.14, 0.0), (-0.07, -0.14, 0.0))
     body = Body("trolley", tuple(PointFeature(np.array(point)) for point in points))
     ranges = PointPattern(np.array([[63.67], [63.98], [64.06]]), np.ones(3))
-    strip = draw_ranges("anchor", ranges, RangeSensor(np.zeros(3)), body, None)
+    lost = Estimate(0, None, "trolley", "lost", None, None, 0.0, {})
+    strip = draw_ranges("anchor", ranges, RangeSensor(np.zeros(3)), body, lost)
     bars = np.flatnonzero((strip[70] == FOUND).all(axis=-1))
     places = [group.mean() for group in np.split(bars, np.flatnonzero(np.diff(bars) > 1) + 1)]
     # the body is 0.45 across, so that the scale goes by whole units: 63 to 65 on 928 px

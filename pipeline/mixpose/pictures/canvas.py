@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mixpose.records import Floats
 
 Picture: TypeAlias = NDArray[np.uint8]
+Size: TypeAlias = tuple[int, int]  # width and height, px
 Colour: TypeAlias = tuple[int, int, int]
 
 BLACK: Colour = (0, 0, 0)
@@ -117,7 +118,7 @@ def columns_for(count: int) -> int:
     return count if count <= 3 else int(np.ceil(np.sqrt(count)))
 
 
-def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
+def fit_into(picture: Picture, size: Size) -> Picture:
     """A picture amid black of exactly that width and height, shrunk where it is larger."""
     width, height = size
     zoom = min(width / picture.shape[1], height / picture.shape[0], 1.0)
@@ -130,9 +131,7 @@ def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
     return canvas
 
 
-def in_grid(
-    pictures: Sequence[Picture], columns: int, cell: tuple[int, int] | None = None
-) -> Picture:
+def in_grid(pictures: Sequence[Picture], columns: int, cell: Size | None = None) -> Picture:
     """Pictures row by row with gaps between them, in cells of (width, height) if given."""
     width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
     rows = []

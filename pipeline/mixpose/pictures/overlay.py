@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
@@ -128,11 +129,7 @@ def ellipse_95(covariance: Floats) -> Floats:
 
 def median_gap(y: Floats) -> float:
     """Median distance of places (n, 2) from their nearest neighbours; infinite for a lone one."""
-    if len(y) < 2:
-        return float("inf")
-    apart = np.linalg.norm(y[:, None] - y, axis=-1)
-    np.fill_diagonal(apart, np.inf)
-    return float(np.median(apart.min(axis=1)))
+    return float(np.median(cKDTree(y).query(y, k=2)[0][:, 1])) if len(y) else np.inf
 
 
 @dataclass(frozen=True)
@@ -183,11 +180,10 @@ class _DrawnPose:
             return
         y, _, seen = self.features
         spreads = projected_covariances(self.sensor, self.body, self.T, covariance)
+        least = _LEAST_ELLIPSE_PX * canvas.stroke(self.picture)
         for place, spread in zip(self.part.places(y)[seen], spreads[seen], strict=True):
             outline = magnified * self.part.zoom * ellipse_95(spread)
-            if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * canvas.stroke(
-                self.picture
-            ):
+            if np.linalg.norm(outline, axis=1).max() >= least:
                 canvas.polyline(self.picture, place + outline, WHITE, closed=True)
 
     def draw_axes(self) -> None:
@@ -224,19 +220,15 @@ def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
     """Write number and status of a frame into the upper left corner, in place."""
     u, v = canvas.caption_place(picture)
     if frame is not None:
-        u = canvas.words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * canvas.line_height(
-            picture
-        )
+        u = canvas.words(picture, f"frame {frame}  ", (u, v), WHITE)
+        u += 0.3 * canvas.line_height(picture)
     if status is not None:
         canvas.words(picture, status, (u, v), STATUS_COLOURS[status])
 
 
 def legend(picture: Picture, bodies: Sequence[tuple[str, Status]], frame: int) -> None:
     """Write the number of a frame, and each body with its status in its colour, in place."""
-    u, v = canvas.caption_place(picture)
-    canvas.words(picture, f"frame {frame}", (u, v), WHITE)
+    canvas.words(picture, f"frame {frame}", canvas.caption_place(picture), WHITE)
     for k, (label, status) in enumerate(bodies):
         colour = BODY_COLOURS[k % len(BODY_COLOURS)] if status != "lost" else GREY
-        canvas.words(
-            picture, f"{label} {status}", (u, v + (k + 2) * canvas.line_height(picture)), colour
-        )
+        canvas.words(picture, f"{label} {status}", canvas.caption_place(picture, k + 2), colour)

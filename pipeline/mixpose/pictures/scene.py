@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.pictures import canvas, overlay
-from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, Size
 from mixpose.pictures.overlay import Part
 from mixpose.records import (
     Estimate,
@@ -25,7 +25,6 @@ from mixpose.records import (
     Pattern,
     PointPattern,
     RawFrame,
-    Status,
 )
 from mixpose.sensors import Sensor
 from mixpose.session import SensorSetup, Session
@@ -35,6 +34,7 @@ _MOST_ENLARGED = 2
 _BLANK_SIZE = (640, 480)
 _DETECTION_PX = 2.5
 
+Posed: TypeAlias = Sequence[tuple[Body, Estimate]]
 Box: TypeAlias = tuple[Floats, float]
 """A square of a sensor, px: the place (2,) of its upper left pixel, and its side."""
 
@@ -79,12 +79,7 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     return canvas.stacked(rows)
 
 
-def _panel(
-    posed: Sequence[tuple[Body, Estimate]],
-    setup: SensorSetup,
-    frame: RawFrame | None,
-    room: tuple[int, int],
-) -> Picture:
+def _panel(posed: Posed, setup: SensorSetup, frame: RawFrame | None, room: Size) -> Picture:
     """A camera's frame with its poses, and those that are small in it larger in a corner."""
     ground, part = backdrop(setup, frame, room)
     box = small_box(ground, part, posed, setup.sensor)
@@ -115,15 +110,13 @@ def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[B
     return [(bodies.get(one.object, session.body), one) for one in estimates]
 
 
-def room_for(cameras: int) -> tuple[int, int]:
+def room_for(cameras: int) -> Size:
     """Width and height in px that each of so many cameras has in a picture of them all."""
     columns = canvas.columns_for(cameras)
     return LARGEST[0] // columns, LARGEST[1] // -(-cameras // columns)
 
 
-def backdrop(
-    setup: SensorSetup, frame: RawFrame | None, room: tuple[int, int] | None
-) -> tuple[Picture, Part]:
+def backdrop(setup: SensorSetup, frame: RawFrame | None, room: Size | None) -> tuple[Picture, Part]:
     """A camera's frame as a picture that fits into some room, before anything is drawn on it.
 
     Without a room it keeps its size. Detections in place of images are dots on a dark ground.
@@ -141,7 +134,7 @@ def backdrop(
     return canvas.displayable(data), Part(zoom)
 
 
-def resized(image: Image, room: tuple[int, int] | None) -> tuple[Image, float]:
+def resized(image: Image, room: Size | None) -> tuple[Image, float]:
     """An image as large as some room has it, and by how much it was enlarged."""
     zoom = _zoom((image.shape[1], image.shape[0]), room)
     if zoom == 1:
@@ -151,7 +144,7 @@ def resized(image: Image, room: tuple[int, int] | None) -> tuple[Image, float]:
     return cast(Image, cv2.resize(image, size, interpolation=way)), zoom
 
 
-def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
+def _zoom(size: Size, room: Size | None) -> float:
     """Factor by which a picture fits into some room; small ones grow a little, by whole pixels."""
     if room is None:
         return 1.0
@@ -159,7 +152,7 @@ def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
     return zoom if zoom < 1 else float(min(int(zoom), _MOST_ENLARGED))
 
 
-def _size_of(data: PointPattern | GridPattern | None) -> tuple[int, int]:
+def _size_of(data: Pattern | None) -> Size:
     """A size that holds detections of a camera that states no resolution."""
     if not isinstance(data, PointPattern) or not len(data.points):
         return _BLANK_SIZE
@@ -168,7 +161,7 @@ def _size_of(data: PointPattern | GridPattern | None) -> tuple[int, int]:
 
 
 def draw_camera(
-    posed: Sequence[tuple[Body, Estimate]],
+    posed: Posed,
     setup: SensorSetup,
     picture: Picture,
     part: Part,
@@ -193,23 +186,13 @@ def draw_camera(
     return picture
 
 
-def draw_strips(
-    posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, frame: RawFrame | None
-) -> list[Picture]:
+def draw_strips(posed: Posed, setup: SensorSetup, frame: RawFrame | None) -> list[Picture]:
     """Draw what a range sensor measured, with the ranges of each body: a strip for each."""
     data = None if frame is None else frame.data
-    return [
-        draw_ranges(
-            f"{setup.name}, {one.label}" if len(posed) > 1 else setup.name,
-            data if isinstance(data, PointPattern | GridPattern) else None,
-            setup.sensor,
-            body,
-            one.T_world_object,
-            one.covariance,
-            one.status,
-        )
-        for body, one in posed
-    ]
+    pattern = data if isinstance(data, PointPattern | GridPattern) else None
+    names = [f"{setup.name}, {one.label}" if len(posed) > 1 else setup.name for _, one in posed]
+    rows = zip(names, posed, strict=True)
+    return [draw_ranges(name, pattern, setup.sensor, *each) for name, each in rows]
 
 
 def _name(picture: Picture, name: str, colour: Colour) -> None:
@@ -217,9 +200,7 @@ def _name(picture: Picture, name: str, colour: Colour) -> None:
     canvas.words(picture, name, canvas.caption_place(picture, 1), colour, size=0.9)
 
 
-def small_box(
-    picture: Picture, part: Part, posed: Sequence[tuple[Body, Estimate]], sensor: Sensor
-) -> Box | None:
+def small_box(picture: Picture, part: Part, posed: Posed, sensor: Sensor) -> Box | None:
     """Around all features in view, where they are small in a picture; else None."""
     places = [np.zeros((0, 2))]
     for body, one in posed:
@@ -235,7 +216,7 @@ def small_box(
     return ((lower + upper - side) / 2, side) if is_small else None
 
 
-def cut_out(whole: Picture, part: Part, size: tuple[int, int], way: int) -> Picture:
+def cut_out(whole: Picture, part: Part, size: Size, way: int) -> Picture:
     """A part of a picture of all pixels of a sensor, in some size, resized in some way."""
     # the sensor's place of the first pixel, and how far the next is
     first, step = np.array(part.corner) + 0.5 / part.zoom - 0.5, 1 / part.zoom
@@ -259,23 +240,14 @@ def put_into(picture: Picture, part: Part, inset: Picture, box: Box) -> None:
 
 
 def draw_ranges(
-    name: str,
-    pattern: Pattern | None,
-    sensor: Sensor,
-    body: Body,
-    T_world_object: Floats | None,
-    covariance: Floats | None = None,
-    status: Status | None = None,
+    name: str, pattern: Pattern | None, sensor: Sensor, body: Body, estimate: Estimate
 ) -> Picture:
-    """Draw what a range sensor measured, None where it has no frame, with the ranges of a pose.
-
-    The other arguments are as for `mixpose.pictures.draw_pose`.
-    """
-    size = STRIP_SIZE
+    """Draw what a range sensor measured, None where it has no frame, with the ranges of a pose."""
+    size, T = STRIP_SIZE, estimate.T_world_object
     picture = np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     expected = np.zeros(0)
-    if T_world_object is not None:
-        y, _, seen = overlay.projected_features(sensor, body, T_world_object)
+    if T is not None:
+        y, _, seen = overlay.projected_features(sensor, body, T)
         expected = np.where(seen, y[:, 0], np.nan)
     low, high = _span(sensor, pattern, expected, body)
     width = size[0] - 2 * _MARGIN_PX
@@ -295,12 +267,10 @@ def draw_ranges(
         for u in across(pattern.points[:, 0]):
             bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
             canvas.polyline(picture, bar, overlay.FOUND, width=2)
-    if T_world_object is not None:
-        colour = overlay.STATUS_COLOURS[status or "ok"]
-        spread = half_widths_95(sensor, body, T_world_object, covariance)
-        _draw_expected(
-            picture, across(expected), spread * width / (high - low), body.labels, colour
-        )
+    if T is not None:
+        colour = overlay.STATUS_COLOURS[estimate.status]
+        spread = half_widths_95(sensor, body, T, estimate.covariance) * width / (high - low)
+        _draw_expected(picture, across(expected), spread, body.labels, colour)
     return picture
 
 
@@ -353,9 +323,8 @@ def _draw_scale(
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     ticks = np.asarray(step * np.arange(first, last + 1))
     for value, u in zip(ticks, across(ticks), strict=True):
-        canvas.polyline(
-            picture, np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]]), GREY
-        )
+        tick = np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]])
+        canvas.polyline(picture, tick, GREY)
         canvas.words(picture, f"{value:g}", (u - 8, 0.96 * height), GREY, size=0.8)
 
 

@@ -21,19 +21,19 @@ from mixpose.body import Body
 from mixpose.density import Atlas
 from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
-from mixpose.extraction.threshold import above, feature_values, foreground
+from mixpose.extraction.threshold import feature_values
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, matched_objective, region_of_interest
 from mixpose.objective.paper import SampledTerm, sampled_terms
 from mixpose.pictures import canvas, overlay
-from mixpose.pictures.canvas import WHITE, Colour, Picture
+from mixpose.pictures.canvas import WHITE, Colour, Picture, Size
 from mixpose.pictures.finding import Finding
+from mixpose.pictures.light import Light
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
-Size: TypeAlias = tuple[int, int]
 Look: TypeAlias = Callable[[Floats], NDArray[Any]]  # values of a density (...,) at places (..., 2)
 
 ABOVE: Colour = (0, 140, 255)
@@ -70,7 +70,6 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     if data is None or isinstance(data, PointPattern | GridPattern):
         return titled(picture, "detections: no threshold")
     size = picture.shape[1], picture.shape[0]
-    window = 0, 0, data.shape[1], data.shape[0]
     if options.method == "corners":
         blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CornerRules().blur)
         values = np.sqrt(np.maximum(saddle_strength(blurred), 0))
@@ -79,15 +78,14 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         values = np.maximum(spot_strength(data, options), 0)
         title = "height of spots"
     elif options.method == "intensity":
-        values = feature_values(data, options, window)
+        values = feature_values(data, options, (0, 0, data.shape[1], data.shape[0]))
         title = "grey values above the threshold"
     elif options.method == "blobs":
-        scene = foreground(data, options, window)
-        mask = above(scene.grey, scene.zero + scene.level)
         picture = np.asarray(np.round(_DIMMED * picture), dtype=np.uint8)
         # a pixel of the picture is marked if any of those behind it is
         behind = np.ones([max(int(np.ceil(1 / part.zoom)), 1)] * 2, np.uint8)
-        shown = cv2.resize(cv2.dilate(mask, behind), size, None, 0, 0, cv2.INTER_NEAREST)
+        mask = cv2.dilate(Light(data, options).above, behind)
+        shown = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
         picture[shown > 0] = ABOVE
         title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
