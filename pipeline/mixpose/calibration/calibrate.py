@@ -139,23 +139,20 @@ class _Run:
         """The calibration, but for its residuals."""
         part = self._start
         self._progress("adjusting all sensors together", 0, _STAGES)
-        adjusted = self._adjusted(part)
+        part, adjusted = self._adjusted(part)
         good = result.met_share(adjusted, part.frames, self._task) > self._rules.least_met
-        part = replace(part, state=adjusted.state)
         bad: list[int] = []
         if good.any():  # else no sensor was placed yet
             bad = [f.number for f, ok in zip(part.frames, good, strict=True) if not ok]
             part = part.only(good)
         # from wider blurs, as features that crowd let the noise that is learnt first be too small
         self._progress("adjusting again, without bad frames", 1, _STAGES)
-        adjusted = self._adjusted(part, adjusted.noise)
-        part = replace(part, state=adjusted.state)
+        part, adjusted = self._adjusted(part, adjusted.noise)
         late = self._latecomers(part, adjusted.noise)
         if late:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
             part = self._with_latecomers(part, late)
-            adjusted = self._adjusted(part, adjusted.noise)
-            part = replace(part, state=adjusted.state)
+            part, adjusted = self._adjusted(part, adjusted.noise)
         self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
@@ -173,7 +170,7 @@ class _Run:
         held: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
-            fit = self._adjusted(part.only(folds != fold), best.noise)
+            _, fit = self._adjusted(part.only(folds != fold), best.noise)
             lost = {
                 block.sensor
                 for block in self._blocks
@@ -190,14 +187,10 @@ class _Run:
 
     def _latecomers(self, part: Start, noise: Floats) -> dict[int, Floats]:
         """T_sensor_world of cameras that could not be linked by what they see alone."""
-        task, unlinked, found = self._task, self._unlinked, dict[int, Floats]()
-        frames = self._whole(part)
-        linked = [s for s in task.cameras if s not in unlinked]
-        for sensor in unlinked:
-            T = placed(task, part.state, sensor, linked, frames, noise, self._rules)
-            if T is not None:
-                found[sensor] = T
-        return found
+        linked = [s for s in self._task.cameras if s not in self._unlinked]
+        known = linked, self._whole(part), noise, self._rules
+        found = {s: placed(self._task, part.state, s, *known) for s in self._unlinked}
+        return {s: T for s, T in found.items() if T is not None}
 
     def _with_latecomers(self, part: Start, late: dict[int, Floats]) -> Start:
         """Frames with what the cameras that came late saw, and the rig with them."""
@@ -226,10 +219,11 @@ class _Run:
     def _gauge(self, state: State) -> tuple[Floats, tuple[str, ...]]:
         return gauge_rows(state, self._blocks, self._pose_free, self._task.length)
 
-    def _adjusted(self, part: Start, noise: Floats | None = None) -> Adjusted:
+    def _adjusted(self, part: Start, noise: Floats | None = None) -> tuple[Start, Adjusted]:
         """A part adjusted, from narrow blurs where the noise is known from before."""
         blurs = None if noise is None else 2 * self._rules.blur * noise
-        return adjust(self._bundle(part), part.state, blurs=blurs)
+        found = adjust(self._bundle(part), part.state, blurs=blurs)
+        return replace(part, state=found.state), found
 
     def _moved_by_biases(self, part: Start, adjusted: Adjusted) -> Floats:
         """What biases as large as σ_ε would move (G,), of sensors of which nothing is stated."""

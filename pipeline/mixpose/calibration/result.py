@@ -186,9 +186,8 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
         before, after = each.before, each.held if np.isfinite(each.held) else each.after
         worse = bool(np.isfinite(before) and before > rules.worse * max(after, 1e-12))
         far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
-        told.append(
-            Displacement(name, turn, shift, sd_turn, sd_shift, before, after, worse and far)
-        )
+        moved = worse and far
+        told.append(Displacement(name, turn, shift, sd_turn, sd_shift, before, after, moved))
     return tuple(told)
 
 
@@ -243,8 +242,6 @@ def _deviations(found: Calibration) -> list[tuple[float, float]]:
             part = found.deviations[block.place]
             turn = float(np.degrees(np.sqrt((part[3:] ** 2).sum()))) if len(part) > 3 else 0.0
             own[block.sensor] = (turn, float(np.sqrt((part[:3] ** 2).sum())))
-    least = (
-        min((t for t, _ in own.values()), default=np.inf),
-        min((s for _, s in own.values()), default=np.inf),
-    )
+    known = [(np.inf, np.inf), *own.values()]
+    least = min(turn for turn, _ in known), min(shift for _, shift in known)
     return [own.get(index, least) for index in range(len(found.after.names))]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -101,23 +102,16 @@ class Saved(Known):
         self._path, first = path, f"{MARK}{json.dumps(key)}}}"
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
         for line in lines[1:] if lines and lines[0] == first else []:
-            self._take(line)
+            with suppress(ValueError):  # the last line was cut off
+                frame, sensor, poses, evidence = json.loads(line)
+                T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+                known = Hypotheses(T, np.array(evidence, dtype=np.float64))
+                super().__setitem__((int(frame), int(sensor)), known)
         self.resumed = len(self)
         self._stream = path.open("w", encoding="utf-8", newline="\n")
         self._stream.write(first + "\n")
         for key_, one in self.items():
             self._write(key_, one)
-
-    def _take(self, line: str) -> None:
-        try:
-            frame, sensor, poses, evidence = json.loads(line)
-            one = Hypotheses(
-                np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
-                np.array(evidence, dtype=np.float64),
-            )
-            super().__setitem__((int(frame), int(sensor)), one)
-        except ValueError:
-            return  # the last line was cut off
 
     def __setitem__(self, key: tuple[int, int], one: Hypotheses) -> None:
         super().__setitem__(key, one)

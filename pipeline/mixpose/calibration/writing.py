@@ -32,12 +32,10 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     if scale != 1:
         for table, one in others:
             _put_body(table, one.body, scale * one.body.means, scale)
-    T_new_old = found.T_new_old
-    if scale != 1 or T_new_old is not None:
-        rewriting.put_starts(
-            document, session, np.eye(4) if T_new_old is None else T_new_old, scale
-        )
-    if T_new_old is not None:
+    T_new_old = np.eye(4) if found.T_new_old is None else found.T_new_old
+    if scale != 1 or found.T_new_old is not None:
+        rewriting.put_starts(document, session, T_new_old, scale)
+    if found.T_new_old is not None:
         rewriting.put_gravity(document, session, T_new_old)
     origin = f"{session.path.name}, {len(found.used)} frames"
     return rewriting.text_of(document, session, f"{MARK} {version} from {origin}.\n")
@@ -56,9 +54,8 @@ def _put_sensor(table: Any, found: Calibration, session: Session, index: int) ->
     # a file of a calibration also says where its camera stands
     was_filed = is_lens and table.pop("calibration", None) is not None
     if was_filed or has_moved("T_sensor_world"):
-        rewriting.put_motion(
-            table, "T_sensor_world", sensor.T_sensor_world, _deviation(said.get("pose"))
-        )
+        pose = _deviation(said.get("pose"))
+        rewriting.put_motion(table, "T_sensor_world", sensor.T_sensor_world, pose)
     if is_lens:
         if was_filed and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
