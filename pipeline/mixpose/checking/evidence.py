@@ -216,9 +216,8 @@ def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
 
 def is_camera(view: View) -> bool:
     """Whether a view holds points in the image of a camera with a centre."""
-    return isinstance(view.sensor, PinholeCamera | FisheyeCamera) and isinstance(
-        view.observation.pattern, PointPattern
-    )
+    has_points = isinstance(view.observation.pattern, PointPattern)
+    return has_points and isinstance(view.sensor, PinholeCamera | FisheyeCamera)
 
 
 def _pattern(view: View) -> PointPattern:

@@ -177,9 +177,8 @@ def _least_squares(toward: Floats, J: Floats, seen: Mask, noise: Floats) -> Quad
     residuals = np.where(seen[..., None], toward, 0.0) / scale
     rows = np.where(seen[..., None, None], J, 0.0) / scale[..., None]
     # of all sensors together, by pose
-    return squares_of(
-        residuals.swapaxes(0, 1).reshape(H, 2 * L * n), rows.swapaxes(0, 1).reshape(H, 2 * L * n, 6)
-    )
+    together = residuals.swapaxes(0, 1).reshape(H, 2 * L * n)
+    return squares_of(together, rows.swapaxes(0, 1).reshape(H, 2 * L * n, 6))
 
 
 def _turned(T_world_object: Floats, body: Body, free: Mask) -> Floats:

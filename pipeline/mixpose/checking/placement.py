@@ -134,10 +134,8 @@ def _no_common_view(session: Session) -> list[str]:
     text = f"{names} would not see the body where the other sensors look"
     if len(blind) == len(cameras):
         text = f"no place was found that is in view of {names}"
-    flipped = replace(
-        session, sensors=tuple(replace(s, sensor=_with_inverse(s.sensor)) for s in cameras)
-    )
-    if not _blind(flipped, list(flipped.sensors)):
+    flipped = [replace(s, sensor=_with_inverse(s.sensor)) for s in cameras]
+    if not _blind(replace(session, sensors=tuple(flipped)), flipped):
         return [f"{text}; with the inverse of each T_sensor_world all would: {_MAPS}"]
     return [f"{text}: check T_sensor_world{_sizes(session, cameras)}"]
 
@@ -170,11 +168,8 @@ def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> l
     if not unseen:
         return []
     cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
-    placed = {
-        name: sensor
-        for name, sensor in cameras.items()
-        if not np.allclose(sensor.T_sensor_world, np.eye(4))
-    }
+    stand = [n for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))]
+    placed = {name: cameras[name] for name in stand}
     names = {setup.name for setup in unseen}
     # only where the inverse mends every camera, chance is no likely reason
     if placed and names.issuperset(placed):

@@ -242,21 +242,15 @@ def _fitted(
         if fitted is None:
             return
         values, poses = fitted
-        body = of_points(
-            session.body, unknown.points(session.body.means, values), session.body.normals
-        )
-        found = [
-            pose_near(session, body, frames[k][0], _by(unknown, values, frames[k][1]), T)
-            for k, T in zip(known, poses)
-        ]
+        points = unknown.points(session.body.means, values)
+        body = of_points(session.body, points, session.body.normals)
+        seen = [_by(unknown, values, frames[k][1]) for k in known]
+        numbers = [frames[k][0] for k in known]
+        found = [pose_near(session, body, *each) for each in zip(numbers, seen, poses)]
         if any(pose is None for pose in found):
             return
-        seen = seen_by(
-            [(_by(unknown, values, frames[k][1]), pose) for k, pose in zip(known, found)]
-        )
-        given = replace(
-            given, frames=seen, poses=[pose.T_world_object for pose in found], beside=[]
-        )
+        begun = [pose.T_world_object for pose in found]
+        given = replace(given, frames=seen_by([*zip(seen, found)]), poses=begun, beside=[])
     after = list(before.poses)
     for k, pose in zip(known, found):
         after[k] = pose
@@ -296,9 +290,8 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
     if not told:
         return as_it_is
     most = max(one.gain for one, _ in told)
-    near = [
-        each for each in told if each[0].gain > most - max(rules.rival, rules.share * abs(most))
-    ]
+    least = most - max(rules.rival, rules.share * abs(most))
+    near = [each for each in told if each[0].gain > least]
     near.sort(key=lambda each: (each[0].change.values, -each[0].gain))
     (best, gain), *others = near
     change = best.change
@@ -327,11 +320,10 @@ def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
     if now > then:
         as_is = f", {then} as it is" if then else ""
         return f"{now} of {count} frames are explained{as_is}"
-    if after.rms(feature) < rules.clearer * rms:
+    off = after.rms(feature)
+    if off < rules.clearer * rms:
         what = "features are" if feature is None else "it is"
-        return (
-            f"{what} met to {after.rms(feature):.2g} sigma in place of {rms:.2g} in {count} frames"
-        )
+        return f"{what} met to {off:.2g} sigma in place of {rms:.2g} in {count} frames"
     more = round(after.met(feature) - met)
     if more < max(2.0, rules.more * met):
         return ""

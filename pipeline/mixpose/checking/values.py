@@ -17,6 +17,7 @@ import numpy as np
 from mixpose.body import PointFeature
 from mixpose.checking.changes import OTHER_SIZE, called, misplaced, moved_by, times_as_large
 from mixpose.checking.evidence import Seen
+from mixpose.objective import pose_jacobian
 from mixpose.records import Floats
 from mixpose.rigid import perturb
 from mixpose.sensors import PinholeCamera, Sensor
@@ -175,11 +176,7 @@ def _linearised(
     points, steps = unknown.points(given.points, values), _STEP * np.diag(unknown.deviations)
     lever = points @ T[:3, :3].T
     world = lever + T[:3, 3]
-    by_twist = np.zeros((len(points), 3, 6))
-    by_twist[:, :, :3], by_twist[:, :, 3:] = (
-        np.eye(3),
-        np.cross(np.eye(3), lever[:, None]).swapaxes(1, 2),
-    )
+    by_twist = pose_jacobian(np.broadcast_to(np.eye(3), (len(points), 3, 3)), lever)
     moved = np.zeros((len(points), 3, len(scales)))  # of a point in the world, by pose and values
     moved[:, :, :6] = by_twist * scales[:6]
     for j, step in enumerate(steps if points is not given.points else ()):
