@@ -213,26 +213,22 @@ def _compared(
     covariances = prediction.covariances[which]
     free = np.flatnonzero(plan.free)
     variances = np.einsum("nii->ni", covariances)
+    summed = variances.reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
     ratios = np.full(6, np.nan)
     if len(errors):
         ratios[free] = np.sqrt((errors[:, free] ** 2 / variances[:, free]).mean(axis=0))
     inner = covariances[:, free][:, :, free]
-    squares = np.einsum(
-        "ni,ni->n", errors[:, free], np.linalg.solve(inner, errors[:, free, None])[..., 0]
-    )
+    solved = np.linalg.solve(inner, errors[:, free, None])[..., 0]
+    squares = np.einsum("ni,ni->n", errors[:, free], solved)
     tips = np.einsum("nii->n", at_tip(prediction, tip)[which])
     arms = (prediction.poses[:, :3, :3] @ tip)[which]
-    moved = errors[:, :3] + np.cross(errors[:, 3:], arms)
+    parts = errors[:, :3], errors[:, 3:], errors[:, :3] + np.cross(errors[:, 3:], arms)
     return Confirmation(
         frames=sum(statuses.values()),
         statuses=dict(statuses),
         ratios=ratios,
         overall=float(np.sqrt(squares.mean() / len(free))) if len(errors) else math.nan,
         chance=1 / math.sqrt(2 * max(len(errors), 1) * len(free)),
-        predicted=np.sqrt(
-            [variances[:, :3].sum(1).mean(), variances[:, 3:].sum(1).mean(), tips.mean()]
-        ),
-        found=np.sqrt(
-            [(part**2).sum(axis=1).mean() for part in (errors[:, :3], errors[:, 3:], moved)]
-        ),
+        predicted=np.sqrt([*summed, tips.mean()]),
+        found=np.sqrt([(part**2).sum(axis=1).mean() for part in parts]),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -317,9 +318,7 @@ def find_session(poses: PoseFile) -> Origin:
 
 
 def _bytes_of(path: Path) -> bytes | None:
-    try:
+    with suppress(OSError):
         if path.is_file() and path.stat().st_size <= _LARGEST:
             return path.read_bytes()
-    except OSError:
-        return None
     return None

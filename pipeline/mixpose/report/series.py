@@ -167,12 +167,8 @@ def _numbers(values: list[float | None]) -> Floats:
 
 def _of_sensor(lines: list[PoseLine], name: str, what: str) -> Floats:
     """What a sensor says of the poses; of a lost frame it says how little the best guess fits."""
-    return _numbers(
-        [
-            None if line.status == "lost" else getattr(line.sensors.get(name), what, None)
-            for line in lines
-        ]
-    )
+    told = [None if line.status == "lost" else line.sensors.get(name) for line in lines]
+    return _numbers([getattr(one, what, None) for one in told])
 
 
 def _of_features(lines: list[PoseLine], name: str) -> dict[str, Floats]:
