@@ -41,6 +41,8 @@ from mixpose.units import Unit, length_ratio
 _WIDEST_PX = 1000
 _WIDEST_BINS = 100_000
 _NARROWEST = 1000  # of a bin
+# keys that are taken over as they are, by tables that have them
+_TAKEN = {"name", "model", "source", "fps", "range_min", "bin_size", "delay", "readout", "exposure"}
 
 
 def build_sensors(
@@ -134,20 +136,13 @@ def _build_sensor(
         _check_widths(extract, table)
         if not isinstance(table, LaterationTable | CloudTable):
             _check_extraction(extract)
+    given = type(table).model_fields.keys() & _TAKEN
     return SensorSetup(
-        name=table.name,
-        model=table.model,
+        **{key: getattr(table, key) for key in given},
         sensor=sensor,
-        source=table.source,
         times=None if table.times is None else folder / table.times,
-        fps=table.fps,
         extract=extract,
-        range_min=getattr(table, "range_min", None),
-        bin_size=getattr(table, "bin_size", None),
         resolution=resolution,
-        delay=table.delay,
-        readout=getattr(table, "readout", 0.0),
-        exposure=getattr(table, "exposure", 0.0),
         calibration_error=_calibration_error(table),
         own=frozenset() if table.extract is None else frozenset(table.extract.model_fields_set),
     )

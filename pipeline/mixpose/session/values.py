@@ -14,7 +14,7 @@ from pydantic_core import core_schema
 from mixpose.limits import MOST_PIXELS
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
-from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
+from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of, under
 
 EXTRACT_METHODS = ("blobs", "corners", "intensity", "log")
 THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
@@ -179,10 +179,8 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
         raise BadKeyError(found(value, allowed))
     rows = []
     for i, item in enumerate(value):
-        try:
+        with under(i):
             rows.append(numbers(item, inner, allowed))
-        except BadKeyError as problem:
-            raise BadKeyError(problem.text, i, *problem.key) from problem
     return np.array(rows, dtype=np.float64)
 
 

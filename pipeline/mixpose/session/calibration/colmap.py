@@ -151,12 +151,10 @@ def _whole(cell: str) -> int:
 
 
 def _floats(cells: Sequence[str]) -> list[float]:
-    values = []
-    for cell in cells:
-        value = as_number(cell)
+    values = [as_number(cell) for cell in cells]
+    for cell, value in zip(cells, values, strict=True):
         if not abs(value) < LARGEST:
             raise BadKeyError(found(cell, "a finite number"))
-        values.append(value)
     return values
 
 

@@ -254,12 +254,8 @@ def _stated_model(opened: _Nodes) -> CameraModel | None:
 
 def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     for names in _SIZE_NODES:
-        nodes = [opened.nodes.get(name) for name in names]
-        sizes = [
-            int(node.real())
-            for node in nodes
-            if node is not None and node.isInt() and node.real() > 0
-        ]
+        nodes = [opened.nodes[name] for name in names if name in opened.nodes]
+        sizes = [int(node.real()) for node in nodes if node.isInt() and node.real() > 0]
         if len(sizes) == 2:
             return sizes[0], sizes[1]
     return None
