@@ -10,20 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from mixpose import __version__
-from mixpose.calibration import Calibration, CalibrationRules, Task, calibrate, free_parameters
+from mixpose.calibration import Calibration, CalibrationRules, Task, calibrate, words
 from mixpose.calibration.recorded import read_frames, require_points, rig_of
 from mixpose.calibration.searching import MARK as SAVED_MARK
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
-from mixpose.calibration.words import (
-    check_world,
-    error_of_held,
-    in_length,
-    in_world,
-    known_length,
-    words_of,
-)
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.app_before import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
@@ -89,7 +81,7 @@ def _calibrated(
     with ExitStack() as kept:
         with watched() as progress:
             task = task_of(session, request, rules, progress)
-            say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
+            say(f"free: {words.words_of(task.rig.names, task.free, task.body_free)}")
             saved = None
             if request.output is not None and not is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")
@@ -99,8 +91,8 @@ def _calibrated(
                     say(f"going on: {saved.resumed} frames of cameras were searched before")
             found = calibrate(task, rules, progress=progress, found=saved)
         if request.length is not None:
-            found = in_length(found, request.length)
-        yield found if request.world is None else in_world(found, request.world)
+            found = words.in_length(found, request.length)
+        yield found if request.world is None else words.in_world(found, request.world)
 
 
 def task_of(
@@ -112,10 +104,9 @@ def task_of(
     known = None if request.poses is None else known_poses(request.poses, session)
     # one word of --free may hold several
     free_words = [part for word in request.free or () for part in word.split()]
-    free, body = free_parameters(
-        rig, free_words, poses_known=known is not None, world=request.world
-    )
-    pair = None if request.length is None else known_length(rig, request.length)[0]
+    is_known = known is not None
+    free, body = words.free_parameters(rig, free_words, poses_known=is_known, world=request.world)
+    pair = None if request.length is None else words.known_length(rig, request.length)[0]
     if pair is not None and known is not None:
         raise SessionError("--length: stands beside --poses, which give the scale; drop one")
     kinds = {kind for each in free.values() for kind in each}
@@ -129,7 +120,7 @@ def task_of(
             "every sensor, or a video"
         )
     if request.world is not None:
-        check_world(rig, request.world, [frame.number for frame in frames])
+        words.check_world(rig, request.world, [frame.number for frame in frames])
     start = session.start
     return Task(
         rig=rig,
@@ -145,7 +136,7 @@ def task_of(
         known=known,
         length=pair,
         errors={
-            k: error_of_held(one.calibration_error, free.get(k, ()))
+            k: words.error_of_held(one.calibration_error, free.get(k, ()))
             for k, one in enumerate(setups)
             if one.calibration_error is not None
         },

@@ -10,14 +10,8 @@ import numpy as np
 
 from mixpose.body import Body, LookAlike, congruent_parts
 from mixpose.checking import noise_of
-from mixpose.design.advice import (
-    MarkerMove,
-    NewSensor,
-    best_marker_move,
-    best_new_sensor,
-    noise_to_equal,
-    scaled,
-)
+from mixpose.design import advice
+from mixpose.design.advice import MarkerMove, NewSensor
 from mixpose.design.confirmation import Confirmation, confirm
 from mixpose.design.prediction import Plan, Summary, at_tip, plan_of, pooled, predict, summarise
 from mixpose.executing import Executor
@@ -132,8 +126,8 @@ def _system(name: str, session: Session, plan: Plan, request: Request) -> System
         summary=summary,
         error=error_of(plan),
         weighed=error_of(replace(plan, sigmas=plan.noises)),
-        move=best_marker_move(plan, error_of),
-        new=best_new_sensor(plan, error_of, middle),
+        move=advice.best_marker_move(plan, error_of),
+        new=advice.best_new_sensor(plan, error_of, middle),
     )
 
 
@@ -167,10 +161,10 @@ def _equal(
     say: Callable[[str], None],
     confirmed: Callable[[System, Plan], Confirmation | None],
 ) -> Equal:
-    factor = noise_to_equal(system.plan, first.error, request.error_of)
+    factor = advice.noise_to_equal(system.plan, first.error, request.error_of)
     if factor is None:
         return Equal(None, (), first.error)
-    plan = scaled(system.plan, factor)
+    plan = advice.scaled(system.plan, factor)
     found = None
     if request.runs:
         say(f"{system.name}: {request.runs} simulated frames with what equals {first.name}")

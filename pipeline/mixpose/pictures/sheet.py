@@ -11,16 +11,11 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.naming import distinct
 from mixpose.objective import View
+from mixpose.pictures import stages
 from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
 from mixpose.pictures.plots import objective_around, objective_picture, ranges_picture
-from mixpose.pictures.stages import (
-    densities_picture,
-    features_picture,
-    pose_picture,
-    threshold_picture,
-)
 from mixpose.records import Estimate
 from mixpose.session import Session
 
@@ -116,16 +111,16 @@ def _camera_pictures(
     """One camera's pictures by `STAGES`; no densities without blurs."""
     room = _SMALL if on_sheet else _LARGE
     pictures = {
-        "features": features_picture(finding, room),
-        "threshold": threshold_picture(finding, room),
-        "pose": pose_picture(finding, body, estimate, room),
+        "features": stages.features_picture(finding, room),
+        "threshold": stages.threshold_picture(finding, room),
+        "pose": stages.pose_picture(finding, body, estimate, room),
     }
     if finding.view is not None and sigmas:
         few = _some(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
         panel = (_SMALL[0] // len(few) - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
         about = finding.view, body, estimate.T_world_object, few, session.estimator
-        pictures["density"] = densities_picture(*about, panel)
+        pictures["density"] = stages.densities_picture(*about, panel)
     return pictures
 
 
