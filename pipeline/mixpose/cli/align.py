@@ -79,17 +79,13 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
     document = rewriting.document_of(session, target)
     T_old_new, T_new_old = floor.T_old_new, rigid.inverse(floor.T_old_new)
     for table, setup in zip(document["sensor"], session.sensors, strict=True):
-        sensor: Any = setup.sensor
+        sensor: Any = setup.sensor.moved(T_old_new)
         if hasattr(sensor, "position"):
-            place = rigid.transform(T_new_old, sensor.position[None])[0]
-            rewriting.put(table, "position", rewriting.plain(place, rewriting.ALL_DIGITS))
+            place = rewriting.plain(sensor.position, rewriting.ALL_DIGITS)
+            rewriting.put(table, "position", place)
         else:
-            rewriting.put_motion(
-                table,
-                "T_sensor_world",
-                sensor.T_sensor_world @ T_old_new,
-                digits=rewriting.ALL_DIGITS,
-            )
+            T, digits = sensor.T_sensor_world, rewriting.ALL_DIGITS
+            rewriting.put_motion(table, "T_sensor_world", T, digits=digits)
     rewriting.put_starts(document, session, T_new_old)
     rewriting.put_gravity(document, session, T_new_old)
     head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"

@@ -19,7 +19,7 @@ from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source
 from mixpose.judgement import expected_covariance
 from mixpose.records import Floats
-from mixpose.rigid import TWIST_NAMES
+from mixpose.rigid import TWIST_NAMES, transform
 from mixpose.runner import open_sources
 from mixpose.session import ObjectSetup, SensorSetup, Session, load_session
 
@@ -251,9 +251,7 @@ def _say_accuracy(report: _Report, session: Session) -> None:
             return
         where = "in the middle of the sensors' common view"
         if several:
-            middle = np.array(
-                [T[:3, :3] @ session.body.means.mean(axis=0) + T[:3, 3] for T in poses]
-            )
+            middle = transform(np.array(poses), session.body.means.mean(axis=0)[None])[:, 0]
             away_by = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
             where = f"{float(f'{away_by:.3g}'):g} {session.unit} away"
         if away == _AWAY[0]:

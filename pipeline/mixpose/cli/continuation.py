@@ -110,31 +110,19 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         if reached is None:
             file.close()
             return Continuation(None, wanted)
-        return _continued(poses, header, wanted, opened, reached, file)
+        file.rewind(reached.size, reached.checksum)
+        after = _after(wanted, reached.frame)
+        with closing(pair(opened, after.start, after.stop, after.step)) as frames:
+            if next(frames, None) is None:
+                return Continuation(file, after, is_done=True)
+        note = _note(poses, header.mixpose)
+        if note is not None:
+            file.rewind(note.size, note.checksum)
+            return Continuation(file, _after(wanted, note.frame), note.memory)
     except BaseException:
         with suppress(OSError):
             file.close()
         raise
-
-
-def _continued(
-    poses: Path,
-    header: Header,
-    wanted: Selection,
-    opened: dict[str, Source],
-    reached: ResumePoint,
-    file: LineFile,
-) -> Continuation:
-    file.rewind(reached.size, reached.checksum)
-    after = _after(wanted, reached.frame)
-    with closing(pair(opened, after.start, after.stop, after.step)) as frames:
-        is_done = next(frames, None) is None
-    if is_done:
-        return Continuation(file, after, is_done=True)
-    note = _note(poses, header.mixpose)
-    if note is not None:
-        file.rewind(note.size, note.checksum)
-        return Continuation(file, _after(wanted, note.frame), note.memory)
     say(
         f"{poses}: what the run knew is not written beside it; its frames up to {reached.frame} "
         "are estimated again and left as they are"

@@ -40,7 +40,7 @@ def convert_poses(request: ConvertRequest) -> None:
     if request.only_ok and not lines:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
     labels = tuple(dict.fromkeys(line.label for line in lines))
-    outputs = [] if request.output is None else written_paths(request.output, name, labels)
+    outputs = written_paths(request.output, name, labels)
     for output in outputs if name not in MARKER_FORMATS else ():
         if output.is_file() | (not output.exists()):
             refuse_to_overwrite(output, [path])
@@ -60,12 +60,9 @@ def convert_poses(request: ConvertRequest) -> None:
 
 def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
     T_sensor_world = _T_sensor_world(poses, request)
-    given = {"scene_id": request.scene_id, "obj_id": request.obj_id}
-    options: dict[str, int | str] = {
-        key: value for key, value in given.items() if value is not None
-    }
-    if name == "ros" and request.relative_to is not None:
-        options["frame_id"] = request.relative_to
+    frame_id = request.relative_to if name == "ros" else None
+    given = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
+    options = {key: value for key, value in given.items() if value is not None}
     header = header_of(poses, _unit(poses, request), __version__)
     if name != "bop" or (request.object is not None and request.obj_id is not None):
         header = replace(header, objects=objects_of(lines))
@@ -80,10 +77,10 @@ def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
     if request.relative_to is None:
         return np.eye(4)
     session = session_of(poses, request.session)
-    for setup in session.sensors:
-        if setup.name == request.relative_to and not isinstance(setup.sensor, RangeSensor):
-            return np.asarray(setup.sensor.T_sensor_world)  # type: ignore[attr-defined]
-    cameras = [s.name for s in session.sensors if not isinstance(s.sensor, RangeSensor)]
+    sensors = {setup.name: setup.sensor for setup in session.sensors}
+    cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
+    if request.relative_to in cameras:
+        return np.asarray(cameras[request.relative_to].T_sensor_world)  # type: ignore[attr-defined]
     raise SessionError(
         f"--relative-to {request.relative_to}: no such camera, allowed: {', '.join(cameras)}"
     )

@@ -115,10 +115,7 @@ class Summary:
         self.split_frames = 0
         self.left_out: Counter[tuple[str, str]] = Counter()  # sensors, and why
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
-        self.estimated = {setup.name for setup in session.sensors if setup.delay == "estimate"}
-        self.told = {
-            setup.name: setup.delay for setup in session.sensors if setup.delay != "estimate"
-        }
+        self.told = {setup.name: setup.delay for setup in session.sensors}
         self.delays: Mapping[str, DelaySeen] = {}
 
     def add(self, estimate: Estimate) -> None:
@@ -207,15 +204,15 @@ class Summary:
         remarks = []
         for name, seen in self.delays.items():
             spread = f"(give or take {2 * seen.deviation:.4f})"
-            if name in self.estimated:
+            told = self.told.get(name, 0.0)
+            if told == "estimate":
                 late = f"{seen.seconds:.4f} s {spread}"
                 remarks.append(f"sensor {name!r}: delay estimated as {late}")
             elif abs(seen.seconds) > max(_SURELY_LATE * seen.deviation, _LATE_S):
-                told = self.told.get(name, 0.0) + seen.seconds
                 kind = "late" if seen.seconds > 0 else "early"
                 remarks.append(
                     f"sensor {name!r} is {kind} by {abs(seen.seconds):.4f} s {spread}: "
-                    f"delay = {told:.4f} in its [[sensor]] takes it off"
+                    f"delay = {told + seen.seconds:.4f} in its [[sensor]] takes it off"
                 )
         return remarks
 

@@ -154,8 +154,10 @@ def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
     return format_name in ONE_TRAJECTORY and len(labels) > 1
 
 
-def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
-    """The files that poses go to."""
+def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
+    """The files that poses go to; none where that is standard output."""
+    if path is None:
+        return []
     return _body_paths(path, labels) if _is_apart(format_name, labels) else [path]
 
 

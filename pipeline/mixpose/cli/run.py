@@ -42,11 +42,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     replaced = named_sources(request.sources)
     header = header_of(session, replaced)
     opened = open_sources(session, replaced)
-    outputs = (
-        []
-        if request.output is None
-        else written_paths(request.output, request.format, header.labels)
-    )
+    outputs = written_paths(request.output, request.format, header.labels)
     for each in outputs:
         if not _is_device(each):
             refuse_to_overwrite(each, _inputs(session))
