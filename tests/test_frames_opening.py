@@ -11,7 +11,7 @@ import pytest
 
 import mixpose.frames
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames import Source, SourceSpec, open_source
+from mixpose.frames import Source, SourceSpec, files_of, open_source
 
 
 def opened(base: Path, source: str | tuple[str, ...], kind: str = "camera") -> Source:
@@ -52,6 +52,13 @@ def test_kind_of_source_is_recognised(
     folder: Path, source: str | tuple[str, ...], sensor: str, kind: str
 ) -> None:
     assert opened(folder, source, sensor).kind == kind
+
+
+@pytest.mark.parametrize("only", ["f*.png", ".", "d*s.csv", "rtsp://camera/1"])
+def test_a_list_of_one_is_read_from_the_files_of_what_it_names(folder: Path, only: str) -> None:
+    one, several = (SourceSpec("s1", source, folder, "camera") for source in (only, (only,)))
+    assert files_of(several) == files_of(one)
+    assert open_source(several).kind == open_source(one).kind
 
 
 @pytest.mark.parametrize(

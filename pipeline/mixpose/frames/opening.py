@@ -54,11 +54,8 @@ def open_source(spec: SourceSpec) -> Source:
     recording. Raises RecordingError if there is no such recording or its beginning cannot be read.
     """
     clock = clock_of(spec)
-    source = spec.source
-    if not isinstance(source, str) and len(source) == 1:
-        source = source[0]
     try:
-        kind, places = _recognise(spec, source)
+        kind, places = _recognise(spec)
     except OSError as error:
         raise RecordingError(
             f"{error.filename}: cannot be read: {error.strerror}; source of {spec.sensor!r}"
@@ -77,7 +74,7 @@ def files_of(spec: SourceSpec) -> list[str]:
 
     Raises RecordingError if there is no such recording.
     """
-    return _recognise(spec, spec.source)[1]
+    return _recognise(spec)[1]
 
 
 def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
@@ -87,8 +84,11 @@ def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource
     return LiveSource(address, spec.resolution, clock)
 
 
-def _recognise(spec: SourceSpec, source: str | tuple[str, ...]) -> tuple[SourceKind, list[str]]:
+def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
     """Kind of a source, and the files or the address it is read from."""
+    source = spec.source
+    if not isinstance(source, str) and len(source) == 1:
+        source = source[0]
     if isinstance(source, str) and live_address(source) is not None:
         return "live", [source]
     if isinstance(source, str) and _STREAM.match(source):
