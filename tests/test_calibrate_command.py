@@ -84,7 +84,7 @@ def test_a_calibration_and_its_report_do_not_go_to_one_file(bumped: Path) -> Non
 
 
 def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: Path) -> None:
-    for word in ("bodi@0", "body@77", "middle"):
+    for word in ("bodi@0", "body@77", f"body@{'7' * 5000}", "middle"):
         done = command("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--world", word)
         assert done.returncode == 2
         (line,) = done.stderr.strip().splitlines()  # no line about what is free and searched

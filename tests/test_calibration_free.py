@@ -153,7 +153,7 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
     right = np.linalg.norm(POINTS - POINTS.mean(axis=0), axis=1)
     assert size == pytest.approx(right, rel=1e-3)
     assert "the known length between two sensors stays" in found.gauge
-    for words in ("s0:s0=3", "s0:s1=-1", "s0:s1=a", "s0=3", "s0:x=3"):
+    for words in ("s0:s0=3", "s0:s1=-1", "s0:s1=inf", "s0:s1=a", "s0=3", "s0:x=3"):
         with pytest.raises(SessionError, match="allowed: SENSOR:SENSOR=LENGTH"):
             known_length(rig, words)
     ranging = Rig.of(("s0", "s1", "s2"), [*true, RangeSensor(np.zeros(3))], small)

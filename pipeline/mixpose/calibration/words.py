@@ -19,7 +19,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError, RangeSensor
-from mixpose.session.values import as_number
+from mixpose.session.values import LARGEST, as_number
 
 _FREES: dict[Kind, tuple[str, ...]] = {
     "pose": ("rotation_deg", "position"),
@@ -114,10 +114,11 @@ def known_length(rig: Rig, words: str) -> tuple[tuple[int, int], float]:
     names, _, value = words.partition("=")
     first, _, second = names.partition(":")
     length = as_number(value)
-    if first not in rig.names or second not in rig.names or first == second or not length > 0:
+    are_two = first in rig.names and second in rig.names and first != second
+    if not (are_two and 0 < length <= LARGEST):
         raise SessionError(
             f"--length {words}: allowed: SENSOR:SENSOR=LENGTH with two of {', '.join(rig.names)} "
-            "and a length above 0"
+            f"and a length above 0, at most {LARGEST:g}"
         )
     for name, sensor in zip(rig.names, rig.sensors, strict=True):
         if not hasattr(sensor, "camera_matrix"):
@@ -232,8 +233,8 @@ def in_world(found: Calibration, words: str) -> Calibration:
 def _frame_number(words: str, numbers: Collection[int]) -> int | None:
     """The frame of ``body@FRAME``; None where the words are no frame of the recording."""
     body, _, number = words.partition("@")
-    known = body == "body" and number.isdecimal() and int(number) in numbers
-    return int(number) if known else None
+    known = {str(each): each for each in numbers} if body == "body" else {}
+    return known.get(number.lstrip("0") or number[-1:])
 
 
 def _with_a_frame(rig: Rig) -> dict[str, Floats]:
