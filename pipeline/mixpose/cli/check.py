@@ -188,28 +188,21 @@ def _say_features(
     report: _Report, session: Session, setup: SensorSetup, source: Source, found: recordings.Survey
 ) -> None:
     where = f"sensor {setup.name!r}"
-    each = [
-        (placement.expected_count(setup, session.alone(o.body.name)), o.count)
-        for o in session.objects
-    ]
-    expected = sum(seen * count for seen, count in each)
+    alone = [(session.alone(one.body.name), one.count) for one in session.objects]
+    expected = sum(count * placement.expected_count(setup, each) for each, count in alone)
     if not (found.numbers or found.damage):
         report.warnings.append(f"{where}: its recording has no frame")
     if found.counts is None:
         if found.numbers and found.empty:
-            report.warnings.append(
-                f"{where}: nothing but one value in frame {_numbers(found.empty)}"
-            )
+            frames = _numbers(found.empty)
+            report.warnings.append(f"{where}: nothing but one value in frame {frames}")
         return
     low, high = min(found.counts), max(found.counts)
     middle = float(np.median(found.counts))
     of = "" if len(found.counted) == len(found.numbers) else f" of {len(found.counted)} frames"
-    report.say(
-        "",
-        f"features per frame: {low} / {middle:g} / {high} (least / median / most{of}), expected: "
-        f"{expected}",
-    )
-    fewest = min(placement.fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
+    counts = f"{low} / {middle:g} / {high} (least / median / most{of})"
+    report.say("", f"features per frame: {counts}, expected: {expected}")
+    fewest = min(placement.fewest_count(setup, each) for each, _ in alone)
     judgement = keys.judge(middle, expected, fewest if len(session.labels) == 1 else None)
     if judgement is not None:
         number = found.typical_frame

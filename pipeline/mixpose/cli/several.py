@@ -183,19 +183,12 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
     depths = [1] * len(parts)
     while True:
         names = ["-".join(part[-depth:]) for part, depth in zip(parts, depths, strict=True)]
-        # some file systems know no capitals
-        counts = Counter(name.casefold() for name in names)
-        twins = [
-            k
-            for k, name in enumerate(names)
-            if counts[name.casefold()] > 1 and depths[k] < len(parts[k])
-        ]
-        if not twins:
-            return [
-                name if counts[name.casefold()] == 1 else f"{name}-{k}"
-                for k, name in enumerate(names)
-            ]
-        for k in twins:
+        counts = Counter(map(str.casefold, names))  # some file systems know no capitals
+        twins = [k for k, name in enumerate(names) if counts[name.casefold()] > 1]
+        shallow = [k for k in twins if depths[k] < len(parts[k])]
+        if not shallow:
+            return [f"{name}-{k}" if k in twins else name for k, name in enumerate(names)]
+        for k in shallow:
             depths[k] += 1
 
 

@@ -126,9 +126,8 @@ class _Stage:
         radius, rng = self.body.radius, self.rng
         aside = rng.uniform(-_LAMPS_ASIDE, _LAMPS_ASIDE, 2)
         place = self.middle + radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ self.frame)
-        lamp = Body(
-            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * radius])
-        )
+        radii = np.array([_LAMP * radius])
+        lamp = Body("lamp", (PointFeature(place),), None, None, "sphere", radii)
         return Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL]))
 
     def other(self, index: int) -> Actor:
