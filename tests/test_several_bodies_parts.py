@@ -101,3 +101,22 @@ def test_a_body_goes_on_from_a_pose_that_an_identical_one_found_by_other_sensors
         tracks, estimates = scene.advance(tracks, frame, frame / 50, views)
     x = [estimate.T_world_object[0, 3] for estimate in estimates]  # type: ignore[index]
     assert x == pytest.approx([126, -110], abs=5)
+
+
+@pytest.mark.parametrize(("cameras", "status"), [(1, "ambiguous"), (2, "ok")])
+def test_bodies_of_one_form_in_two_sizes_may_be_each_other_before_one_camera(
+    cameras: int, status: str
+) -> None:
+    # to one camera a body of 0.8 times the size looks as the other at 0.8 times the distance
+    large, small = body("large", TOOL), body("small", 0.8 * TOOL)
+    scene, places = scene_of(large, small), [at(-120, 10), at(130, -20, 30, 1.1)]
+    tracks = scene.begin()
+    for frame in range(3):
+        views = views_of([large, small], places, frame)[:cameras]
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        assert [estimate.status for estimate in estimates] == [status] * 2
+    if cameras == 1:
+        # nothing tells which of the two it is
+        confidences = [estimate.confidence for estimate in estimates]
+        assert confidences == pytest.approx([0.5, 0.5], abs=0.1)
+        assert estimates[0].doubt == "what is met lies like features of 'small'"

@@ -63,11 +63,19 @@ def test_a_body_by_itself_shares_nothing_but_what_it_repeats() -> None:
     assert (part.features, part.partners) == ((0, 1, 2), (0, 2, 1))
 
 
-@pytest.mark.parametrize(("moved", "said"), [(0.0, "are congruent"), (8.0, "4 markers of 'a' lie")])
+@pytest.mark.parametrize(
+    ("moved", "size", "said"),
+    [
+        (0.0, 1.0, "'a' and 'b' are congruent"),
+        (8.0, 1.0, "4 markers of 'a' lie"),
+        # one camera knows no size
+        (0.0, 0.8, "'a' and 'b', 1.25 times as large, are congruent"),
+    ],
+)
 def test_a_session_is_warned_of_bodies_that_could_be_taken_for_each_other(
-    tmp_path: Path, moved: float, said: str
+    tmp_path: Path, moved: float, size: float, said: str
 ) -> None:
-    other = transform(MOTION, FIVE)
+    other = size * transform(MOTION, FIVE)
     other[4] += moved
     path = tmp_path / "session.toml"
     path.write_text(

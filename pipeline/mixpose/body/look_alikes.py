@@ -175,7 +175,19 @@ def mirror_image(body: Body, near: frozenset[int]) -> Body:
     outward = body.normals
     if outward is not None:
         outward = outward - 2 * (outward @ normal)[:, None] * normal
-    return replace(body, features=tuple(PointFeature(one) for one in mirrored), normals=outward)
+    return of_points(body, mirrored, outward)
+
+
+@lru_cache(maxsize=64)
+def of_size(body: Body, factor: float) -> Body:
+    """A body whose points, and what is about them, are so many times as large."""
+    larger = of_points(body, factor * body.means, body.normals)
+    return larger if body.radii is None else replace(larger, radii=factor * body.radii)
+
+
+def of_points(body: Body, points: Floats, normals: Floats | None) -> Body:
+    """A body of other points; one whose features have an extent is of points, too."""
+    return replace(body, features=tuple(PointFeature(one) for one in points), normals=normals)
 
 
 @lru_cache(maxsize=256)

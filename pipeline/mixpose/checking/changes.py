@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, PointFeature, of_points, of_size
 from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
@@ -54,18 +54,6 @@ class Change:
         sensors = {view.name: view.sensor for view in self.views(views)}
         setups = [replace(s, sensor=sensors.get(s.name, s.sensor)) for s in session.sensors]
         return replace(session, body=self.body(session.body), sensors=tuple(setups))
-
-
-def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
-    """A body of other points; one whose features have an extent is of points, too."""
-    features = tuple(PointFeature(point) for point in points)
-    return replace(body, features=features, normals=normals)
-
-
-def of_size(body: Body, factor: float) -> Body:
-    """A body whose points, and what is about them, are so many times as large."""
-    larger = of_points(body, factor * body.means, body.normals)
-    return larger if body.radii is None else replace(larger, radii=factor * body.radii)
 
 
 def changes(session: Session) -> Iterator[Change]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mixpose.body import LookAlike, congruent_parts
+from mixpose.body import LookAlike, congruent_parts, of_size
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.placement import typical_poses
 from mixpose.errors import MixposeError
@@ -231,11 +231,18 @@ def shared_part_warnings(session: Session) -> list[str]:
     if len(session.objects) < 2:
         return warnings
     noise = _noise_length(session)
+    # one camera alone knows no size
+    is_alone = len(session.sensors) == 1 and session.sensors[0].model in ("pinhole", "fisheye")
     for one, other in combinations([each.body for each in session.objects], 2):
-        least = _LEAST * min(one.radius, other.radius)
-        parts = congruent_parts(one, other, max(least, _NOISES * noise, one.spread, other.spread))
-        if parts:
-            warnings.append(_text(parts[0], session.unit))
+        factor = one.radius / other.radius if is_alone else 1.0
+        for size in dict.fromkeys((1.0, round(factor, 9))):
+            resized = other if size == 1 else of_size(other, size)
+            least = _LEAST * min(one.radius, resized.radius)
+            reach = max(least, _NOISES * noise, one.spread, resized.spread)
+            parts = congruent_parts(one, resized, reach)
+            if parts and (size == 1 or len(parts[0].features) == len(one) == len(other)):
+                warnings.append(_text(parts[0], session.unit, size))
+                break
     return warnings
 
 
@@ -255,7 +262,7 @@ def _noise_length(session: Session) -> float:
     return min(lengths, default=0.0)
 
 
-def _text(part: LookAlike, unit: str) -> str:
+def _text(part: LookAlike, unit: str, size: float) -> str:
     one, other = part.body, part.other
     pairs = ", ".join(
         f"{one.labels[i]} like {other.labels[j]}"
@@ -263,10 +270,12 @@ def _text(part: LookAlike, unit: str) -> str:
     )
     off = part.off if part.off > 1e-9 * one.radius else 0.0  # what is rounded
     if len(part.features) == len(one) == len(other):
+        resized, remedy = "", "give one [[object]] with count"
+        if size != 1:
+            resized, remedy = f", {size:.3g} times as large,", "add a sensor"
         return (
-            f"the bodies {one.name!r} and {other.name!r} are congruent to {off:.2g} {unit} "
-            f"(markers {pairs}): nothing tells them apart; give one [[object]] with count, or move "
-            "a marker"
+            f"the bodies {one.name!r} and {other.name!r}{resized} are congruent to {off:.2g} "
+            f"{unit} (markers {pairs}): nothing tells them apart; {remedy}, or move a marker"
         )
     return (
         f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mixpose.checking.changes import Change, by_cameras_alone, changes, of_points, with_sensor
+from mixpose.body import of_points
+from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
 from mixpose.checking.evidence import (
     Explained,
     Frames,

@@ -14,10 +14,13 @@ from dataclasses import replace
 from itertools import combinations, permutations
 from typing import NamedTuple
 
-from mixpose.body import like_features, tolerance_of
+import numpy as np
+
+from mixpose.body import LookAlike, like_features, of_size, tolerance_of
 from mixpose.fit import Fit
 from mixpose.judgement import Alternative, ScoredPose, Verdict
 from mixpose.objective import project_body
+from mixpose.records import Floats
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import met_features
@@ -55,26 +58,25 @@ def taken_for(
     for k, j in permutations(frames, 2):
         if k in bests and j not in sure and frames[k].body is not frames[j].body:
             found[k] += _as_lost(instead(k, j), frames[k], frames[j])
-    for pair in combinations(sure, 2):
+    for pair in combinations(bests, 2):
         # what meets more is seldom the other
         k, j = sorted(pair, key=lambda one: -bests[one].features[0])
         if frames[k].body is frames[j].body or not (there := instead(k, j)):
             continue
         if there[-1].log_odds > -frames[k].rules.look_alikes.behind and (here := instead(j, k)):
             both = there[-1].log_odds + here[-1].log_odds, there[-1].alone + here[-1].alone
-            for one, what in ((k, there[-1].what), (j, here[-1].what)):
-                found[one] += _as_lost([Confusion(what, *both)], frames[k], frames[j])
+            for one, rival, what in ((k, j, there[-1].what), (j, k, here[-1].what)):
+                if rival in sure:
+                    found[one] += _as_lost([Confusion(what, *both)], frames[k], frames[j])
     return found
 
 
 def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
     """Parts of another body, or of its own, that all that a pose meets might be as well."""
-    met, T = met_features(best), best.T_world_object
-    tolerance = tolerance_of(data.body, other.body, other.rules.look_alikes.alike)
-    parts = like_features(data.body, met, other.body, tolerance)
-    parts = tuple(part for part in parts if len(part.features) == len(met))
+    parts = list(_in_place_of(data, best, other))
     if not parts:
         return
+    T = best.T_world_object
     here = Start(T, left_out=best.left_out)
     own = likelihood_of(data).density(Fit(T), here, best.matches)
     seen = other.seen_otherwise(views=data.views, still=data.still)
@@ -82,14 +84,43 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Conf
     # what a pose meets does not depend on what is drawn
     drawn = replace(data.finest, projection=project_body(data.finest.projection.sensors, seen.body))
     as_it_stands = likelihood_of(replace(seen, drawn=drawn))
-    for part in parts:
-        T_other = T @ part.T_body_other
+    for part, T_other in parts:
         there = as_it_stands.density(Fit(T_other), here, best.matches)
         if there - own > -other.rules.look_alikes.behind:  # else it is none, however fitted
             start = other.rival(best, T_other, other.close, left_out=best.left_out)
             there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
         known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
         yield Confusion(part.reason, there - own, there - own - known)
+
+
+def _in_place_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[tuple[LookAlike, Floats]]:
+    """Parts of a body that lie like all that a pose meets, with its pose (4, 4) there.
+
+    One camera sees a body that is larger by some factor, and as much farther away, as the same.
+    """
+    met, sizes = met_features(best), [(1.0, np.zeros(3))]
+    centre, factor = _centre_of_one(data, best), data.body.radius / other.body.radius
+    if centre is not None and abs(factor - 1) > 1e-9:
+        sizes.append((factor, centre))
+    for factor, centre in sizes:
+        body = other.body if factor == 1 else of_size(other.body, factor)
+        tolerance = tolerance_of(data.body, body, other.rules.look_alikes.alike)
+        for part in like_features(data.body, met, body, tolerance):
+            if len(part.features) == len(met):
+                T_other = best.T_world_object @ part.T_body_other
+                T_other[:3, 3] = centre + (T_other[:3, 3] - centre) / factor
+                yield part, T_other
+
+
+def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
+    """Centre of projection (3,) of the camera that meets a pose, if it is the only sensor."""
+    meets = [name for name, met in zip(best.used.names, best.used.met.tolist()) if met]
+    if len(meets) != 1:
+        return None
+    (view,) = (view for view in data.views if view.name == meets[0])
+    points = view.observation.points
+    rays = None if points is None else view.sensor.rays(points)
+    return rays.origins[0] if rays and rays.central and len(rays) else None
 
 
 def _as_lost(against: Sequence[Confusion], one: Frame, other: Frame) -> list[Confusion]:
