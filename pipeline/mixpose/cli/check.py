@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,7 @@ def check_session(
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
-    report.warnings += keys.shared_source_warnings(session, replaced) + _pairing_warnings(opened)
+    report.warnings += keys.shared_source_warnings(session, replaced)
     sizes = {name: each.size for name, each in surveys.items()}
     doubts = geometry.geometry_doubts(session, opened, surveys)
     given = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
@@ -96,6 +97,8 @@ def check_session(
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings, *given.warnings]
+    # numbers are sure, and what is out of step may look moved
+    report.warnings = [*_pairing_warnings(opened), *report.warnings]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
     report.write(doubts.tried or not_tried)
@@ -180,6 +183,13 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
             warnings.append(
                 f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other "
                 "sensors: frames are paired by the number that their names end in; rename the files"
+            )
+    for (one, own), (other, others) in combinations(numbers.items(), 2):
+        if own & others and own != others and {k - min(own) + min(others) for k in own} == others:
+            warnings.append(
+                f"sensors {one!r} and {other!r} have {len(own)} frames each, numbered from "
+                f"{min(own)} and from {min(others)}: if both began at once, rename the files of "
+                "one, as frames of one number are taken together"
             )
     return warnings
 
