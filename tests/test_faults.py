@@ -16,7 +16,7 @@ from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from faults import FAULTS, Fault, moved, outcome, rewritten
+from faults import FAULTS, Fault, instead, moved, outcome, rewritten
 
 from mixpose.records import Floats
 
@@ -138,6 +138,19 @@ def test_one_cameras_files_given_for_both_are_told_by_their_names(tmp_path: Path
 def test_a_camera_that_is_a_frame_late_is_told_from_one_that_is_bumped(tmp_path: Path) -> None:
     found = outcome(FAULTS["one frame late"], tmp_path / "recording", stop=8)
     assert found.wrong == 0
+    assert found.is_named, found.said
+
+
+def test_a_camera_that_is_a_frame_late_is_told_where_the_body_rests_at_first(
+    tmp_path: Path,
+) -> None:
+    def rested(folder: Path) -> None:
+        # while nothing moves, a late camera agrees
+        instead("left", range(1, 40), lambda k: max(k - 4, 0))(folder)
+        instead("right", range(1, 40), lambda k: max(k - 5, 0))(folder)
+
+    found = outcome(Fault(rested, "'right' is a frame late"), tmp_path / "recording", stop=12)
+    assert found.ambiguous == 7  # all in which it moves
     assert found.is_named, found.said
 
 

@@ -17,4 +17,4 @@ from mixpose.checking.keys import shared_source_warnings as shared_source_warnin
 from mixpose.checking.lookalikes import LookAlike as LookAlike, look_alikes as look_alikes
 from mixpose.checking.lookalikes import noise_of as noise_of
 from mixpose.checking.placement import with_image_sizes as with_image_sizes
-from mixpose.checking.trials import explanation as explanation
+from mixpose.checking.trials import explanation as explanation, late_sensor as late_sensor

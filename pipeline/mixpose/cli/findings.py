@@ -14,7 +14,7 @@ from statistics import median
 import numpy as np
 
 from mixpose.body import ASIDE
-from mixpose.checking import CAUSES, explanation, judge
+from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
@@ -306,11 +306,13 @@ class Findings:
         twice = self._doubts.get(TWICE, Stretches()).count
         twice = twice if 2 * twice > doubted else 0
         frozen = sum(each.count for each in self._same.values())
-        few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
+        few = self._ok <= (self._places + 1) / 2
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
-        return explanation(self._session, self._frames)
+        # a body that was at rest at first shows no delay; all else would have shown
+        asked = late_sensor if self._agreed_before >= _LONG else explanation
+        return asked(self._session, self._frames)
 
     def _of_markers(self) -> list[str]:
         lines = []
