@@ -10,7 +10,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect
 from rounding import rounding
 
 from mixpose.body import Body, Gravity, PointFeature
-from mixpose.judgement import RememberedNoise, expected_covariance, judge, judge_together
+from mixpose.judgement import Case, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
 from mixpose.sensors import PinholeCamera
 
@@ -48,7 +48,7 @@ def test_bodies_judged_at_once_are_worth_what_each_is_alone(
     # one of eight features, one of five; some hidden from all cameras, some from one
     five = Body("five", EIGHT.features[:5])
     cases = [
-        (matched_objective(views, body, [1.5, 1.5]), TRUTH, RememberedNoise(), None, None, None)
+        Case(matched_objective(views, body, [1.5, 1.5]), TRUTH)
         for body, views in (
             (EIGHT, detect(pinhole_cameras, EIGHT, TRUTH, hidden=2, noise=0.3, seed=1)),
             (five, detect(pinhole_cameras, five, TRUTH, hidden=1, noise=0.2, seed=2)),
@@ -57,7 +57,7 @@ def test_bodies_judged_at_once_are_worth_what_each_is_alone(
     # residuals of 0.2 px and more are differences of places up to 1280 px, and enter squared
     relative = 2 * rounding(1280) / 0.2
     for together, case in zip(judge_together(cases, ALL_FREE), cases, strict=True):
-        alone = judge(*case[:2], ALL_FREE)
+        alone = judge(case.objective, case.T_world_object, ALL_FREE)
         assert together.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
         np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
         assert together.noise.names == alone.noise.names

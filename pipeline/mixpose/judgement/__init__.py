@@ -33,6 +33,7 @@ from mixpose.judgement.judge import (
 from mixpose.judgement.expected import (
     expected_covariance as expected_covariance,
 )
+from mixpose.judgement.clutter import ClutterRates as ClutterRates
 from mixpose.judgement.information import (
     invert_information as invert_information,
     inverted as inverted,

@@ -18,13 +18,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
+from mixpose.judgement.clutter import ClutterRates
 from mixpose.judgement.information import information_of, inverted, log_determinants, with_wide_turn
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
@@ -35,10 +36,23 @@ Prior: TypeAlias = tuple[float, Floats]
 """What is known of a pose before its frame: log of its density, per length and radian of each free
 direction, and how uncertain it is (6,), which matters where the data leave a direction open."""
 
-Case: TypeAlias = tuple[
-    MatchedObjective, Floats, RememberedNoise, Prior | None, Matches | None, NoiseEstimate | None
-]
-"""Objective, pose (4, 4), noise before, prior, and matches and noise where the fit has them."""
+
+class Case(NamedTuple):
+    """A pose to be judged, and what is known before its frame."""
+
+    objective: MatchedObjective
+    T_world_object: Floats  # (4, 4)
+    before: RememberedNoise = RememberedNoise()
+    clutter: ClutterRates = ClutterRates()
+    prior: Prior | None = None
+    # as the fit has them
+    matches: Matches | None = None
+    noise: NoiseEstimate | None = None
+
+    @property
+    def body(self) -> Body:
+        """The object whose pose it is."""
+        return self.objective.projection.body
 
 
 @dataclass(frozen=True)
@@ -47,7 +61,9 @@ class DetectionModel:
 
     probability: float = constant(0.75, "P_D of a feature in view: one or two of eight are hidden")
     log_unseen: float = constant(-1.2, "per feature that faces a sensor out of its view: ln 0.3")
-    log_blind: float = constant(-5.0, "at least, for a sensor that misses all: 1 in 150 does")
+    log_blind: float = constant(
+        -5.0, "at least, for a sensor that misses all: 1 in 150 does, or shows what is new"
+    )
     by_count: bool = constant(True, "whether features that fix a pose may pay for its freedom")
     in_space: bool = constant(True, "whether clutter may be a point in space, and counts once")
     room: float = constant(10.0, "radii of the body: how far it may be where nothing is known")
@@ -153,6 +169,7 @@ def judge(
     rules: JudgementRules = JudgementRules(),
     *,
     before: RememberedNoise = RememberedNoise(),
+    clutter: ClutterRates = ClutterRates(),
     prior: Prior | None = None,
     left_out: Mapping[str, str] | None = None,
     matches: Matches | None = None,
@@ -160,7 +177,10 @@ def judge(
 ) -> ScoredPose:
     """Judge a pose, estimated in free directions (6,); arguments as in `Case`."""
     return judge_together(
-        [(objective, T_world_object, before, prior, matches, noise)], free, rules, left_out
+        [Case(objective, T_world_object, before, clutter, prior, matches, noise)],
+        free,
+        rules,
+        left_out,
     )[0]
 
 
@@ -171,13 +191,15 @@ def judge_together(
     left_out: Mapping[str, str] | None = None,
 ) -> list[ScoredPose]:
     """Judge K poses that the same sensors see and take part in; those left out meet nothing."""
-    left_out, whole, noises = left_out or {}, [], []
+    left_out, whole, noises, counted = left_out or {}, [], [], []
     association = rules.association, rules.noise.errors.narrowest
-    for objective, T, before, prior, matches, noise in cases:
-        whole.append(matches or associate(objective, T, *association))
-        known = (prior or flat_prior(objective.projection.body, free, rules.detection))[1]
+    for case in cases:
+        at = case.objective, case.T_world_object
+        whole.append(case.matches or associate(*at, *association))
+        known = (case.prior or flat_prior(case.body, free, rules.detection))[1]
         part = taken_part(whole[-1], left_out)
-        noises.append(noise_of(part, free, before, rules.noise, noise, known))
+        noises.append(noise_of(part, free, case.before, rules.noise, case.noise, known))
+        counted.append(case.clutter.log_odds(part, rules.detection.log_blind))
     # one pose needs no axis of poses
     variances, seen = noises[0][0], whole[0]
     if len(cases) > 1:
@@ -188,12 +210,12 @@ def judge_together(
         variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent = _evidence(cases, seen, variances, free, rules.detection)
-    evidence, densities = odds + [noise[-1] for noise in noises]
+    evidence, densities = odds + counted + [noise[-1] for noise in noises]
     return [
         ScoredPose(
-            cases[k][1],
+            case.T_world_object,
             whole[k],
-            with_wide_turn(covariance, cases[k][1], cases[k][0].projection.body.means),
+            with_wide_turn(covariance, case.T_world_object, case.body.means),
             float(evidence[k]),
             noise=remembered,
             log_missed=rules.detection.log_missed,
@@ -204,7 +226,9 @@ def judge_together(
             bent=bent[k],
             by_count=float(evidence[k] - densities[k]) if evidence[k] > -np.inf else 0.0,
         )
-        for k, (own, covariance, persistent, remembered, ratio, _) in enumerate(noises)
+        for k, (case, (own, covariance, persistent, remembered, ratio, _)) in enumerate(
+            zip(cases, noises, strict=True)
+        )
     ]
 
 
@@ -212,8 +236,8 @@ def _evidence(
     cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
 ) -> tuple[Floats, Floats]:
     """Log odds (2, K) as in `log_evidence`, and covariances (K, 6, 6) of bodies that give way."""
-    bodies = [case[0].projection.body for case in cases]
-    priors = [case[3] or flat_prior(body, free, detection) for case, body in zip(cases, bodies)]
+    bodies = [case.body for case in cases]
+    priors = [case.prior or flat_prior(case.body, free, detection) for case in cases]
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
     bent = np.zeros((len(cases), 6, 6))
     given = seen, variances, free, priors, sizes, detection
@@ -223,7 +247,7 @@ def _evidence(
         spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
         by_pose = spreads.reshape(len(cases), *spreads.shape[-3:])
         for own, body, case in zip(by_pose, bodies, cases, strict=True):
-            turned = body.node_spreads(case[1])
+            turned = body.node_spreads(case.T_world_object)
             own[: len(turned)] = turned
         # rigid as a rule, and bent now and then: as often the one as the other
         information = information_of(seen, variances, spreads)

@@ -109,7 +109,8 @@ class MatchedLikelihood:
         frame, _ = _as_moving(self.frame, fit)
         T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         seen = replace(matches_at(frame, T), crowd=beside.crowd, others=beside.others)
-        case = frame.finest, T, frame.track.residuals, frame.prior(T), seen, None
+        track = frame.track
+        case = Case(frame.finest, T, track.residuals, track.rates, frame.prior(T), seen)
         (judged,) = judge_together([case], frame.free, frame.rules.judgement, start.left_out)
         return judged.log_density
 
@@ -136,7 +137,7 @@ def case_of(frame: Frame, fit: Fit, start: Start) -> Case:
     prior = frame.prior(T if start.T_moved is None else start.T_moved)
     is_seen = T is fit.T_world_object and not (frame.is_timed or start.left_out)
     seen = (fit.matches, fit.noise) if is_seen else (None, None)
-    return frame.finest, T, frame.track.residuals, prior, *seen
+    return Case(frame.finest, T, frame.track.residuals, frame.track.rates, prior, *seen)
 
 
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:

@@ -12,7 +12,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import Prior, RememberedNoise, nearest_alike
+from mixpose.judgement import ClutterRates, Prior, RememberedNoise, nearest_alike
 from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
@@ -148,6 +148,7 @@ class Track:
     mistaken: Mapping[str, float] = field(default_factory=dict)
     # log odds that what is followed is another body, or turned, by the reasons for it
     alike: Mapping[str, float] = field(default_factory=dict)
+    rates: ClutterRates = ClutterRates()  # of clutter, since the last frame that was not ok
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
     distances: Distances | None = None  # between identical bodies, of which this is the first
@@ -176,7 +177,9 @@ class Track:
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
-        return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
+        return replace(
+            self, misses=self.misses + 1, search=search, clutter=clutter, rates=ClutterRates()
+        )
 
     def nearest(self, T_world_object: Floats, body: Body) -> Branch | None:
         """The branch that a pose goes on from: the nearest."""

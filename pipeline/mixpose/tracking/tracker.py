@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit
-from mixpose.judgement import APART, ScoredPose, Verdict, insert
+from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
@@ -272,13 +272,16 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
-    sizes = track.sizes
+    # after a frame that may show something else nobody knows what is new
+    sizes, rates = track.sizes, ClutterRates()
     if is_ok:
+        rates = track.rates.followed(used, data.rules.judgement.noise.memory)
         sizes = sizes_after(sizes, best, data.rules.sizes)
     return follow(
         data,
         found,
         residuals=best.noise if is_ok else track.residuals,
+        rates=rates,
         sizes=sizes,
         met_before=dict(zip(used.names, met.tolist(), strict=True)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
