@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import nbinom, poisson
 
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import ClutterRates
-from mixpose.judgement.judge import DetectionModel
+from mixpose.judgement import ClutterRates, DetectionModel
 from mixpose.matching import Matches
 from mixpose.records import Estimate
 from mixpose.rigid import from_rotation_vector, transform

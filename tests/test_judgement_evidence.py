@@ -12,8 +12,8 @@ from matches import Seen, matches_of
 from numpy.typing import NDArray
 
 from mixpose.judgement import DetectionModel, Prior
+from mixpose.judgement.evidence import log_evidence, odds_of
 from mixpose.judgement.information import information_of
-from mixpose.judgement.judge import log_evidence, odds_of
 from mixpose.matching import Matches
 
 Floats = NDArray[np.float64]

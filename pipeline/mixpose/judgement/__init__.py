@@ -16,19 +16,21 @@ from mixpose.judgement.acceptance import (
     nearest_alike as nearest_alike,
     one_misses as one_misses,
 )
+from mixpose.judgement.evidence import (
+    DetectionModel as DetectionModel,
+    Prior as Prior,
+    flat_prior as flat_prior,
+    gained_by as gained_by,
+    odds_of as odds_of,
+    paid_by_count as paid_by_count,
+)
 from mixpose.judgement.judge import (
     MEETS_NOTHING as MEETS_NOTHING,
     Case as Case,
-    DetectionModel as DetectionModel,
     JudgementRules as JudgementRules,
-    Prior as Prior,
     ScoredPose as ScoredPose,
-    flat_prior as flat_prior,
-    gained_by as gained_by,
     judge as judge,
     judge_together as judge_together,
-    odds_of as odds_of,
-    paid_by_count as paid_by_count,
 )
 from mixpose.judgement.expected import (
     expected_covariance as expected_covariance,
