@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, TypeAlias
@@ -26,6 +26,8 @@ Box: TypeAlias = Sequence[int]
 MOST_ROWS_SHARE = 0.5
 
 CONTOUR_SAMPLES = 64
+
+_AT_ONCE = 256  # contours that are held against all others in one piece
 
 _MOMENTS = itemgetter("m00", "m10", "m01", "mu20", "mu02", "mu11")
 
@@ -161,25 +163,35 @@ def neighbours(
     contours: Sequence[Contour], rules: ContourRules = ContourRules()
 ) -> list[list[int]]:
     """Groups of contours, by their places, that nearly touch: perhaps parts of one broken rim."""
+    near: list[set[int]] = [set() for _ in contours]
+    for k, j, gap in _pairs_by_box(contours, rules) if len(contours) > 1 else ():
+        if _are_near(contours[k], contours[j], gap):
+            near[k].add(j)
     groups: list[list[int]] = []
-    boxed = [(contour, cv2.boundingRect(contour)) for contour in contours]
-    for k, one in enumerate(boxed):
-        apart, together = [], [k]
-        for group in groups:
-            if any(_near(one, boxed[other], rules) for other in group):
-                together += group
-            else:
-                apart.append(group)
-        groups = [*apart, together]
+    for k, others in enumerate(near):
+        joined = [group for group in groups if not others.isdisjoint(group)] if others else []
+        groups = [group for group in groups if group not in joined] if joined else groups
+        groups.append([k, *[one for group in joined for one in group]])
     return groups
 
 
-def _near(one: tuple[Contour, Box], other: tuple[Contour, Box], rules: ContourRules) -> bool:
-    """Whether the gap between two contours, with their boxes, is small beside them."""
-    (a, (ua, va, wa, ha)), (b, (ub, vb, wb, hb)) = one, other
-    gap = rules.gap * min(max(wa, ha), max(wb, hb)) + rules.gap_px
-    if max(ua - ub - wb, ub - ua - wa, va - vb - hb, vb - va - ha) > gap:
-        return False
+def _pairs_by_box(
+    contours: Sequence[Contour], rules: ContourRules
+) -> Iterator[tuple[int, int, float]]:
+    """Pairs k > j whose boxes are nearer than the gap that is small beside them; with that gap."""
+    count = len(contours)
+    boxes = np.array([cv2.boundingRect(contour) for contour in contours])
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    largest = boxes[:, 2:].max(axis=1)
+    for rows in np.array_split(np.arange(count), count // _AT_ONCE + 1):
+        off = np.maximum(low[rows, None] - high, low - high[rows, None]).max(axis=2)
+        gaps = rules.gap * np.minimum(largest[rows, None], largest) + rules.gap_px
+        k, j = np.nonzero((off <= gaps) & (np.arange(count) < rows[:, None]))
+        yield from zip(rows[k].tolist(), j.tolist(), gaps[k, j].tolist())
+
+
+def _are_near(a: Contour, b: Contour, gap: float) -> bool:
+    """Whether two contours are so near to each other."""
     # Some points of each are enough: between them a contour comes closer by half a step.
     steps = [max(len(contour) // CONTOUR_SAMPLES, 1) for contour in (a, b)]
     between = a[:: steps[0]].astype(np.float32) - b[:: steps[1], 0].astype(np.float32)
