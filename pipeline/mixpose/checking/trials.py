@@ -16,20 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.body import of_points
+from mixpose.checking import evidence
 from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
-from mixpose.checking.evidence import (
-    Explained,
-    Frames,
-    Views,
-    anywhere,
-    beside,
-    best_pose,
-    evidence_of,
-    is_explained,
-    is_well_explained,
-    pose_near,
-    seen_by,
-)
+from mixpose.checking.evidence import Explained, Frames, Views, best_pose, evidence_of
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
 from mixpose.judgement import ScoredPose
@@ -74,7 +63,7 @@ class _Runner:
     def explains(self, rules: DiagnosisRules) -> bool:
         """Whether it explains the last frame."""
         pose = self.poses[-1]
-        return pose is not None and is_explained(pose, rules)
+        return pose is not None and evidence.is_explained(pose, rules)
 
     def gain(self, before: Explained) -> float:
         """Nats by which it explains the frames that it tried better."""
@@ -110,17 +99,17 @@ def diagnosis(
     extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
     change by values undecided.
     """
-    session, rules = anywhere(session), DiagnosisRules()
+    session, rules = evidence.anywhere(session), DiagnosisRules()
     before = _as_it_is(session, frames)
     case = _Case(session, frames[: len(before.poses)], before)
     frames = case.frames
-    is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
+    is_good = sum(evidence.is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
         tried += _without_values(case, others)
     # values only follow the noise where all frames are explained to within it without any
     if not any(
-        all(is_well_explained(pose, rules) for pose in one.explained.poses)
+        all(evidence.is_well_explained(pose, rules) for pose in one.explained.poses)
         and not one.change.values
         and one.gain > rules.margin
         for one in tried
@@ -150,7 +139,7 @@ def _as_it_is(session: Session, frames: Frames) -> Explained:
     """Poses of the session as it is, of fewer frames where a search takes long in vain."""
     rules, poses, left = DiagnosisRules(), list[ScoredPose | None](), DiagnosisRules().in_vain
     for number, views in frames:
-        if poses and left < 0 and not is_well_explained(poses[-1], rules):
+        if poses and left < 0 and not evidence.is_well_explained(poses[-1], rules):
             break
         pose, made = best_pose(session, session.body, number, views)
         poses.append(pose)
@@ -212,9 +201,9 @@ def _with_values(case: _Case, met: Explained) -> Iterator[Tried]:
     given = Adjustment(
         session.body.means,
         {setup.name: setup.sensor for setup in session.sensors},
-        seen_by(posed),
+        evidence.seen_by(posed),
         [pose.T_world_object for _, pose in posed],
-        beside(posed),
+        evidence.beside(posed),
     )
     alone = replace(given, beside=[])  # what is beside a feature that is missed may be of another
     promises = [
@@ -247,11 +236,11 @@ def _fitted(
         body = of_points(session.body, points, session.body.normals)
         seen = [_by(unknown, values, frames[k][1]) for k in known]
         numbers = [frames[k][0] for k in known]
-        found = [pose_near(session, body, *each) for each in zip(numbers, seen, poses)]
+        found = [evidence.pose_near(session, body, *each) for each in zip(numbers, seen, poses)]
         if any(pose is None for pose in found):
             return
         begun = [pose.T_world_object for pose in found]
-        given = replace(given, frames=seen_by([*zip(seen, found)]), poses=begun, beside=[])
+        given = replace(given, frames=evidence.seen_by([*zip(seen, found)]), poses=begun, beside=[])
     after = list(before.poses)
     for k, pose in zip(known, found):
         after[k] = pose
@@ -350,7 +339,7 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
 
 
 def _is_ok(session: Session, number: int, views: Views) -> bool:
-    tracker, track = begin(anywhere(session))
+    tracker, track = begin(evidence.anywhere(session))
     with np.errstate(all="ignore"):
         _, estimate = tracker.advance(track, number, None, views)
     shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]

@@ -18,16 +18,10 @@ from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
 from mixpose.frames import Source
+from mixpose.poses import trajectories
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.poses.trajectories import (
-    MARKS,
-    Trajectories,
-    numbers_of,
-    rate_of,
-    write_c3d,
-    write_trc,
-)
+from mixpose.poses.trajectories import Trajectories
 from mixpose.rigid import transform
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
@@ -55,7 +49,7 @@ def write_markers(
     if format_name == "c3d":
         _place(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
     if output is not None:
-        begins, mark = MARKS[format_name]
+        begins, mark = trajectories.MARKS[format_name]
         refuse_to_overwrite_but(output, [poses.path, session.path], mark, begins=begins)
     if not any(line.points for line in lines):
         without = f"{poses.path}: no frame has a marker that was measured"
@@ -63,22 +57,22 @@ def write_markers(
         if measured:
             raise SessionError(f"--measured: {without}; {hint}")
         warn(f"{without}; all places are by the pose; {hint}")
-    trajectories = trajectories_of(poses, lines, session, measured=measured, fps=request.fps)
+    told = trajectories_of(poses, lines, session, measured=measured, fps=request.fps)
     if output is None:
-        write_trc(sys.stdout, trajectories, "markers.trc")
+        trajectories.write_trc(sys.stdout, told, "markers.trc")
         return
     with appearing_whole(output) as part:
         if format_name == "trc":
             with part.open("w", encoding="utf-8", newline="\n") as stream:
-                write_trc(stream, trajectories, output.name)
-        elif not write_c3d(part, trajectories):
-            warn(f"{output}: frames are numbered from 1, not from {trajectories.first}")
-    frames, markers = trajectories.is_known.shape
-    known, found = trajectories.is_known.sum(), trajectories.is_measured.sum()
+                trajectories.write_trc(stream, told, output.name)
+        elif not trajectories.write_c3d(part, told):
+            warn(f"{output}: frames are numbered from 1, not from {told.first}")
+    frames, markers = told.is_known.shape
+    known, found = told.is_known.sum(), told.is_measured.sum()
     say(
         f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
         f"{found} places measured, {known - found} by the pose, "
-        f"{trajectories.is_known.size - known} gaps -> {output}"
+        f"{told.is_known.size - known} gaps -> {output}"
     )
 
 
@@ -97,7 +91,7 @@ def trajectories_of(
     bodies = _bodies(poses, lines, session)
     names = [(label, name) for label, body in bodies.items() for name in body.labels]
     columns = {pair: k for k, pair in enumerate(names)}
-    numbers = numbers_of(poses.poses)
+    numbers = trajectories.numbers_of(poses.poses)
     first, last = min(numbers.values()), max(numbers.values())
     if any(number != own for own, number in numbers.items()):
         warn(f"{poses.path}: frames are numbered by stamps; in the file they count from {first}")
@@ -158,7 +152,7 @@ def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Map
 
 def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
     """Frames per second by the times of the poses; 1 where they have none."""
-    found = rate_of(poses.poses, numbers)
+    found = trajectories.rate_of(poses.poses, numbers)
     if found is None:
         warn(f"{poses.path}: has no times; the rate is told as 1 frame a second; --fps says more")
         return 1.0

@@ -20,20 +20,9 @@ from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
+from mixpose.cli import recording_job
 from mixpose.cli.notices import frames_text, say
-from mixpose.cli.recording_job import (
-    DONE,
-    FAILED,
-    INTERRUPTED,
-    UNFINISHED,
-    Job,
-    Outcome,
-    Running,
-    finished,
-    outcome_of,
-    run_job,
-    told,
-)
+from mixpose.cli.recording_job import DONE, FAILED, INTERRUPTED, UNFINISHED, Job, Outcome, run_job
 from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError, reporting
 from mixpose.executing import Executor, in_threads, on_cluster
@@ -111,7 +100,8 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)
     _refuse_others(folder, jobs)
-    outcomes = {k: outcome for k, job in enumerate(jobs) if (outcome := finished(job)) is not None}
+    before = map(recording_job.finished, jobs)
+    outcomes = {k: outcome for k, outcome in enumerate(before) if outcome is not None}
     if outcomes:
         say(f"{len(outcomes)} of {len(jobs)} recordings are done already")
     left = [k for k in range(len(jobs)) if k not in outcomes]
@@ -138,7 +128,7 @@ def _doing(request: RunRequest, workers: int) -> Iterator[tuple[Executor, partia
         with on_cluster(request.scheduler, workers if workers > 1 else None) as cluster:
             yield cluster, partial(run_job)
         return
-    running = Running()
+    running = recording_job.Running()
     share = max((os.cpu_count() or 1) // workers, 1)
     with in_threads(workers) as threads:
         try:
@@ -153,7 +143,7 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-    return replace(outcome_of(job, FAILED, 3), reason=reason, host="")
+    return replace(recording_job.outcome_of(job, FAILED, 3), reason=reason, host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
@@ -235,7 +225,7 @@ def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
     """Raise a SessionError where what is there under the name of a job is of another session."""
     for job in jobs:
         for name in (job.name, f".{job.name}.{UNFINISHED}"):
-            there = told(folder / name)
+            there = recording_job.told(folder / name)
             if there is not None and Path(there.session).resolve() != Path(job.session).resolve():
                 raise SessionError(
                     f"-o {folder}: {name} in it is of {there.session}, not of {job.session}; name "

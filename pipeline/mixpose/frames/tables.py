@@ -15,25 +15,9 @@ from typing import ClassVar, NoReturn, TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames.source import (
-    Frames,
-    SensorKind,
-    Source,
-    SourceKind,
-    SourceSpec,
-    numbers_text,
-    selection,
-)
-from mixpose.frames.times import (
-    Clock,
-    FrameTimes,
-    csv_rows,
-    finite,
-    header,
-    plain,
-    require_times,
-    whole,
-)
+from mixpose.frames import source, times
+from mixpose.frames.source import Frames, SensorKind, Source, SourceKind, SourceSpec
+from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, plain, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -100,13 +84,14 @@ class DetectionTable(Source):
         contents = self._contents
         if contents.first is None or contents.last is None:
             return "0 detections"
-        numbers = numbers_text(contents.first, contents.last, contents.frames)
+        numbers = source.numbers_text(contents.first, contents.last, contents.frames)
         return f"{contents.rows} detections, {numbers}"
 
     def check_times(self, wanted: range) -> None:
         """See that each frame in the range has a time; reads the table once more."""
         if isinstance(self.clock, FrameTimes):
-            require_times(self.clock, (number for number in self.numbers() if number in wanted))
+            own = (number for number in self.numbers() if number in wanted)
+            times.require_times(self.clock, own)
 
     @property
     def stamps(self) -> list[int]:
@@ -132,7 +117,7 @@ class DetectionTable(Source):
         The time of a frame is that of its earliest detection.  A row of weight 0 says no more
         than that its frame exists.
         """
-        wanted = selection(start, stop, step, self.first)
+        wanted = source.selection(start, stop, step, self.first)
         rows: Iterator[_Row] = self._rows()
         if not self._contents.in_order:
             unsorted = list(islice(rows, MOST_UNSORTED_ROWS + 1))
@@ -173,8 +158,8 @@ class DetectionTable(Source):
         pattern = PointPattern(points[weights > 0], weights[weights > 0])
         if self.clock is not None:
             return RawFrame(number, self.clock(number), pattern)
-        times = self._column("time_s", values)
-        return RawFrame(number, None if times is None else float(times.min()), pattern)
+        seconds = self._column("time_s", values)
+        return RawFrame(number, None if seconds is None else float(seconds.min()), pattern)
 
     def _column(self, name: str, values: Floats) -> Floats | None:
         return values[:, self.columns.index(name)] if name in self.columns else None

@@ -5,18 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mixpose.body import Body, PointFeature
+from mixpose.pictures import levels
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.pictures.levels import (
-    FLOODED,
-    NEAR_SIGMAS,
-    apart,
-    around,
-    direction,
-    leaving_out,
-    looser,
-    more,
-    some,
-)
+from mixpose.pictures.levels import FLOODED, around, direction, more, some
 from mixpose.pictures.light import Light
 from mixpose.records import GridPattern, PointPattern
 
@@ -91,9 +82,9 @@ def _threshold(light: Light) -> str:
     scene = light.scene
     side = "above" if options.polarity == "bright" else "below"
     if scene.judged:
-        levels = scene.level, scene.noise, scene.least_peak
+        heights = scene.level, scene.noise, scene.least_peak
         digits = ".3g" if light.image.dtype == np.float32 else ".1f"
-        level, noise, peak = (f"{each:{digits}}" for each in levels)
+        level, noise, peak = (f"{each:{digits}}" for each in heights)
         text = (
             f'  threshold "{options.threshold}": {level} grey levels {side} the background, whose '
             f"noise is {noise}; peaks of at least {peak}"
@@ -136,9 +127,8 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
         )
     if found := missing["faint"]:
         level = (min(found.values()) + float(np.median(light.raw))) / 2  # and the background
-        lines.append(
-            f"not met, fainter than the threshold: {some(found, body)}; {looser(light, level)}"
-        )
+        lower = levels.looser(light, level)
+        lines.append(f"not met, fainter than the threshold: {some(found, body)}; {lower}")
     if found := missing["small"]:
         lower = direction(options, lower=True, level=light.written(light.level))
         lines.append(
@@ -154,7 +144,7 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
         lines.append(
             f"not met though bright there: {some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
-            f"{apart(finding, expected, light, body, list(found))}"
+            f"{levels.apart(finding, expected, light, body, list(found))}"
         )
     return lines
 
@@ -169,7 +159,7 @@ def _sorted_out(
         kind: {} for kind in ("nothing", "faint", "small", "large", "other")
     }
     for i in np.flatnonzero(expected.seen & ~expected.met).tolist():
-        region = around(expected.y[i], NEAR_SIGMAS * finding.sigma, scene.grey.shape)
+        region = around(expected.y[i], levels.NEAR_SIGMAS * finding.sigma, scene.grey.shape)
         signal = float(scene.grey[region].max()) - scene.zero
         area = float(areas[labels[region]].max())
         if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
@@ -214,7 +204,7 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
         level = (peak[extra].max() + peak[own].min()) / 2
         word = "fainter" if light.options.polarity == "bright" else "less dark"
         text += f", all {word} than those that do; they do no harm"
-        number = leaving_out(finding, pattern.points[extra], light, level)
+        number = levels.leaving_out(finding, pattern.points[extra], light, level)
         return [f"{text}, and in this frame {number} would leave them out" if number else text]
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 

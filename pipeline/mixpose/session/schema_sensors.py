@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BeforeValidator, Field, PlainValidator
 
 from mixpose.records import Floats
+from mixpose.session import values
 from mixpose.session.intrinsics import MATRIX_FORM
 from mixpose.session.schema_common import (
     ExtractTable,
@@ -21,15 +22,7 @@ from mixpose.session.schema_common import (
     Table,
     Text,
 )
-from mixpose.session.values import (
-    RESOLUTION_FORM,
-    ArrayOf,
-    Delay,
-    SensorName,
-    Source,
-    read_calibration_key,
-)
-from mixpose.session.values import resolution as resolution_of
+from mixpose.session.values import ArrayOf, Delay, SensorName, Source, read_calibration_key
 from mixpose.units import Unit
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
@@ -130,8 +123,8 @@ class PlacedTable(SensorTable, Placement):
     right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
     the origin of the world.
     Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""
-    resolution: Annotated[tuple[int, int] | None, PlainValidator(resolution_of)] = Field(
-        None, description=RESOLUTION_FORM
+    resolution: Annotated[tuple[int, int] | None, PlainValidator(values.resolution)] = Field(
+        None, description=values.RESOLUTION_FORM
     )
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
     Example: `resolution = [640, 512]`"""

@@ -8,33 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from mixpose import sensors
 from mixpose.errors import SessionError
 from mixpose.extraction import ExtractOptions, check_options
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.sensors import (
-    CalibrationError,
-    CloudSensor,
-    FisheyeCamera,
-    ParallelBeam,
-    PinholeCamera,
-    RangeSensor,
-    Sensor,
-)
+from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
+from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
 from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
 from mixpose.session.schema_common import ExtractTable
-from mixpose.session.schema_sensors import (
-    AnySensorTable,
-    CalibrationTable,
-    CameraTable,
-    CloudTable,
-    LaterationTable,
-    ParallelTable,
-    PlacedTable,
-)
+from mixpose.session.schema_sensors import AnySensorTable, CameraTable, CloudTable, LaterationTable
 from mixpose.session.setup import SensorSetup
 from mixpose.units import Unit, length_ratio
 
@@ -112,9 +98,9 @@ def _build_sensor(
         case CameraTable():
             sensor = _camera(table, folder, unit)
             resolution = sensor.resolution
-        case ParallelTable():
+        case schema_sensors.ParallelTable():
             resolution = table.resolution
-            sensor = ParallelBeam(
+            sensor = sensors.ParallelBeam(
                 table.pixel_size, table.principal_point, resolution, _T_sensor_world(table)
             )
         case LaterationTable():
@@ -122,13 +108,13 @@ def _build_sensor(
                 missing = "range_min" if table.range_min is None else "bin_size"
                 raise BadKeyError("missing; a profile needs range_min and bin_size", missing)
             # the far end of a profile is known only when its bins are counted
-            sensor = RangeSensor(table.position, table.range_bias)
+            sensor = sensors.RangeSensor(table.position, table.range_bias)
         case CloudTable():
             if table.delay == "estimate":
                 raise BadKeyError(
                     'found "estimate" with model = "cloud"; allowed: seconds', "delay"
                 )
-            sensor = CloudSensor(_T_sensor_world(table))
+            sensor = sensors.CloudSensor(_T_sensor_world(table))
     if getattr(table, "readout", 0.0) and resolution is None:
         raise BadKeyError("stands without resolution; allowed: with [width, height]", "readout")
     with under("extract"):
@@ -182,7 +168,9 @@ def _camera(table: CameraTable, folder: Path, unit: Unit) -> PinholeCamera | Fis
     return kind(intrinsics.camera_matrix, intrinsics.distortion, resolution, T)
 
 
-def _pose_in_file(camera: CalibratedCamera, wanted: CalibrationTable | None, unit: Unit) -> Floats:
+def _pose_in_file(
+    camera: CalibratedCamera, wanted: schema_sensors.CalibrationTable | None, unit: Unit
+) -> Floats:
     """Where the calibration says that the camera stands; the origin where it does not."""
     T = camera.T_camera_rig
     if T is None or wanted is None:
@@ -236,6 +224,6 @@ def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
             raise BadKeyError(f"found {getattr(extract, key):g}; allowed: {text}", key)
 
 
-def _T_sensor_world(table: PlacedTable | CloudTable) -> Floats:
+def _T_sensor_world(table: schema_sensors.PlacedTable | CloudTable) -> Floats:
     T = read_motion(table, "T_sensor_world")
     return np.eye(4) if T is None else T

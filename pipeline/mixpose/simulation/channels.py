@@ -13,18 +13,11 @@ from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.session import SensorSetup, Session
+from mixpose.simulation import render
 from mixpose.simulation.motion import Motion, Shutter
 from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
-from mixpose.simulation.render import (
-    DetectionWriter,
-    ImageFormat,
-    ImageWriter,
-    ProfileFormat,
-    ProfileWriter,
-    SensorWriter,
-    VideoWriter,
-)
+from mixpose.simulation.render import DetectionWriter, ProfileWriter, SensorWriter
 from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.visible_spots import View, brightness_levels
 
@@ -102,12 +95,12 @@ class Planner:
         options = self.options
         optics = _SPOT_SIGMA_PX if self.body.radii is None else _OPTICS_PX
         spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
-        form = ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
+        form = render.ImageFormat(setup.resolution, spot_sigma, setup.extract.polarity)
 
         def start(folder: Path) -> SensorWriter:
             if files.kind == "images":
-                return ImageWriter(files, folder, options, form)
-            return VideoWriter(files, folder, options, form, self.fps)
+                return render.ImageWriter(files, folder, options, form)
+            return render.VideoWriter(files, folder, options, form, self.fps)
 
         bounds = setup.sensor.lower, setup.sensor.upper
         return Channel(files, self._view(setup, bounds, spot_sigma, index), options, start)
@@ -124,7 +117,7 @@ class Planner:
                 f"sensor {setup.name!r}: range_min: found {range_min:g}; the object is at "
                 f"ranges from {nearest[0]:g} to {farthest[0]:g}"
             )
-        form = ProfileFormat(bins, range_min, bin_size, width)
+        form = render.ProfileFormat(bins, range_min, bin_size, width)
         view = self._view(setup, (np.maximum(nearest, range_min), farthest), width, index)
         return Channel(files, view, options, lambda at: ProfileWriter(files, at, options, form))
 
