@@ -16,6 +16,7 @@ from mixpose.checking import times_as_large
 from mixpose.checking.changes import Change
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Tried, diagnosis, simplest
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.cli.findings import Findings
 from mixpose.objective import View
@@ -145,7 +146,7 @@ def test_what_follows_from_the_cause_is_not_told(
     path = tmp_path / "session.toml"
     text = f"{before}points = {rows}\n{after}"
     path.write_text(text.replace('source = "', f'source = "{SESSION.parent}/'), encoding="utf-8")
-    check_session(path, quick=True)
+    check_session(CheckRequest(path, quick=True))
     warnings = [row for row in capsys.readouterr().out.splitlines() if row.startswith("warning")]
     assert len(warnings) == 1
     assert "with points 1000 times as large, 4 of 4 frames are explained" in warnings[0]
@@ -163,7 +164,7 @@ def test_where_the_body_is_another_one_it_is_said_that_no_frame_is_explained(
     path = tmp_path / "session.toml"
     text = re.sub(r"\[start\]\n(?:[^\[\n].*\n)*", "", "[[sensor]]".join(parts[: 1 + sensors]))
     path.write_text(text.replace('source = "', f'source = "{SESSION.parent}/'), encoding="utf-8")
-    check_session(path, quick=True)
+    check_session(CheckRequest(path, quick=True))
     out = capsys.readouterr().out
     assert "the body is not found, by the session as it is or with any one change of it" in out
     assert "warnings  none" not in out

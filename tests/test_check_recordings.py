@@ -17,6 +17,7 @@ from mixpose.checking import judge
 from mixpose.checking.keys import told_apart
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey, some_of
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.runner import open_sources
@@ -36,7 +37,7 @@ def recording(tmp_path: Path) -> Path:
 
 
 def report_on(session: Path, capsys: pytest.CaptureFixture[str], *, quick: bool = False) -> str:
-    check_session(session, quick=quick)
+    check_session(CheckRequest(session, quick=quick))
     return capsys.readouterr().out
 
 
@@ -112,7 +113,7 @@ def test_features_are_counted_in_some_images_of_a_long_recording_and_all_are_rea
         shutil.copy(recording / "right0000.png", recording / f"right{n:04d}.png")
     (recording / "left0001.png").write_bytes(b"no image")
     with pytest.raises(RecordingError, match=r"left0001\.png"):
-        check_session(recording / "session.toml")
+        check_session(CheckRequest(recording / "session.toml"))
     report = capsys.readouterr().out
     assert "1 of the 45 looked at cannot be read" in report
     assert report.count("features per frame: 0 / 0 / 0 (least / median / most of 20 frames)") == 2
@@ -139,7 +140,7 @@ def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
     (recording / "left0003.png").write_bytes(b"this is no image")
     (recording / "left0005.png").write_bytes(b"")
     with pytest.raises(RecordingError, match=r"left0003\.png: .*\(and 1 more, see above\)$"):
-        check_session(recording / "session.toml")
+        check_session(CheckRequest(recording / "session.toml"))
     report = capsys.readouterr().out
     assert "2 of the 8 looked at cannot be read" in report
     assert "left0005.png: the file is empty" in report
@@ -150,7 +151,7 @@ def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
 def test_an_image_of_another_size_is_damaged(recording: Path) -> None:
     cv2.imwrite(str(recording / "right0004.png"), np.zeros((100, 120), dtype=np.uint8))
     with pytest.raises(RecordingError, match=r"right0004\.png: found 120x100"):
-        check_session(recording / "session.toml")
+        check_session(CheckRequest(recording / "session.toml"))
 
 
 def test_a_video_that_ends_early_is_told_with_the_frames_before(
@@ -161,7 +162,7 @@ def test_a_video_that_ends_early_is_told_with_the_frames_before(
     video = tmp_path / "camera.avi"
     video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
     with pytest.raises(RecordingError, match="cut short"):
-        check_session(tmp_path / "session.toml")
+        check_session(CheckRequest(tmp_path / "session.toml"))
     assert "features per frame: " in capsys.readouterr().out
 
 
@@ -376,7 +377,7 @@ def test_files_that_are_given_to_two_sensors_are_told(
     session = darkened(recording, 2)
     text = session.read_text(encoding="utf-8").replace('"right*.png"', '"./left*.png"')
     session.write_text(text, encoding="utf-8")
-    check_session(session, quick=True)
+    check_session(CheckRequest(session, quick=True))
     out = capsys.readouterr().out
     assert "sensors 'left' and 'right' read the same recording, " in out
     assert "files (left0000.png, ...): give each its own source" in out

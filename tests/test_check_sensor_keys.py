@@ -13,6 +13,7 @@ from inspected import copied, left_image, write_left
 from mixpose import runner
 from mixpose.checking import key_warnings
 from mixpose.checking.keys import advice
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
@@ -77,12 +78,12 @@ source = "anchor{k}.csv"
         (tmp_path / f"anchor{k}.csv").write_text(f"frame,range\n{rows}", encoding="utf-8")
     path = tmp_path / "session.toml"
     path.write_text(text, encoding="utf-8")
-    check_session(path)
+    check_session(CheckRequest(path))
     printed = capsys.readouterr().out
     assert "anchor0: lateration, sigma 0.08 m\n" in printed
     assert "at [start], the sensors do not determine z, rx, ry: hold what is known" in printed
     path.write_text(text + '\n[estimator]\nfree = ["x", "y", "rz"]\n', encoding="utf-8")
-    check_session(path)
+    check_session(CheckRequest(path))
     assert "do not determine" not in capsys.readouterr().out
 
 
@@ -95,7 +96,7 @@ def test_a_flood_of_features_of_which_none_is_used_is_too_many_and_not_too_few(
     for u in range(20, 620, 10):
         image[10:13, u : u + 3] = 160
     write_left(recording, image)
-    check_session(recording / "session.toml")
+    check_session(CheckRequest(recording / "session.toml"))
     report = capsys.readouterr().out
     assert "features per frame: 67 / 67 / 67" in report
     assert "sensor 'left': too many features, 67 in frame" in report
@@ -116,7 +117,7 @@ def test_a_key_is_said_to_stand_where_it_overrides_that_of_all_sensors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = copied(tmp_path / "recording")
-    check_session(with_own(recording, "min_area = 60", "min_area = 60"))
+    check_session(CheckRequest(with_own(recording, "min_area = 60", "min_area = 60")))
     report = capsys.readouterr().out
     for side in ("left", "right"):
         assert re.search(
@@ -150,7 +151,7 @@ def test_a_polarity_that_sensors_have_of_their_own_is_said_to_stand_there(
     path = with_own(recording, 'polarity = "dark"', right)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('method = "blobs"', 'method = "blobs"\npolarity = "dark"', 1))
-    check_session(path)
+    check_session(CheckRequest(path))
     assert f'with polarity = "bright" {where}, 1 of 1' in capsys.readouterr().out
 
 
@@ -171,7 +172,7 @@ def test_a_recording_without_a_frame_is_told(
     path = recording / "session.toml"
     path.write_text(path.read_text(encoding="utf-8").replace("left*.png", "left.csv"))
     (recording / "left.csv").write_text("frame,u,v\n", encoding="utf-8")
-    check_session(path, quick=quick)
+    check_session(CheckRequest(path, quick=quick))
     printed = capsys.readouterr().out
     assert "warning   sensor 'left': its recording has no frame" in printed
     assert "sensor 'right': its recording" not in printed

@@ -15,7 +15,7 @@ import pytest
 
 import mixpose
 from mixpose.cli import main
-from mixpose.cli.app import app
+from mixpose.cli.app import CheckRequest, app
 from mixpose.cli.check import check_session
 from mixpose.session.schema import SessionTable
 from mixpose.simulation import SimulationOptions, simulate
@@ -229,7 +229,7 @@ def test_the_session_of_the_readme_gives_poses_that_are_ok(
     # by four markers one camera finds the pose, too, and chance explains each frame nearly as well
     four = text.replace("[100, 111.6, -6.7], [-48, 20, 12], [35, -60, 30],", "[100, 111.6, -6.7],")
     assert four != text
-    check_session(simulated("four", four), quick=True)
+    check_session(CheckRequest(simulated("four", four), quick=True))
     assert "the body is found, but not surely (confidence 0.99" in capsys.readouterr().out
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from session_lines import with_lines
 
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.frames import Source, SourceSpec, open_source, pair, paired_by_stamp
 
@@ -79,7 +80,7 @@ def test_a_quick_check_tells_that_frames_do_not_pair(
             cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((1024, 1280), np.uint8))
     session = tmp_path / "session.toml"
     session.write_text(with_lines(sonar="", sonar_keys=""), encoding="utf-8")
-    check_session(session, quick=True)
+    check_session(CheckRequest(session, quick=True))
     said = capsys.readouterr().out
     assert "sensor 'left': 0 of its 40 frames pair with those of other sensors" in said
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.cli.request import RunRequest
 from mixpose.cli.run import run_session
@@ -151,7 +152,7 @@ def test_a_check_tells_rows_that_lack_beyond_the_frames_that_it_looks_at(
 ) -> None:
     session = video_session(tmp_path, *range(57), 58, 59)
     with pytest.raises(RecordingError, match=r"times\.csv: no row for frame 57; allowed"):
-        check_session(session, quick=quick)
+        check_session(CheckRequest(session, quick=quick))
 
 
 def test_a_video_that_promises_more_frames_than_it_has_needs_rows_for_those_it_has(

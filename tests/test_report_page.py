@@ -18,6 +18,7 @@ import pytest
 from command_line import LONGEST_S, command
 from report_runs import COVARIANCE, RECORDING, SYNTHETIC, estimate, write, write_run
 
+from mixpose.cli.app_after import ReportRequest
 from mixpose.cli.report import write_report
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.evaluate import evaluate_files
@@ -58,7 +59,7 @@ class Page(HTMLParser):
 
 def report(tmp_path: Path, poses: Path, truth: Path | None = None) -> Page:
     output = tmp_path / "report.html"
-    write_report(poses, truth, output)
+    write_report(ReportRequest(poses, output, truth))
     return Page(output.read_text(encoding="utf-8"))
 
 
@@ -67,7 +68,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of a whole run against its truth."""
     folder = tmp_path_factory.mktemp("full")
     poses = write_run(folder / "poses.jsonl", {5: "lost", 6: "lost", 7: "lost", 20: "ambiguous"})
-    write_report(poses, RECORDING / "truth.jsonl", folder / "report.html")
+    write_report(ReportRequest(poses, folder / "report.html", RECORDING / "truth.jsonl"))
     return folder / "report.html"
 
 
@@ -251,7 +252,7 @@ def test_a_browser_runs_nothing_that_names_in_a_file_hold(tmp_path: Path) -> Non
     header, *lines = poses.read_text(encoding="utf-8").splitlines()
     header = json.dumps({**json.loads(header), "session": evil, "mixpose": evil, "seed": evil})
     poses.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
-    write_report(poses, None, output)
+    write_report(ReportRequest(poses, output))
     answers = browse(output, tmp_path, 800)
     assert answers["images"] == []
     assert answers["scripts"] == 1  # the one put in here
@@ -347,7 +348,7 @@ def test_output_never_takes_the_place_of_something_else(tmp_path: Path) -> None:
         (tmp_path / "none" / "report.html", "there is no folder"),
     ):
         with pytest.raises(SessionError, match=words):
-            write_report(poses, truth, output)
+            write_report(ReportRequest(poses, output, truth))
     assert {path: path.read_bytes() for path in before} == before
 
 
@@ -373,7 +374,7 @@ def test_missing_library_is_named_with_the_extra_that_brings_it(
     poses = write(tmp_path / "p.jsonl", [], None)
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(SessionError, match=rf"found no {library}.*mixpose\[report\]"):
-        write_report(poses, None, tmp_path / "report.html")
+        write_report(ReportRequest(poses, tmp_path / "report.html"))
     assert not (tmp_path / "report.html").exists()
 
 

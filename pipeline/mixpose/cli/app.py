@@ -156,18 +156,14 @@ def run(words: RunWords) -> None:
     run_session(Path(sessions[0]), request)
 
 
-def check(
-    session: SessionFile,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
-    ] = False,
-    source: Sources = None,
-    allow_code: AllowCode = False,
-) -> None:
+@dataclass(frozen=True)
+class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
-    from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session, quick=quick, sources=tuple(source or ()), allow_code=allow_code)
+    session: SessionFile
+    quick: bool = option(False, "Look at a few frames of each sensor only.")
+    source: Sources = None
+    allow_code: AllowCode = False
 
 
 @dataclass(frozen=True)
@@ -186,14 +182,14 @@ class InspectRequest:
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "run": taking(RunWords, run),
-    "check": check,
+    "check": taking(CheckRequest, "check:check_session"),
     "inspect": taking(InspectRequest, "inspect:inspect_frame"),
     "import": taking(ImportRequest, "importing:import_files"),
     "simulate": taking(SimulateRequest, "simulate:simulate_session"),
     "evaluate": app_after.evaluate,
     "convert": taking(app_after.ConvertRequest, "convert:convert_poses"),
     "schema": app_after.schema,
-    "report": app_after.report,
+    "report": taking(app_after.ReportRequest, "report:write_report"),
     "calibrate": taking(CalibrateRequest, "calibrate:calibrate_session"),
     "design": taking(DesignRequest, "design:design_sessions"),
     "pivot": taking(app_after.PivotRequest, "pivot:pivot_poses"),

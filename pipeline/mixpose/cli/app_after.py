@@ -30,17 +30,13 @@ def evaluate(
     sys.stdout.write(text.rstrip("\n") + "\n")
 
 
-def report(
-    poses: PosesFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The page, as report.html; or stdout (-).")
-    ],
-    truth: Annotated[Path | None, TRUTH] = None,
-) -> None:
+@dataclass(frozen=True)
+class ReportRequest:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
-    from mixpose.cli.report import write_report  # noqa: PLC0415
 
-    write_report(poses, truth, output)
+    poses: PosesFile
+    output: Path = option(..., "The page, as report.html; or stdout (-).", "-o", "--output")
+    truth: Annotated[Path | None, TRUTH] = None
 
 
 def schema() -> None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.checking import geometry, keys, lookalikes, placement, recordings
+from mixpose.cli.app import CheckRequest
 from mixpose.cli.notices import bar
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
@@ -54,18 +54,15 @@ class _Report:
         sys.stdout.write("\n".join(self.lines) + "\n")
 
 
-def check_session(
-    path: Path, *, quick: bool = False, sources: Sequence[str] = (), allow_code: bool = False
-) -> None:
+def check_session(request: CheckRequest) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
-    `quick` looks at a few frames only; `sources` (``left=frames/``) stand in place of the
-    session's. Raises SessionError as ``mixpose run`` would before its first frame, and
-    RecordingError if a recording cannot be opened or its table of times lacks rows, or, after all
-    has been printed, if a frame is damaged.
+    Raises SessionError as ``mixpose run`` would before its first frame, and RecordingError if a
+    recording cannot be opened or its table of times lacks rows, or, after all has been printed, if
+    a frame is damaged.
     """
-    session = load_session(path, allow_code=allow_code)
-    replaced = named_sources(sources)
+    session, quick = load_session(request.session, allow_code=request.allow_code), request.quick
+    replaced = named_sources(request.source or ())
     opened = open_sources(session, replaced)
     for source in opened.values():
         source.check_times(ALL_NUMBERS)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from mixpose import __version__
+from mixpose.cli.app_after import ReportRequest
 from mixpose.cli.notices import say
 from mixpose.cli.output import refuse_to_overwrite_but, shown, write_text
 from mixpose.errors import SessionError
@@ -14,15 +13,16 @@ from mixpose.report.page import MARK, find_session, render
 _PAGES = (".html", ".htm")
 
 
-def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
+def write_report(request: ReportRequest) -> None:
     """Write the report of a run to a page of its own, or to standard output.
 
     Raises SessionError if the output would overwrite something else, or a library is missing.
     Raises RecordingError if the poses or the truth cannot be read or compared.
     """
-    poses, cut = read_unfinished_poses(poses_path)
-    truth = None if truth_path is None else read_poses(truth_path)
-    inputs = (poses_path, truth_path, find_session(poses).path)
+    output = request.output
+    poses, cut = read_unfinished_poses(request.poses)
+    truth = None if request.truth is None else read_poses(request.truth)
+    inputs = (request.poses, request.truth, find_session(poses).path)
     refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
     if output.suffix and output.suffix.casefold() not in _PAGES:
         raise SessionError(
