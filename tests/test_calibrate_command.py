@@ -69,6 +69,15 @@ def test_a_wrong_word_for_what_is_free_is_one_line(bumped: Path) -> None:
         assert len(done.stderr.strip().splitlines()) == 1
 
 
+def test_of_several_bodies_the_one_that_is_looked_at_is_told(bumped: Path) -> None:
+    other = '[[object]]\nname = "other"\npoints = [[0, 0, 0], [90, 0, 0], [0, 70, 0], [0, 0, 50]]\n'
+    path = bumped.with_name("two.toml")
+    text = bumped.read_text().replace("[object]", "[[object]]").replace("[start]", "[object.start]")
+    path.write_text(text + other)
+    done = mixpose("calibrate", path, "--check")
+    assert "mixpose: of 2 bodies 'tracker' is looked at\n" in done.stderr
+
+
 def test_the_session_itself_is_not_overwritten(bumped: Path) -> None:
     done = command("calibrate", bumped, "-o", bumped)
     assert done.returncode == 2

@@ -229,6 +229,18 @@ def test_the_command_writes_a_table_that_the_same_session_reads(tmp_path: Path) 
     assert table.startswith("name,x,y,z,deviation_x,deviation_y,deviation_z,frames\n1,")
 
 
+def test_what_no_camera_saw_is_said_to_be_left_out(tmp_path: Path) -> None:
+    frames = detections([moving(4, 5)], CAMERAS, SHORT, 1)
+    path = write_recording(tmp_path, frames, CAMERAS)
+    (tmp_path / "points.csv").write_text("frame,x,y,z\n0,1,2,3\n", encoding="utf-8")
+    with path.open("a", encoding="utf-8") as session:
+        session.write('\n[[sensor]]\nname = "points"\nmodel = "cloud"\nsource = "points.csv"\n')
+    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "points: bodies are learnt from what cameras see, and not from this" in done.stderr
+
+
 def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
     path = write_recording(tmp_path, [[np.zeros((0, 2))] * 2], CAMERAS)
     (tmp_path / "body.csv").write_text("name,x,y,z\na,0,0,0\n", encoding="utf-8")

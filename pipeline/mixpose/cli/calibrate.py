@@ -82,6 +82,8 @@ def _calibrated(
         with watched() as progress:
             task = task_of(session, request, rules, progress)
             say(f"free: {words.words_of(task.rig.names, task.free, task.body_free)}")
+            if len(session.objects) > 1:
+                say(f"of {len(session.objects)} bodies {session.body.name!r} is looked at")
             saved = None
             if request.output is not None and not is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")

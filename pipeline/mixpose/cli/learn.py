@@ -30,6 +30,8 @@ def learn_session(request: LearnRequest) -> None:
     refuse_to_overwrite_but(request.output, inputs, MARK)
     older = None if request.like is None else _older(request.like, session)
     rules = LearningRules()
+    if others := [one.name for one in session.sensors if one.sensor.dimension != 2]:
+        warn(f"{', '.join(others)}: bodies are learnt from what cameras see, and not from this")
     with watched() as progress:
         lesson = learn(session, named_sources(request.source or ()), rules, progress)
     bodies = _in_frames(lesson, request, older)
