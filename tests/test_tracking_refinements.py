@@ -257,3 +257,29 @@ def test_others_are_asked_where_spots_that_are_off_can_carry_them(
         J, offsets = used.J / noise[..., None], used.offsets / noise
         met = J[used.shares > 0]
         assert _carry(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
+
+
+def test_a_fit_that_is_pulled_far_away_is_sought_again_from_where_it_was_expected() -> None:
+    # four of seven features, and spots beside the others: by all of these the body is turned by 7°
+    flat = np.array(
+        [[41, -23, -1], [-50, 61, 0], [79, 86, -2], [10, -76, 1], [-69, -69, -3], [-39, -63, -2]]
+    )
+    body = Body("flat", tuple(PointFeature(one) for one in [*flat, np.array([-5.0, -58.0, -2.0])]))
+    K = np.array([[900.0, 0, 319.5], [0, 900.0, 255.5], [0, 0, 1]])
+    T_sensor_world = from_parts(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), [0, 0, 953.5])
+    camera = PinholeCamera(K, np.zeros(5), (640, 512), T_sensor_world)
+    turn = Rotation.from_rotvec([-0.8114, 0.0073, 0.4555]).as_matrix()
+    T = from_parts(turn, [-99.6, 111.4, 150.6])
+    expected = perturb(T, np.array([-0.3, 3.0, 1.3, 0.003, 0.003, -0.001]))
+    tracker = Tracker.create(body, EstimatorOptions(), expected)
+    track = tracker.begin()
+    for k in range(6):
+        seen = detect([camera], body, expected, noise=0.06, seed=k)
+        track, _ = tracker.advance(track, k, k / 25, seen)
+    y = camera.project(transform(T, body.means))[0]
+    spots = np.array([[221.9, 76.8], [276.9, 197.6], [118.5, 353.4], [117.8, 295.3], [22.5, 218.9]])
+    views = [view_of("0", camera, np.concatenate([y[[0, 4, 5, 6]], spots]))]
+    _, found = tracker.advance(track, 6, 6 / 25, views)
+    assert found.T_world_object is not None
+    # where the fit ends by itself, it is 5.7° off, and was ok
+    assert rotation_angle_deg(found.T_world_object, T) < 0.1

@@ -105,8 +105,8 @@ _SETUPS = (
     Mutant(
         "session-bias-left-out",
         "session/sensor_setups.py",
-        "sensor = RangeSensor(table.position, table.range_bias)",
-        "sensor = RangeSensor(table.position)",
+        "sensor = sensors.RangeSensor(table.position, table.range_bias)",
+        "sensor = sensors.RangeSensor(table.position)",
         "the range bias of the file is ignored",
     ),
     Mutant(

@@ -121,8 +121,8 @@ _VALUES = (
     Mutant(
         "frames-time-of-the-latest-detection",
         "frames/tables.py",
-        "float(times.min())",
-        "float(times.max())",
+        "float(seconds.min())",
+        "float(seconds.max())",
         "the time of a frame is that of its last row",
     ),
     Mutant(

@@ -7,7 +7,7 @@ without a sensor, with merged features, where most detections agree.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import combinations
 from typing import TypeAlias
@@ -146,9 +146,23 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     r = used.offsets / noise[:, None, None]
     if judged.residual_ratio <= 1 and not _carry(J[used.shares > 0], J[off], r[off], rules.fit):
         return
-    is_met = (used.shares > 0) & (used.detections >= 0)
-    J, r = J[is_met], r[is_met]
-    few = -(-J.shape[2] // int(used.dimensions.min()))
+    yield from _modes(frame, likelihood, judged.T_world_object, used, variances)
+    # what pulls a fit together may have pulled it away from where the pose was expected
+    for one in frame.predictions[:1]:
+        T, seen = met_at(frame, Fit(one.T_world_object))
+        yield from _modes(frame, likelihood, T, seen, variances)
+
+
+def _modes(
+    frame: Frame, likelihood: Likelihood, T_world_object: Floats, seen: Matches, variances: Floats
+) -> Iterator[Start]:
+    """Modes of the likelihood by one step from a pose that meets this; noise of variances (L,)."""
+    errors, rules, noise = frame.rules.judgement.noise.errors, frame.rules, np.sqrt(variances)
+    is_met = (seen.shares > 0) & (seen.detections >= 0)
+    by = is_met.nonzero()[0]
+    J = seen.J[is_met][..., frame.free] / noise[by, None, None]
+    r = seen.offsets[is_met] / noise[by, None]
+    few = -(-J.shape[2] // int(seen.dimensions.min()))
     if (sets := _some_sets(len(r), few, rules.proposals.sets, frame.options.seed)) is None:
         return
     known = frame.predictions[0].uncertainty if frame.predictions else frame.start_uncertainty
@@ -157,12 +171,12 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     twists = np.linalg.solve(information, rows.swapaxes(1, 2) @ r[sets].reshape(*rows.shape[:2], 1))
     twists = np.concatenate([np.zeros((1, J.shape[2])), twists[..., 0]])
     moved = np.einsum("nmk,sk->snm", J, twists)  # in deviations of the noise
-    offsets = np.zeros((len(twists), *used.offsets.shape))
-    offsets[:, is_met] = (r - moved) * noise[is_met.nonzero()[0], None]
-    others = replace(used, offsets=offsets)
+    offsets = np.zeros((len(twists), *seen.offsets.shape))
+    offsets[:, is_met] = (r - moved) * noise[by, None]
+    others = replace(seen, offsets=offsets)
     likely = log_likelihood(errors.blur * noise, others, J.shape[2], errors)
     likely[_is_out_of_step(others, variances, errors).any(axis=1)] = -np.inf
-    poses = perturb(judged.T_world_object, twists @ np.eye(6)[frame.free])
+    poses = perturb(T_world_object, twists @ np.eye(6)[frame.free])
     least, modes = float(likely.max()) + rules.acceptance.log_doubt, [0]
     for k in np.argsort(-likely, kind="stable").tolist():
         if not likely[k] > least or len(modes) > rules.proposals.kept:
@@ -171,9 +185,9 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
         if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
             modes.append(k)
             start = Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
-            T, seen = met_at(frame, fit := likelihood.fit(start))
-            if not _is_out_of_step(seen, frame.variances, errors).any():
-                yield Start(T, matches=seen, noise=fit.noise if seen is fit.matches else None)
+            T, found = met_at(frame, fit := likelihood.fit(start))
+            if not _is_out_of_step(found, frame.variances, errors).any():
+                yield Start(T, matches=found, noise=fit.noise if found is fit.matches else None)
 
 
 def _is_out_of_step(seen: Matches, variances: Floats, errors: ErrorRules) -> Mask:
