@@ -10,7 +10,7 @@ import numpy as np
 from mixpose.calibration import result
 from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.contradicted import contradiction
+from mixpose.calibration.contradicted import Contradiction, contradiction
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.recorded import held_back_with
@@ -60,7 +60,7 @@ def calibrate(
             "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
-    return replace(run.found, residuals=run.residuals())
+    return replace(run.found, residuals=run.residuals(), contradicted=run.contradicted())
 
 
 def _from_cameras(
@@ -109,7 +109,7 @@ def _best(
 
 
 class _Run:
-    """One calibration from a start; what it `found` is without residuals."""
+    """One calibration from a start; what it `found` is without what only the best is asked."""
 
     def __init__(
         self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
@@ -185,6 +185,11 @@ class _Run:
             for s in sensors
         }
 
+    def contradicted(self) -> Contradiction | None:
+        """What of all that is held the recording contradicts most."""
+        sizes = {"length": self._length, "interval": self._interval}
+        return contradiction(self._bundle(self._part), self._best, **sizes)
+
     def _latecomers(self, part: Start, noise: Floats) -> dict[int, Floats]:
         """T_sensor_world of cameras that could not be linked by what they see alone."""
         linked = [s for s in self._task.cameras if s not in self._unlinked]
@@ -258,9 +263,6 @@ class _Run:
             residuals={},
             noise=adjusted.noise,
             inflation=adjusted.inflation,
-            contradicted=contradiction(
-                self._bundle(part), adjusted, length=self._length, interval=self._interval
-            ),
             certainty=adjusted.certainty,
             moved_by_biases=self._moved_by_biases(part, adjusted),
             explained=result.explained_share(adjusted, part.frames, task),

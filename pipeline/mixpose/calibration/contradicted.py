@@ -42,15 +42,16 @@ def contradiction(
     S, b = S * np.outer(scales, scales), b * scales
     known = np.linalg.pinv(S[:count, :count], rcond=1e-10, hermitian=True)
     deviations = np.sqrt(np.diag(found.covariance)) / scales[:count]
+    ratio = variance_ratio(state.rig, rules) * found.inflation
     best, told = 0.0, None
     for block in held:
         along = known @ S[:count, block.place]
         information = S[block.place, block.place] - S[block.place, :count] @ along
         values, vectors = np.linalg.eigh(information)
-        V = vectors[:, values > 1 / rules.undetermined**2]
-        inverse = V @ np.linalg.inv(V.T @ information @ V) @ V.T
+        kept = values > 1 / rules.undetermined**2
+        V = vectors[:, kept]
         score = b[block.place] - along.T @ b[:count]
-        step, ratio = inverse @ score, variance_ratio(state.rig, rules) * found.inflation
+        step = V @ ((V.T @ score) / values[kept])
         squared = float(score @ step) / ratio
         moved = np.abs(along @ step)[deviations > 0] / deviations[deviations > 0]
         moves = float(moved.max(initial=0.0))

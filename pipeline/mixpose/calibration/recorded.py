@@ -37,6 +37,12 @@ def rig_of(session: Session) -> Rig:
     return replace(rig, delays=np.array(late, dtype=np.float64), readouts=readouts)
 
 
+def require_times(frames: Sequence[SeenFrame], found: str) -> None:
+    """Refuse, by a SessionError that begins with what was found, frames that are out of time."""
+    if any(frame.time_s is None for frame in frames):
+        raise SessionError(f"{found}; allowed: fps or times for every sensor, or a video")
+
+
 def require_points(body: Body) -> None:
     """Refuse, by a SessionError, bodies whose detections are not points."""
     if not is_pointlike(body):

@@ -67,7 +67,6 @@ class Calibration:
     residuals: Mapping[int, Residual]
     noise: Floats  # (L,)
     inflation: float
-    contradicted: Contradiction | None  # what of that is held the recording contradicts most
     # share of the weight of pairs of which each is the nearest that the other has: near 1, or
     # detections cannot be told apart
     certainty: float
@@ -79,6 +78,7 @@ class Calibration:
     explained: Floats
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]  # (4, 4), by frame number
+    contradicted: Contradiction | None = None  # what is held, and the recording says otherwise
     T_new_old: Floats | None = None  # (4, 4): to the world of `after`, where it is another one
 
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:

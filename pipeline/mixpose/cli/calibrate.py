@@ -11,7 +11,7 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.calibration import Calibration, CalibrationRules, Task, calibrate, words
-from mixpose.calibration.recorded import read_frames, require_points, rig_of
+from mixpose.calibration.recorded import read_frames, require_points, require_times, rig_of
 from mixpose.calibration.searching import MARK as SAVED_MARK
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
@@ -116,11 +116,8 @@ def task_of(
     frames = read_frames(
         session, named_sources(request.source or ()), rules, progress, runs=runs, known=known
     )
-    if runs and any(frame.time_s is None for frame in frames):
-        raise SessionError(
-            f"{session.path}: --free delay: found frames without times; allowed: fps or times for "
-            "every sensor, or a video"
-        )
+    if runs:
+        require_times(frames, f"{session.path}: --free delay: found frames without times")
     if request.world is not None:
         words.check_world(rig, request.world, [frame.number for frame in frames])
     start = session.start

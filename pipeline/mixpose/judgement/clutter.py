@@ -34,8 +34,8 @@ class ClutterRates:
     def log_odds(self, used: Matches, log_new: float) -> float:
         """By how much likelier the number of detections is with the body than of clutter alone.
 
-        Beside clutter of the rate that the frame itself shows; `log_new` of frames show what is
-        new.
+        Beyond what clutter of the rate that the frame itself shows makes of it, which counts where
+        something is new: `log_new` is the log of how often that is.
         """
         with_body, alone = 0.0, 0.0
         images = used.images[used.owner]  # a cloud has three, which show the same

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mixpose.calibration import CalibrationRules, SeenFrame
-from mixpose.calibration.recorded import read_frames, rig_of
+from mixpose.calibration.recorded import read_frames, require_times, rig_of
 from mixpose.calibration.task import Progress, silent
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning.adjusting import Eyes, Learnt, adjusted
@@ -63,11 +63,9 @@ def learn(
     )
     runs = eyes.rig.is_late
     frames = read_frames(session, sources or {}, read, progress, runs=runs, known=None)
-    if runs and any(frame.time_s is None for frame in frames):
-        raise SessionError(
-            f"{session.path}: learn: found delay or readout, and frames without times; allowed: "
-            "fps or times for every sensor, or a video"
-        )
+    if runs:
+        found = f"{session.path}: learn: found delay or readout, and frames without times"
+        require_times(frames, found)
     return learn_from(frames, eyes, rules, progress, name=str(session.path))
 
 

@@ -98,17 +98,17 @@ def _in_place_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[tuple[
 
     One camera sees a body that is larger by some factor, and as much farther away, as the same.
     """
-    met, sizes = met_features(best), [(1.0, np.zeros(3))]
-    centre, factor = _centre_of_one(data, best), data.body.radius / other.body.radius
-    if centre is not None and abs(factor - 1) > 1e-9:
-        sizes.append((factor, centre))
-    for factor, centre in sizes:
-        body = other.body if factor == 1 else of_size(other.body, factor)
+    met, sizes, centre = met_features(best), [1.0], np.zeros(3)
+    factor = data.body.radius / other.body.radius
+    if abs(factor - 1) > 1e-9 and (of_one := _centre_of_one(data, best)) is not None:
+        sizes, centre = [1.0, factor], of_one
+    for size in sizes:
+        body = other.body if size == 1 else of_size(other.body, size)
         tolerance = tolerance_of(data.body, body, other.rules.look_alikes.alike)
         for part in like_features(data.body, met, body, tolerance):
             if len(part.features) == len(met):
                 T_other = best.T_world_object @ part.T_body_other
-                T_other[:3, 3] = centre + (T_other[:3, 3] - centre) / factor
+                T_other[:3, 3] += (1 / size - 1) * (T_other[:3, 3] - centre)
                 yield part, T_other
 
 
@@ -119,7 +119,7 @@ def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
         return None
     (view,) = (view for view in data.views if view.name == meets[0])
     points = view.observation.points
-    rays = None if points is None else view.sensor.rays(points)
+    rays = None if points is None else view.sensor.rays(points[:1])
     return rays.origins[0] if rays and rays.central and len(rays) else None
 
 

@@ -133,19 +133,19 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     agrees elsewhere.  Modes of the likelihood are sought by one step of least squares from each of
     many sets.
     """
-    errors, rules, used = frame.rules.judgement.noise.errors, frame.rules, judged.used
+    errors, used = frame.rules.judgement.noise.errors, judged.used
     # what is off is told by the noise of frames before
     if judged.proposer != predicted.__name__ or judged.left_out or not frame.track.believed:
         return
     variances = np.minimum(frame.variances, judged.variances)  # this frame's has what is off
-    off = errors.are_off(used, variances[:, None]) & (used.detections >= 0)
-    if judged.residual_ratio <= 1 and not np.count_nonzero(off):
-        return
-    noise = np.sqrt(variances)
-    J = used.J[..., frame.free] / noise[:, None, None, None]
-    r = used.offsets / noise[:, None, None]
-    if judged.residual_ratio <= 1 and not _carry(J[used.shares > 0], J[off], r[off], rules.fit):
-        return
+    if judged.residual_ratio <= 1:
+        off = errors.are_off(used, variances[:, None]) & (used.detections >= 0)
+        if not np.count_nonzero(off):
+            return
+        noise = np.sqrt(variances)[:, None, None]
+        J, r = used.J[..., frame.free] / noise[..., None], used.offsets / noise
+        if not _carry(J[used.shares > 0], J[off], r[off], frame.rules.fit):
+            return
     yield from _modes(frame, likelihood, judged.T_world_object, used, variances)
     # what pulls a fit together may have pulled it away from where the pose was expected
     for one in frame.predictions[:1]:
