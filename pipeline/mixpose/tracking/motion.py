@@ -197,13 +197,16 @@ class Course:
     def ahead(self, elapsed: float) -> tuple[Floats, Floats]:
         """The twist (6,) to where the body goes in some seconds, and by what variance it may err.
 
-        That is what is added to the variance of the last pose.
+        That is what is added to the variance of the last pose. All filters have a say: which of
+        them is right, a few frames do not tell surely.
         """
-        likeliest = self.log_likelihoods.argmax(axis=0).repeat(3), np.arange(6)
-        means, covariances = (each[likeliest] for each in self._foretold(elapsed))
-        now, before = self.means[likeliest], self.covariances[likeliest]
-        grown = covariances[:, 0, 0] - before[:, 0, 0]
-        return means[:, 0] - now[:, 0], np.maximum(grown, 0.0)
+        means, covariances = self._foretold(elapsed)
+        weights = np.exp(self.log_likelihoods)
+        weights = (weights / weights.sum(axis=0)).repeat(3, axis=1)
+        twists = means[..., 0] - self.means[..., 0]
+        twist = (weights * twists).sum(axis=0)
+        grown = covariances[..., 0, 0] - self.covariances[..., 0, 0] + (twists - twist) ** 2
+        return twist, np.maximum((weights * grown).sum(axis=0), 0.0)
 
     def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> Course:
         """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""
