@@ -72,6 +72,8 @@ def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
         ("lsl://", "found no name; allowed: lsl://tracker"),
         ("ros2://my body", "topic: found my body; allowed: words of letters"),
         ("ros2://tool?bridge=there", "bridge: found there; allowed: host:port"),
+        ("mqtt://there/rig/+", "topic: found + or #, which name many; allowed: a topic without"),
+        ("mqtt://there/rig/#", "topic: found + or #"),
     ],
 )
 def test_address_that_nothing_can_be_sent_to_is_refused_before_the_run(
@@ -357,11 +359,12 @@ def test_stamp_of_a_pose_ahead_is_of_the_moment_that_it_is_for() -> None:
 
 
 def test_several_bodies_have_topics_of_their_own() -> None:
-    header = replace(HEADER, objects={"left hand": 1, "cup": 2})
+    header = replace(HEADER, objects={"left hand": 1, "cup": 2, "\u5de6": 1, "\u53f3": 1})
     found = topics(parse("ros2://rig/poses", SENDERS), header)
-    assert list(found.poses.values()) == [
-        *("/rig/poses/left_hand", "/rig/poses/cup_0", "/rig/poses/cup_1"),
-    ]
+    # of names that no topic can have no two become one
+    words = ["left_hand", "cup_0", "cup_1", "_", "__2"]
+    assert list(found.poses.values()) == [f"/rig/poses/{word}" for word in words]
+    assert list(found.frames.values()) == words
     lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)
     assert ros_messages(Message(lost), found) == []
 

@@ -70,7 +70,7 @@ def parse(url: str, schemes: Collection[str]) -> Address:
     # a password is for the receiver, not for those who read what is said
     text = re.sub(r"//[^/]*@", "//", url)
     try:
-        parts = urlsplit(url)
+        parts = urlsplit(url, allow_fragments=False)
         port = parts.port
     except ValueError as error:
         raise SessionError(f"--publish {text}: is no address: {error}") from error

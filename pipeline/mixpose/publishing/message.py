@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 
+from mixpose.naming import distinct
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import header_line, pose_line
 from mixpose.publishing.address import Address
@@ -61,6 +62,11 @@ def path_word(label: str) -> str:
     """What a body is called in topics and paths, which allow few characters."""
     word = re.sub(r"\W", "_", label, flags=re.ASCII)
     return f"_{word}" if word[:1].isdigit() else word
+
+
+def path_words(labels: Sequence[str]) -> Mapping[str, str]:
+    """What bodies are called in topics and paths, by label; no two are alike."""
+    return dict(zip(labels, distinct(labels, path_word), strict=True))
 
 
 class TooLargeError(Exception):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, header_text, path_word
+from mixpose.publishing.message import Message, Sender, header_text, path_words
 from mixpose.publishing.sockets import force_down, keep_little
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ class MqttSender(Sender):
         self._address = address
         self._place = address.place("mqtt://127.0.0.1:1883/tracker", _PORT)
         self._topic = address.path or "mixpose"
+        if set("+#") & set(self._topic):
+            raise address.error("topic: found + or #, which name many; allowed: a topic without")
+        self._words = path_words(header.labels)
         self._header = header_text(header)
         self._client: Client | None = None
         self._is_sending = False
@@ -66,7 +69,7 @@ class MqttSender(Sender):
 
     def send(self, message: Message) -> bool:
         """Publish the line of one body, and wait until it is on its way."""
-        self._publish(path_word(message.estimate.label), message.text)
+        self._publish(self._words[message.estimate.label], message.text)
         return True
 
     def _publish(self, name: str, text: str, *, retain: bool = False) -> None:

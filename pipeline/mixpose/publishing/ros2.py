@@ -19,7 +19,7 @@ from mixpose.poses.header import Header
 from mixpose.poses.ros import pose_message
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, path_word
+from mixpose.publishing.message import Message, Sender, path_word, path_words
 from mixpose.publishing.sockets import connected, force_down
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Topics(NamedTuple):
     """Topics of the poses of a run, and the frame that they are in."""
 
     poses: Mapping[str, str]  # by label of a body
+    frames: Mapping[str, str]  # likewise, the frames of bodies in transforms
     unit: str
     frame_id: str
     transforms: str = "/tf"
@@ -65,10 +66,11 @@ def topics(address: Address, header: Header) -> Topics:
             "slashes between them, as in ros2://tracker"
         )
     base = f"/{address.name}"
-    poses = {label: f"{base}/{path_word(label)}" for label in header.labels}
+    words = path_words(header.labels)
+    poses = {label: f"{base}/{word}" for label, word in words.items()}
     if len(poses) == 1:
         poses = dict.fromkeys(poses, base)
-    return Topics(poses, header.unit, address.options.get("frame", "world"))
+    return Topics(poses, words, header.unit, address.options.get("frame", "world"))
 
 
 def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
@@ -86,7 +88,7 @@ def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
     pose = fields["pose"]["pose"]
     transform = {
         "header": fields["header"],
-        "child_frame_id": path_word(estimate.label),
+        "child_frame_id": to.frames[estimate.label],
         "transform": {"translation": pose["position"], "rotation": pose["orientation"]},
     }
     return [

@@ -12,7 +12,7 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, TooLargeError, header_text, path_word
+from mixpose.publishing.message import Message, Sender, TooLargeError, header_text, path_words
 from mixpose.records import Estimate
 
 HEADER_S = 1.0
@@ -139,14 +139,16 @@ class OscSender(Datagrams):
         address.allow()
         address.needs("pythonosc", "osc")
         super().__init__(address.place("osc://127.0.0.1:9000"))
-        self._prefix = f"/{address.path or 'mixpose'}"
+        prefix = f"/{address.path or 'mixpose'}"
+        words = path_words(header.labels)
+        self._paths = {label: f"{prefix}/{word}" for label, word in words.items()}
 
     def send(self, message: Message) -> bool:
         """Send the message of one body."""
         from pythonosc.osc_message_builder import OscMessageBuilder  # noqa: PLC0415 - an extra
 
         estimate = message.estimate
-        built = OscMessageBuilder(f"{self._prefix}/{path_word(estimate.label)}")
+        built = OscMessageBuilder(self._paths[estimate.label])
         frame = int(estimate.frame)
         built.add_arg(frame, "i" if -(2**31) <= frame < 2**31 else "h")
         time_s = estimate.time_s if message.unix_s is None else message.unix_s
