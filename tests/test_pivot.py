@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_line import command, mixpose
 from pose_lines import covariance_of, lines_of, measured, write_poses
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 import mixpose as package
@@ -76,9 +77,10 @@ def test_turns_that_err_by_three_degrees_bias_no_tip(reference: bool) -> None:
     squared = [e @ np.linalg.solve(tip.covariance, e) for e, tip in zip(errors, tips, strict=True)]
     # errors of turns that are coefficients of least squares make the tip 0.5 mm of 150 short
     assert np.abs(errors.mean(axis=0)).max() < 3 * (errors.std(axis=0) / np.sqrt(40)).max()
-    assert 0.8 < np.mean(squared) / 3 < 1.2  # 1 ± 0.1
-    # parts that err so much are not quite linear in what they err by
-    assert sum(tip.lasting > 1 for tip in tips) <= 4
+    # 1 ± 0.1, and less where parts that err so much, and are not quite linear in what they err by,
+    # are taken to disagree; seldom so that people are told of it
+    assert 0.65 < np.mean(squared) / 3 < 1.2
+    assert sum(tip.lasting > 4 for tip in tips) <= 4
     assert np.mean([tip.scale for tip in tips]) == pytest.approx(1, abs=0.05)
 
 
@@ -116,11 +118,27 @@ def test_a_point_that_moves_on_slowly_is_in_the_deviation_of_the_tip() -> None:
         poses = pivoting.poses.copy()
         poses[:, :2, 3] += np.linspace(-1, 1, len(poses))[:, None]  # 2 mm along x and y
         tip = find_tip(pivoting._replace(poses=poses))
-        assert tip.lasting > 1
+        assert tip.lasting > 4  # by which it is told
         error = tip.place - TIP
         squared.append(error @ np.linalg.solve(tip.covariance, error) / 3)
     # right is 1; by residuals alone, as if those of a hundred frames were independent, 19
     assert np.mean(squared) < 2.5
+
+
+@pytest.mark.parametrize("frames", [4, 15])
+def test_a_tip_that_wanders_in_its_dimple_is_within_its_deviation(frames: int) -> None:
+    inside, keeps = 0, np.exp(-1 / frames)
+    for seed in range(60):
+        pivoting, rng = run_of(seed), np.random.default_rng(seed)
+        steps = rng.standard_normal((len(pivoting.poses), 3)) * np.sqrt(1 - keeps**2)
+        steps[0] /= np.sqrt(1 - keeps**2)
+        wander, poses = lfilter([1.0], [1.0, -keeps], steps, axis=0), pivoting.poses.copy()
+        poses[:, :3, 3] += 0.2 * wander  # mm, as much as poses err by
+        tip = find_tip(pivoting._replace(poses=poses))
+        error = tip.place - TIP
+        inside += error @ np.linalg.solve(tip.covariance, error) < INSIDE_95
+    # 57 ± 1.7; where parts count as disagreeing by 0.1 % of chance alone, 47 and 51
+    assert 54 <= inside <= 59
 
 
 @pytest.mark.parametrize(("share", "left_out"), [(0.93, 0), (1.07, 1)])

@@ -19,7 +19,7 @@ from mixpose.session.rewriting import document_of, objects_of, plain, put, text_
 from mixpose.trajectories.pivot import Pivoting, PivotRules, Tip, find_tip, fixed_in, fixed_in_world
 
 _DIGITS = 8
-_SLIPPED = 2.0  # times the deviations: a tip that stays where it is gives 1 within a few percent
+_SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few percent, parts 1.7
 
 
 def pivot_poses(request: PivotRequest) -> None:
@@ -115,11 +115,11 @@ def _warn(tip: Tip) -> None:
             f"the tip is {np.sqrt(tip.scale):.2g} times as far off the point as poses err: it "
             "slipped, or the body bends; the deviations are as much larger"
         )
-    if tip.lasting > 1:
+    if tip.lasting > _SLIPPED**2:
         warn(
             f"parts of the recording tell tips {np.sqrt(tip.lasting):.2g} times as far apart as "
             "errors of single frames would: the point moved on, or sensors and body err alike for "
-            "long; the deviations are as much larger"
+            "long; the deviations allow for it"
         )
     values, vectors = np.linalg.eigh(tip.covariance)
     if values[-1] > PivotRules().uneven ** 2 * values[0]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 from mixpose import rigid
 from mixpose.constants import constant
@@ -37,7 +37,7 @@ class PivotRules:
     foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
     parts: int = constant(5, "of the recording that are held out in turn")
     accident: float = constant(
-        1e-3, "chance of parts that disagree as much: errors last, and more poses tell no more"
+        0.2, "chance of parts that disagree as much: errors last, and more poses tell no more"
     )
     uneven: float = constant(
         3.0, "ratio of deviations from which a direction is said to lack turns"
@@ -72,7 +72,7 @@ class Tip:
     # squared residuals by their covariances; what is above 1 is in the covariance of the tip
     scale: float
     # variance of the tip by parts of the recording that are held out, against that by residuals;
-    # above 1 where errors last, and then in the covariance, too
+    # above 1 where errors last, and then in the covariance, with what so few parts tell it to
     lasting: float
     frames: int  # poses that count
     left_out: int  # those that lie too far off
@@ -109,10 +109,10 @@ def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
     told = max(1.0, scale)
     _require_turns(pivoting, turns, directions, told, rules)
     covariance = told * _of_tip(information[kept])
-    held_out, lasting = _held_out(some, x[:3], information[kept], told, rules)
+    held_out, lasting, by_few = _held_out(some, x[:3], information[kept], told, rules)
     return Tip(
         place=x[:3],
-        covariance=covariance * lasting,
+        covariance=covariance * lasting * by_few,
         pivot=x[3:],
         residual=_rms(rest),
         expected=float(np.sqrt(np.trace(expected, axis1=1, axis2=2).mean())),
@@ -231,11 +231,12 @@ def _residuals(some: Pivoting, x: Floats) -> Floats:
 
 def _held_out(
     some: Pivoting, tip: Floats, information: Floats, scale: float, rules: PivotRules
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """RMS residual of parts of the recording, each by a tip that was found without it.
 
     And the squared distance of these tips from that of all, against what it would be if errors of
-    all frames were independent; 1 unless it is surely more.
+    all frames were independent, 1 unless chance is seldom as much; and by what an ellipsoid of 95 %
+    is larger where so few numbers tell its size (R. A. Fisher's F in place of χ²).
     """
     rest, squared = [], 0.0
     for part in np.array_split(np.arange(len(some.poses)), rules.parts):
@@ -248,8 +249,10 @@ def _held_out(
         differing = scale * (_of_tip(information[others]) - _of_tip(information))
         squared += float(away @ np.linalg.pinv(differing) @ away)
     freedom = 3 * (rules.parts - 1)  # all of them differ from their own mean
-    is_more = squared > chdtri(freedom, rules.accident)
-    return _rms(np.concatenate(rest)), squared / freedom if is_more else 1.0
+    held_out = _rms(np.concatenate(rest))
+    if squared <= chdtri(freedom, rules.accident):
+        return held_out, 1.0, 1.0
+    return held_out, squared / freedom, float(3 * fdtri(3, freedom, 0.95) / chdtri(3, 0.05))
 
 
 def _rms(rest: Floats) -> float:
