@@ -195,6 +195,19 @@ def test_the_track_tells_which_hypothesis_of_ambiguous_frames_is_right() -> None
         assert rigid.rotation_angle_deg(one.T_world_object, truth[k]) < 0.5  # the tilt is 23 deg
 
 
+@pytest.mark.parametrize("seed", [4, 11])
+def test_no_probability_of_many_paths_is_above_1(seed: int) -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    poses = measured(truth, covariance, seed)
+    lines = lines_of(poses, covariance)
+    tilt = rigid.from_rotation_vector([0.4, 0, 0], [1.0, 0, 0])
+    # sixteen paths whose shares make 1 but for rounding
+    rivals = [with_rival(line, T, T @ tilt) for line, T in zip(lines, poses, strict=True)]
+    smooth = smooth_body(rivals, rules=QUICK)
+    assert smooth.decided > 30
+    assert max(one.confidence for one in smooth.estimates) <= 1
+
+
 def test_a_frame_that_shows_something_else_stays_as_it_was() -> None:
     truth, covariance = swinging(40), covariance_of(0.1, 0.001)
     lines = lines_of(measured(truth, covariance), covariance)

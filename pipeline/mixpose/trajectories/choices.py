@@ -59,7 +59,8 @@ def choices(
                 probabilities[path[k]] += share
         which = paths[int(np.argmax(logs))][k]
         pose = None if which == _NONE else one.poses[which]
-        found.append(Choice(which, pose, probabilities))
+        # shares that make 1 may be more by rounding, which no reader takes
+        found.append(Choice(which, pose, np.minimum(probabilities, 1.0)))
     return found
 
 

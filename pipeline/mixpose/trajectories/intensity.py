@@ -37,7 +37,7 @@ class SmoothingRules:
         10.83, "twice the log likelihood, χ² of 99.9 %, by which a covariance is not all white"
     )
     tail: float = constant(
-        1.0,
+        3.0,
         "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
         "times what covariances say, 4 times with one intensity throughout",
     )
