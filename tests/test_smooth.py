@@ -172,6 +172,32 @@ def test_corners_of_a_path_are_not_overshot() -> None:
     assert np.mean(squared) < 1.6
 
 
+def reaching(frames: int, seed: int) -> Floats:
+    """A hand that reaches for a place within 1.2 s, rests there for 2.4 s, sways and shakes."""
+    rng = np.random.default_rng(seed)
+    places = np.cumsum(rng.uniform(-1, 1, (frames // 90 + 2, 6)), axis=0) * np.repeat([80, 0.4], 3)
+    k, way = np.divmod(np.arange(frames), 90)
+    s = np.minimum(way / 30, 1)[:, None]
+    at = places[k] + np.diff(places, axis=0)[k] * (10 * s**3 - 15 * s**4 + 6 * s**5)  # least jerk
+    for slowest_hz, fastest_hz, width in ((0.2, 0.6, 2.0), (2.0, 3.0, 0.2)):
+        turns = np.outer(0.04 * np.arange(frames), rng.uniform(slowest_hz, fastest_hz, 6))
+        at += np.repeat([width, width / 100], 3) * np.sin(2 * np.pi * (turns + rng.random(6)))
+    return rigid.from_rotation_vector(at[:, 3:], at[:, :3])
+
+
+def test_a_hand_that_rests_and_shakes_errs_by_what_covariances_say() -> None:
+    covariance, rules, squared = covariance_of(0.3, 0.003), replace(QUICK, frames=120), []
+    for seed in range(3):
+        truth = reaching(180, seed)
+        smooth = smooth_body(lines_of(measured(truth, covariance, seed), covariance), rules=rules)
+        for one, T in zip(smooth.estimates, truth, strict=True):
+            assert one.T_world_object is not None
+            error = rigid.twist_between(T, one.T_world_object)
+            squared.append(error @ np.linalg.solve(one.covariance, error) / 6)
+    # 1.3 where a body that shakes by less than poses err is believed to rest as still as it looks
+    assert 0.8 < np.mean(squared) < 1.2
+
+
 def with_rival(line: PoseLine, right: Floats, wrong: Floats, share: float = 0.4) -> PoseLine:
     """An ambiguous frame; the right hypothesis has a share of belief."""
     rivals = (Hypothesis(wrong, 1 - share), Hypothesis(right, share))
