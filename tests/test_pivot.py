@@ -109,6 +109,9 @@ def test_poses_that_are_wrong_are_left_out_and_a_tip_that_slips_is_told() -> Non
     slid[50:, 0, 3] += 5.0
     tip = find_tip(pivoting._replace(poses=slid))
     assert tip.scale > 4  # by which it is told; of tips that stay it is 1 ± 0.08
+    slid[:, :3, 3] += 300 * np.sin(np.arange(len(slid)))[:, None]
+    with pytest.raises(RecordingError, match=r"errors make 32, 17\d times what the poses say"):
+        find_tip(pivoting._replace(poses=slid))
 
 
 def test_a_point_that_moves_on_slowly_is_in_the_deviation_of_the_tip() -> None:

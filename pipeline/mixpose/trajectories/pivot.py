@@ -152,9 +152,9 @@ def _require_turns(
     least, found = np.degrees(rules.turned * noise), np.degrees(turns)
     if not swings[1]:
         raise RecordingError(
-            f"the body hardly turns: found {found[2]:.3g} deg RMS, of which errors of the poses "
-            f"make {np.degrees(noise[2]):.2g}; allowed: turns of 20 deg and more about two axes, "
-            "while the tip stays where it is"
+            f"the body hardly turns about one point: found {found[2]:.3g} deg RMS, of which errors "
+            f"make {np.degrees(noise[2]):.2g}, {np.sqrt(scale):.3g} times what the poses say; "
+            "allowed: turns of 20 deg and more about two axes, while the tip stays where it is"
         )
     axis = ", ".join(f"{value:.2f}" for value in directions[0])
     raise RecordingError(
