@@ -192,6 +192,7 @@ def test_a_hand_that_rests_and_shakes_errs_by_what_covariances_say() -> None:
         smooth = smooth_body(lines_of(measured(truth, covariance, seed), covariance), rules=rules)
         for one, T in zip(smooth.estimates, truth, strict=True):
             assert one.T_world_object is not None
+            assert one.covariance is not None
             error = rigid.twist_between(T, one.T_world_object)
             squared.append(error @ np.linalg.solve(one.covariance, error) / 6)
     # 1.3 where a body that shakes by less than poses err is believed to rest as still as it looks
@@ -231,7 +232,7 @@ def test_no_probability_of_many_paths_is_above_1(seed: int) -> None:
     rivals = [with_rival(line, T, T @ tilt) for line, T in zip(lines, poses, strict=True)]
     smooth = smooth_body(rivals, rules=QUICK)
     assert smooth.decided > 30
-    assert max(one.confidence for one in smooth.estimates) <= 1
+    assert all(one.confidence is not None and one.confidence <= 1 for one in smooth.estimates)
 
 
 def test_a_frame_that_shows_something_else_stays_as_it_was() -> None:
