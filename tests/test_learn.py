@@ -191,6 +191,13 @@ def test_a_body_that_never_moves_is_refused_with_what_is_missing() -> None:
         lesson_of([(points, np.repeat(poses[:1], SHORT.frames, axis=0))])
 
 
+def test_points_that_keep_no_distances_are_refused_though_there_are_enough() -> None:
+    rng = np.random.default_rng(3)
+    scene = Scene(frames=12, hidden=0.0, still=0, false=0)
+    with pytest.raises(RecordingError, match=r"3 points .*no three that keep their distances"):
+        lesson_of([(np.zeros((1, 3)), motion(scene, rng)) for _ in range(3)], scene)
+
+
 def test_a_body_that_is_only_shifted_is_learnt_and_turns_are_missed() -> None:
     points, poses = moving(5, 3)
     poses[:, :3, :3] = np.eye(3)

@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 from mixpose.calibration import SeenFrame
 from mixpose.learning import like
-from mixpose.learning.adjusting import Learnt
+from mixpose.learning.adjusting import Learnt, _spread
 from mixpose.learning.copies import is_chance
 from mixpose.learning.growing import Found, least_met
 from mixpose.learning.placing import Placement, Shape
-from mixpose.learning.points import _supported
+from mixpose.learning.points import Cloud, _supported
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
@@ -67,6 +68,17 @@ def test_turns_that_are_missing_are_named(along: float, across: float, missing: 
 def test_markers_that_move_on_the_body_are_told_with_the_key_to_write() -> None:
     told = doubts_of(learnt(turning(40.0, 20.0), spread=0.456), "body", "mm", RULES)
     assert told == ["body: its markers move on it by 0.46 mm: write sigma = 0.46 into its [object]"]
+
+
+def test_the_spread_of_markers_is_what_poses_leave_and_triangulation_does_not_explain() -> None:
+    shifts, turns = np.tile(np.eye(3), 5), np.cross(np.eye(3)[:, None], POINTS).reshape(3, 15)
+    left = null_space(np.vstack([shifts, turns]))  # nine of 15 coordinates
+    seen = POINTS + 0.5 * left.sum(axis=1).reshape(5, 3)
+    numbers = np.arange(5)
+    cloud = Cloud(seen, np.full(5, 0.4), numbers[:, None], numbers, SeenFrame(0, None, {}, {}))
+    places = ((0, Placement(np.eye(4), numbers, 0.5)),)
+    loose = Found(Shape(POINTS, np.full(5, 0.1)), places, loose=4.0)
+    assert _spread(loose, [cloud]) == pytest.approx(np.sqrt(0.5**2 - 5 * 0.4**2 / 9), rel=1e-9)
 
 
 @pytest.mark.parametrize(("corners", "ways"), [(3, "2 other ways"), (2, "1 other way:")])

@@ -71,6 +71,7 @@ def test_why_a_frame_is_not_ok_stands_in_its_line_and_is_read_again(tmp_path: Pa
 
 def test_json_lines_have_the_keys_of_the_contract_in_its_order() -> None:
     header, pose = map(json.loads, written("jsonl", GOOD).splitlines())
+    assert replace(HEADER, symmetries={"tracker": np.stack([np.eye(4), HALF_TURN])}) == HEADER
     assert list(header) == [
         *("type", "format", "version", "unit", "covariance", "session", "session_sha256"),
         *("mixpose", "seed", "symmetries"),

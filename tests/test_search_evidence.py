@@ -57,8 +57,13 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     never = (-1e9, np.ones(6))  # by volume: so that by count is cheaper
-    for hidden, false in ((0, 0), (2, 6)):
-        views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
+    in_one_place = pinhole_cameras[:1] * 2  # only the body's size says how far away features are
+    for cameras, hidden, false in (
+        (pinhole_cameras, 0, 0),
+        (pinhole_cameras, 2, 6),
+        (in_one_place, 0, 0),
+    ):
+        views = detect(cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
         poses = perturb(TRUTH, np.array([np.zeros(6), [0.3, -0.2, 0.2, 0.002, 0.0, -0.003]]))
         found, _ = evidence(problem(views), poses)
         objective = matched_objective(views, EIGHT, [1.5] * len(views))

@@ -73,6 +73,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "equivalent: of two arrays of one axis",
     ),
     Harmless(
+        "poses/consistency.py",
+        "kept = values > 1e-9",
+        "kept = values > 2e-09",
+        "between the rounding of a correlation, 1e-15, and any that is measured",
+    ),
+    Harmless(
         "poses/trajectories.py",
         "@dataclass(frozen=True, eq=False)",
         "@dataclass(frozen=False, eq=False)",

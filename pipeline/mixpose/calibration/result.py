@@ -92,23 +92,19 @@ def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floa
     Poses are fitted to the rig by least squares first, in a bundle without parameters of the rig,
     so that all rigs are held to the same.
     """
-    state = State(rig, adjusted.state.poses)
-
-    def seen() -> list[Weighted]:
-        found = []
-        for s, (before, weight) in enumerate(adjusted.weighted):
-            rows = rows_of(bundle, state, s, before.pairs)
-            found.append((rows, (weight > _MET) * rows.known / adjusted.noise[s] ** 2))
-        return found
-
-    rows, spent = seen(), np.inf
-    for _ in range(_CLIMBS if bundle.pose_free.any() else 0):
-        before, spent = spent, sum(float(w @ (e.residual**2).sum(axis=1)) for e, w in rows)
-        if before - spent < _CLIMBED * spent:
+    state, spent = State(rig, adjusted.state.poses), np.inf
+    for _ in range(_CLIMBS):
+        rows = list[Weighted]()
+        for s, (seen, weight) in enumerate(adjusted.weighted):
+            found = rows_of(bundle, state, s, seen.pairs)
+            rows.append((found, (weight > _MET) * found.known / adjusted.noise[s] ** 2))
+        squared = [(found.residual**2).sum(axis=1) for found, _ in rows]
+        weighed = zip(rows, squared, strict=True)
+        before, spent = spent, sum(float(weight @ each) for (_, weight), each in weighed)
+        if before - spent < _CLIMBED * spent or not bundle.pose_free.any():
             break
         state = stepped(bundle, state, solved(bundle, state, rows, 1e-6))
-        rows = seen()
-    return [np.where(w > 0, (e.residual**2).sum(axis=1), np.nan) for e, w in rows]
+    return [np.where(w > 0, each, np.nan) for (_, w), each in zip(rows, squared, strict=True)]
 
 
 def rms(squared: Sequence[Floats]) -> float:
