@@ -114,14 +114,17 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return package
 
 
-@pytest.mark.parametrize(("workers", "expected"), [(3, 3), (None, 5)])
+@pytest.mark.parametrize(
+    ("workers", "processors", "expected"), [(3, 5, 3), (None, 5, 5), (None, None, 1)]
+)
 def test_a_local_cluster_has_a_worker_of_one_thread_for_each_processor(
     workers: int | None,
+    processors: int | None,
     expected: int,
     distributed: MagicMock,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 5)
+    monkeypatch.setattr(os, "cpu_count", lambda: processors)
     with executing.executor(executing.LOCAL, workers):
         ((), options) = distributed.LocalCluster.call_args
     assert (options["n_workers"], options["threads_per_worker"]) == (expected, 1)

@@ -97,8 +97,10 @@ def test_no_axis_is_drawn_over_a_name_nor_over_its_own_letter() -> None:
             length, along = float(np.linalg.norm(end - start)), end - start
             # its letter stands beyond the end
             v, u = np.nonzero((picture == AXES[k][1]).all(axis=-1))
-            beyond = (np.stack([u, v], axis=1) - start) @ along / length - length
-            assert (beyond > 6).sum() > 20
+            away = np.stack([u, v], axis=1) - start
+            assert (away @ along / length - length > 6).sum() > 20
+            # nor is the axis drawn over the feature at the origin, nor over its ring
+            assert np.linalg.norm(away, axis=1).min() > 15
     assert min(names) > 0.9 * max(names) > 20
 
 

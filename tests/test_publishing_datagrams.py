@@ -69,12 +69,13 @@ def test_poses_go_on_without_a_header_that_is_too_large() -> None:
 def test_frame_numbers_beyond_32_bits_are_sent_in_64() -> None:
     pytest.importorskip("pythonosc")
     stamp = 1_403_636_579_763_555_584  # ns, the name of a file of images
-    estimates = [replace(ESTIMATE, frame=frame) for frame in (2**31 - 1, 2**31, stamp)]
+    frames = (-(2**31), -(2**31) - 1, 2**31 - 1, 2**31, stamp)
+    estimates = [replace(ESTIMATE, frame=frame) for frame in frames]
     arrived, (end,) = published("osc", HEADER, estimates)
-    assert end == "published to URL: 3 poses"
+    assert end == "published to URL: 5 poses"
     kinds = [data.partition(b",")[2][:3].decode() for data in arrived]
-    assert kinds == ["ids", "hds", "hds"]
-    assert struct.pack(">q", stamp) in arrived[2]
+    assert kinds == ["ids", "hds", "ids", "hds", "hds"]
+    assert struct.pack(">q", stamp) in arrived[4]
 
 
 def test_poses_go_on_after_one_that_cannot_be_put_in_a_message() -> None:

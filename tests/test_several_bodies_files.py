@@ -201,3 +201,18 @@ def test_bodies_that_change_places_are_counted(
     assert found.bodies["rod-0"].translation.max == pytest.approx(100.0)
     assert as_dict(found)["swaps"] == {"count": 2, "announced": announced}
     assert f"2 swaps, {announced} of them announced" in as_table(found)
+
+
+def test_wrong_poses_that_are_near_neither_body_are_no_swap(tmp_path: Path) -> None:
+    # together they are nearer to each other's bodies, by 870 to 930 mm, and neither clearly so
+    wrong = {(5, 0): 1000.0, (5, 1): 170.0}
+    usual = {None: 0.0, 0: 100.0, 1: 200.0}
+    poses = [
+        estimate(f, body, wrong.get((f, body[1]), usual[body[1]]))
+        for f in range(10)
+        for body in BODIES
+    ]
+    truth = file_of(tmp_path, "truth.jsonl", three_bodies(10))
+    found = evaluate(file_of(tmp_path, "poses.jsonl", poses), truth)
+    assert found.swaps is not None
+    assert found.swaps.count == 0

@@ -134,10 +134,9 @@ def _profile_peaks(pattern: GridPattern) -> Floats:
     if top <= 0:
         return np.zeros((0, 1))
     at, _ = find_peaks(values, height=_HIGHEST * top, prominence=_HIGHEST * top / 2)
-    inner = at[(at > 0) & (at < len(values) - 1)]
-    before, here, after = values[inner - 1], values[inner], values[inner + 1]
+    before, here, after = values[at - 1], values[at], values[at + 1]  # never at an end
     shift = 0.5 * (after - before) / np.maximum(2 * here - before - after, 1e-12)
-    places = pattern.origin[0] + pattern.step * (inner + np.clip(shift, -0.5, 0.5))
+    places = pattern.origin[0] + pattern.step * (at + np.clip(shift, -0.5, 0.5))
     return np.asarray(places[:, None])
 
 

@@ -83,7 +83,7 @@ def fitted_model(
         if name == motion:
             break
         # a derivative more takes e³ times less noise, about, in units of the poses'
-        x = x - [3.0, 3.0, 0.0]
+        x = x - 3.0
     likely, order, shared = best
     if not np.isfinite(likely):
         raise OverflowError("no motion has a likelihood")
