@@ -199,6 +199,18 @@ def test_frames_lost_in_the_middle_of_an_avi_are_told(tmp_path: Path) -> None:
     assert f"damaged or cut short; only frames 0-{len(frames) - 1}" in error
 
 
+def test_the_last_frame_of_an_avi_is_missed_though_it_alone_is_lost(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "clip.avi", "MJPG")
+    data = bytearray(path.read_bytes())
+    index = data.rfind(b"idx1")
+    last = data.rfind(b"00dc", 0, index)
+    data[last:index] = bytes(index - last)
+    path.write_bytes(data)
+    frames, error = read(path)
+    assert len(frames) == COUNT - 1
+    assert f"cut short; only frames 0-{COUNT - 2} of the {COUNT} that it promises" in error
+
+
 def test_file_that_is_no_video_is_told(tmp_path: Path) -> None:
     path = tmp_path / "clip.mov"
     path.write_text("not a video")

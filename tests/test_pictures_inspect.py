@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose.cli.inspect import summary
 from mixpose.frames import pair
+from mixpose.pictures import Part
 from mixpose.pictures.advice import describe
 from mixpose.pictures.finding import Finding, find
 from mixpose.pictures.signature import write_png
-from mixpose.pictures.stages import ABOVE, threshold_picture
+from mixpose.pictures.stages import ABOVE, _mark, threshold_picture
 from mixpose.records import Estimate, Status
 from mixpose.rigid import transform
 from mixpose.runner import begin, observe, open_sources
@@ -429,6 +430,12 @@ def test_a_small_spot_is_seen_between_the_arms_of_its_cross() -> None:
     assert areas.min() > 4 * 30  # px, of 40 in the image, at twice its size
     np.testing.assert_array_equal(seen, areas)  # though two are only 13 px apart
     assert (marked != bare).any(axis=-1).sum() > 7 * 4 * 4  # four arms, a few px long
+    # nor does an arm, 7 px long where most spots are far apart, reach one 8 px away
+    corners = np.array([[20, 20], [28, 20], [80, 20], [80, 80], [20, 80.0]])
+    picture = np.zeros((100, 100, 3), np.uint8)
+    _mark(picture, Part(), replace(found, points=corners, view=None))
+    assert picture[20, 24].any()
+    assert not picture[20, 27:30].any()
 
 
 def test_real_frames_have_every_marker_met(

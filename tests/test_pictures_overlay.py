@@ -33,6 +33,7 @@ from mixpose.pictures.overlay import (
 )
 from mixpose.pictures.scene import backdrop, draw_ranges, draw_scene
 from mixpose.pictures.signature import is_ours
+from mixpose.pictures.stages import fitted
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
 from mixpose.runner import run
@@ -128,6 +129,9 @@ def test_a_resized_part_of_the_frame_has_its_marks_where_the_features_went(
     # the middle of the pixel (10, 20), three times as large, is three pixels wide
     assert Part(3.0, (10.0, 20.0)).places(np.array([10.0, 20.0])).tolist() == [1.0, 1.0]
     assert Part(0.5).places(np.array([0.5, 0.5])).tolist() == [0.0, 0.0]
+    # 200 by 50 pixels fit into a square by their width, in the middle of its height
+    wide = fitted((np.array([10.0, 20.0]), np.array([209.0, 69.0])), (100, 100))
+    assert (wide.zoom, wide.corner) == (0.5, (10.0, -55.0))
 
 
 def test_projected_covariances_are_those_of_drawn_poses(

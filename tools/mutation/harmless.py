@@ -55,6 +55,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "errors that are equal to the last bit",
     ),
     Harmless(
+        "design/prediction.py",
+        "arms = prediction.poses[:, :3, :3] @ tip",
+        "arms = prediction.poses[:, :6, :3] @ tip",
+        "equivalent: of arms three numbers are read, and the fourth is zero",
+    ),
+    Harmless(
         "learning/points.py",
         "if likely > best:",
         "if likely >= best:",
@@ -71,6 +77,13 @@ HARMLESS: tuple[Harmless, ...] = (
         "places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)",
         "places = np.stack([ranges, np.zeros_like(ranges)], axis=+1)",
         "equivalent: of two arrays of one axis",
+    ),
+    Harmless(
+        "pictures/plots.py",
+        "scale = next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) "
+        "if n * share >= 0.15), 1000)",
+        "scale = next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share > 0.15), 1000)",
+        "an ellipse that fills exactly 0.15 of a map",
     ),
     Harmless(
         "poses/consistency.py",
@@ -109,6 +122,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "usual = np.median(steps[1:]) if len(steps) > 1 else 1.0",
         "usual = np.median(steps[1:]) if len(steps) > 1 else 2.0",
         "equivalent: the steps of a single frame are 0",
+    ),
+    Harmless(
+        "runner.py",
+        "LEAST_DELAY_S = 1e-6",
+        "LEAST_DELAY_S = 2e-06",
+        "between the rounding of times since 1970, 2.4e-7 s, and delays in which anything moves",
     ),
     Harmless(
         "search/from_points.py",
