@@ -174,6 +174,12 @@ def test_rate_must_be_positive(fps: float) -> None:
         clock_of(SourceSpec("left", "*.png", Path(), "camera", fps=fps))
 
 
+def test_a_rate_may_be_of_less_than_a_frame_per_second() -> None:
+    clock = clock_of(SourceSpec("left", "*.png", Path(), "camera", fps=0.1))
+    assert clock is not None
+    assert clock(3) == pytest.approx(30.0)
+
+
 def test_table_and_rate_together_are_told() -> None:
     with pytest.raises(SessionError, match="only one"):
         clock_of(SourceSpec("left", "*.png", Path(), "camera", times=Path("t.csv"), fps=5.0))
