@@ -211,9 +211,9 @@ def test_a_frame_of_clutter_is_left_out_by_number() -> None:
 def test_a_check_names_the_one_camera_of_three_that_was_bumped() -> None:
     sensors = cameras(3)
     frames = recording(sensors, 14, 0.05)
-    for index in (0, 2):
+    for index, turn_deg in ((0, 0.5), (2, 0.0)):
         found = calibrate(
-            bumped(task_of(sensors, frames), index, 0.5, 4.0), found=alone(sensors, frames)
+            bumped(task_of(sensors, frames), index, turn_deg, 4.0), found=alone(sensors, frames)
         )
         told = displacements(found, CalibrationRules())
         assert [one.name for one in told if one.moved] == [f"s{index}"]

@@ -119,10 +119,11 @@ def test_an_inverted_start_is_recognised(session: Session) -> None:
     assert any(warning.startswith("start.T_world_object looks inverted") for warning in warnings)
 
 
-def test_lengths_in_two_units_are_suspicious(session: Session) -> None:
+@pytest.mark.parametrize("times", [50.0, 1000.0])  # 50 times as far away it is 3.3 px wide
+def test_lengths_in_two_units_are_suspicious(times: float, session: Session) -> None:
     far = [T.copy() for T in camera_poses(session)]
     for T in far:
-        T[:3, 3] *= 1000.0
+        T[:3, 3] *= times
     warnings = placement_warnings(with_poses(session, *far))
     assert any("px wide: are points" in w and "all in mm?" in w for w in warnings)
 
