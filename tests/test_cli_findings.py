@@ -93,21 +93,27 @@ def test_a_flooded_image_is_told_as_such_though_nothing_of_it_is_used() -> None:
     assert flooded[0].startswith(f"sensor {setup.name!r} found up to 8374 features")
 
 
-def test_markers_that_are_never_met_are_told_in_one_line() -> None:
+@pytest.mark.parametrize(
+    ("since", "said"),
+    [(0, "met in none of 20 frames"), (5, "not met from frame 5 on, in 15 frames: gone?")],
+)
+def test_markers_that_are_not_met_any_more_are_told_in_one_line(since: int, said: str) -> None:
     session = load_session(SESSION)
     findings, features = Findings(session), np.arange(7)
-    is_met, nothing = np.isin(features, [0, 1, 5]), np.zeros((7, 2))
-    seen = Offsets(features, is_met, nothing, np.zeros((7, 2, 3)), nothing, np.zeros(7, np.bool_))
+    nothing, views = np.zeros((7, 2)), (np.zeros((7, 2, 3)), np.zeros((7, 2)))
     sensors = {name: SensorReport(True, 0.9, 0.1) for name in ("left", "right")}
     for frame in range(20):
         label, T = session.labels[0], np.eye(4)
+        is_met = np.isin(features, [0, 1, 5]) | (frame < since)
+        seen = Offsets(features, is_met, nothing, *views, np.zeros(7, np.bool_))
         measured = Estimate(
-            frame, None, label, "ok", T, np.eye(6), 1.0, sensors, measured=lambda: {"left": seen}
+            *(frame, None, label, "ok", T, np.eye(6), 1.0, sensors),
+            measured=lambda seen=seen: {"left": seen},  # type: ignore[misc]
         )
         findings.add(measured)
     names = [session.body.labels[i] for i in (2, 3, 4, 6)]
     (line,) = findings.causes()
-    assert line.startswith(f"markers {', '.join(names)} are each met in none of 20 frames")
+    assert line.startswith(f"markers {', '.join(names)} are each {said}")
 
 
 @pytest.mark.parametrize(

@@ -341,7 +341,10 @@ def test_what_cannot_be_simulated_is_said_before_anything_is_written(
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"frames": 0}, {"noise": -1.0}, {"hidden": 1.5}, {"clutter": float("nan")}, {"seed": -1}],
+    [
+        *({"frames": 0}, {"noise": -1.0}, {"hidden": 1.5}, {"clutter": float("nan")}, {"seed": -1}),
+        {"others": 1.5},
+    ],
 )
 def test_options_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(SessionError, match=f"simulate: {next(iter(wrong))}: found .*; allowed: "):

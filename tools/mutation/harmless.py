@@ -31,6 +31,12 @@ GUARDED = "zip(strict=True) only guards against lists that the code made of diff
 
 HARMLESS: tuple[Harmless, ...] = (
     Harmless(
+        "calibration/adjust.py",
+        "if (blur <= last / rules.narrowing).all():",
+        "if (blur < last / rules.narrowing).all():",
+        "blurs that are equal to the last bit",
+    ),
+    Harmless(
         "calibration/latecomers.py",
         "_MOST = 1_000_000  # detections of a frame",
         "_MOST = 1000001  # detections of a frame",
@@ -59,6 +65,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "arms = prediction.poses[:, :3, :3] @ tip",
         "arms = prediction.poses[:, :6, :3] @ tip",
         "equivalent: of arms three numbers are read, and the fourth is zero",
+    ),
+    Harmless(
+        "learning/bodies.py",
+        "triples = congruent_triples(points, other.points, rules.gate * np.sqrt(2.0) * typical)",
+        "triples = congruent_triples(points, other.points, rules.gate * np.sqrt(4.0) * typical)",
+        "only speed: more triples are tried, of which those count whose points are met",
     ),
     Harmless(
         "learning/points.py",
@@ -160,6 +172,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "detections = far_apart(rays.pixels, 3 * budget.sample // 2)",
         "detections = far_apart(rays.pixels, 4 * budget.sample // 2)",
         "only speed: more of the outermost detections are tried",
+    ),
+    Harmless(
+        "session/messages.py",
+        "_LONGEST = 60  # characters of a found value that are shown",
+        "_LONGEST = 61  # characters of a found value that are shown",
+        "any width that a line has room for will do",
     ),
     Harmless(
         "simulation/visible_spots.py",
