@@ -62,11 +62,14 @@ def test_two_cameras_at_one_place_are_suspicious(session: Session) -> None:
     assert "T_sensor_world" in warnings[0]
 
 
-def test_cameras_side_by_side_are_not(session: Session) -> None:
+def test_cameras_side_by_side_are_not_but_nearer_than_lenses_are(session: Session) -> None:
     T = camera_poses(session)[0]
-    beside = T.copy()
+    beside, too_near = T.copy(), T.copy()
     beside[0, 3] += 5.0
     assert placement_warnings(with_poses(session, T, beside)) == []
+    too_near[0, 3] += 2.0
+    (warning,) = placement_warnings(with_poses(session, T, too_near))
+    assert "stand 2 mm apart, less than two lenses need: are translations in mm?" in warning
 
 
 @pytest.mark.parametrize("with_start", [True, False])
