@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rounding import rounding
@@ -14,8 +16,12 @@ from mixpose.rigid import (
     transform,
     twist_between,
 )
+from mixpose.session import load_session
+from mixpose.simulation.central_pose import swinging
 from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.options import SimulationOptions
 
+TWO_CAMERAS = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
 CENTRE = from_rotation_vector([0.5, -1.0, 0.3], [100.0, 50.0, 800.0])
 PIVOT = np.array([20.0, 10.0, -5.0])
 TIMES = np.arange(0, 60, 0.04)
@@ -44,6 +50,14 @@ def test_the_pivot_moves_within_the_amplitude_and_makes_use_of_it(seed: int) -> 
     assert away.max() <= 30.0 + 1e-9
     assert (away.max(axis=0) > 20.0).all()
     assert np.linalg.norm(away, axis=1).max() <= motion(seed).reach
+
+
+def test_a_body_swings_by_four_tenths_of_its_radius_where_nothing_else_is_said() -> None:
+    session = load_session(TWO_CAMERAS)
+    away = np.abs(swinging(session, CENTRE, SimulationOptions(frames=1), 0).shift.at(TIMES))
+    shares = away.max(axis=0) / session.body.radius
+    assert (shares > 2 / 3 * 0.4).all()
+    assert (shares <= 0.4 + 1e-9).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
