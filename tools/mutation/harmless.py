@@ -43,6 +43,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "any number above that of the detections of a frame will do",
     ),
     Harmless(
+        "calibration/rig.py",
+        '_STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}',
+        '_STEPS = {"focal": 0.02, "principal_point": 1e-2, "distortion": 1e-5}',
+        "steps of derivatives, far from rounding and from where a lens is not linear",
+    ),
+    Harmless(
         "checking/evidence.py",
         "@dataclass(frozen=True)",
         "@dataclass(frozen=False)",
@@ -184,6 +190,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)",
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) >= 0)",
         "a face is exactly edge-on only by rounding",
+    ),
+    Harmless(
+        "tracking/in_motion.py",
+        "is_asked = frame.frame % frame.rules.timing.asked == 0 or frame.is_timed",
+        "is_asked = frame.frame % frame.rules.timing.asked == 1 or frame.is_timed",
+        "one of so many frames is asked, whichever it is",
     ),
     Harmless(
         "tracking/proposers.py",
