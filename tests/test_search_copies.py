@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from bodies_in_view import CAMERAS, at, body
 from detections import ALL_FREE
 from numpy.typing import NDArray
@@ -13,7 +14,9 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.search import search_copies
+from mixpose.search.copies import _Candidates, _shared_out
 from mixpose.search.from_points import feature_triangles
+from mixpose.search.problem import SearchBudget
 
 Floats = NDArray[np.float64]
 
@@ -65,6 +68,28 @@ def test_another_point_that_may_be_a_marker_makes_a_rival() -> None:
     pair = body("pair", np.concatenate([TRIANGLE.means, [[21.4, -37.5, 0.0]]]))
     found = search_copies(seen([pair], PLACES[:1], 1), [TRIANGLE], ALL_FREE)
     assert found[0].rival is not None
+
+
+@pytest.mark.parametrize(
+    ("kind", "less", "is_rival"), [(0, 1.0, True), (1, 1.0, False), (0, 1e3, False)]
+)
+def test_a_rival_is_a_pose_of_the_same_body_that_is_not_outdone(
+    kind: int, less: float, is_rival: bool
+) -> None:
+    # both meet the same three detections
+    found = [[(PLACES[0], 50.0)], []]
+    found[kind].append((PLACES[1], 50.0 - less))
+    rivals = [
+        _Candidates(
+            np.array([T for T, _ in some]).reshape(-1, 4, 4),
+            np.array([evidence for _, evidence in some]),
+            np.zeros(len(some)),
+            np.tile(np.arange(3), (len(some), 1)),
+        )
+        for some in found
+    ]
+    (copy,) = _shared_out(rivals, [TRIANGLE, HEAD], SearchBudget())
+    assert (copy.rival is not None) == is_rival
 
 
 def test_one_camera_sees_no_points_in_space() -> None:
