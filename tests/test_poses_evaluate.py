@@ -345,7 +345,7 @@ def test_the_report_holds_the_figures_as_json_and_as_an_aligned_table() -> None:
     assert table[0] == "2 frames: 1 ok, 1 ambiguous, 0 lost, 0 missing"
     header = next(text for text in table if text.startswith("error"))
     rotation = next(text for text in table if text.startswith("rotation"))
-    assert len(header) == len(rotation)
+    assert len(header) == len(rotation) < 80  # as wide as a terminal is
     assert rotation.split()[-1] == "1"  # the worst frame
     said = next(text for text in table if text.startswith("rotation and position count"))
     assert "the ambiguous frame, too" in said
