@@ -11,7 +11,7 @@ from scipy.linalg import null_space
 from mixpose.calibration import SeenFrame
 from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt, _spread
-from mixpose.learning.copies import is_chance
+from mixpose.learning.copies import _never_with, is_chance
 from mixpose.learning.growing import Found, least_met
 from mixpose.learning.placing import Placement, Shape
 from mixpose.learning.points import Cloud, _supported
@@ -140,6 +140,16 @@ def test_four_points_that_no_other_size_has_are_a_body_from_twice_the_least_fram
     places = [(k, one) for k in range(2 * rules.least_frames + more)]
     body = Found(Shape(points, np.full(4, 0.1)), tuple(places))
     assert is_chance(body, [], rules) == expected
+
+
+def test_of_points_that_are_hardly_ever_seen_together_the_one_seen_less_goes() -> None:
+    shape, places = Shape(POINTS[:4], np.full(4, 0.1)), []
+    for k in range(100):  # one of two points each, by accident once both
+        seen = np.array([True, True, k % 2 == 0, k == 0 or (k % 2 == 1 and k > 3)])
+        places.append((k, Placement(np.eye(4), np.where(seen, np.arange(4), -1), 0.5)))
+    strange = np.array([False, False, True, True])
+    assert _never_with(shape, places, strange).tolist() == [False, False, False, True]
+    assert not _never_with(shape, places[:1], strange).any()
 
 
 def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:

@@ -104,6 +104,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "an ellipse that fills exactly 0.15 of a map",
     ),
     Harmless(
+        "pictures/scene.py",
+        "if np.isfinite(low) and np.isfinite(high) and high > low:",
+        "if np.isfinite(low) and np.isfinite(high) and high >= low:",
+        "a sensor that measures one range",
+    ),
+    Harmless(
         "poses/consistency.py",
         "kept = values > 1e-9",
         "kept = values > 2e-09",
@@ -134,6 +140,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "_DEPTH = 10  # of the queues of publishers, as in ROS's examples",
         "_DEPTH = 11  # of the queues of publishers, as in ROS's examples",
         "only how many messages wait, as in examples of ROS",
+    ),
+    Harmless(
+        "report/page.py",
+        'return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"',
+        'return f"{value:.0f}" if 1000 <= abs(value) <= 1e6 else f"{value:.3g}"',
+        "a number that is exactly a million, written either way",
     ),
     Harmless(
         "report/series.py",
@@ -190,6 +202,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)",
         "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) >= 0)",
         "a face is exactly edge-on only by rounding",
+    ),
+    Harmless(
+        "tracking/doubt.py",
+        "if best.residual_ratio > rules.changed:",
+        "if best.residual_ratio >= rules.changed:",
+        "a ratio that is equal to the last bit",
     ),
     Harmless(
         "tracking/in_motion.py",
