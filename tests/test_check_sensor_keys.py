@@ -137,6 +137,16 @@ def test_keys_that_may_be_changed_are_said_to_stand_where_they_do(session: Sessi
     assert told == f"{change}, threshold in its own [sensor.extract]"
 
 
+def test_a_key_with_which_a_tenth_of_the_features_is_missed_is_not_advised(
+    session: Session, tmp_path: Path
+) -> None:
+    image = left_image(copied(tmp_path / "recording"))
+    left = session.sensors[0]
+    blind = replace(left, extract=replace(left.extract, threshold=250.0))
+    assert advice(session, blind, 0, image, 7).endswith("it would be 7")
+    assert advice(session, blind, 0, image, 8).startswith("change polarity, threshold")
+
+
 @pytest.mark.parametrize(
     ("right", "where"),
     [
