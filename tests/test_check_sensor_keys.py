@@ -12,9 +12,10 @@ from inspected import copied, left_image, write_left
 
 from mixpose import runner
 from mixpose.checking import key_warnings
-from mixpose.checking.keys import advice
+from mixpose.checking.keys import _trials, advice
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
+from mixpose.extraction import ExtractOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
 
@@ -135,6 +136,12 @@ def test_keys_that_may_be_changed_are_said_to_stand_where_they_do(session: Sessi
     assert advice(session, left, 0, dark, 7) == change
     told = advice(session, own, 0, dark, 7)
     assert told == f"{change}, threshold in its own [sensor.extract]"
+
+
+@pytest.mark.parametrize("method", ["blobs", "corners", "log"])
+def test_widths_of_spots_are_tried_with_the_method_that_has_one(method: str) -> None:
+    tried = {key for key, _ in _trials(ExtractOptions(method), np.zeros((8, 8), np.uint8))}
+    assert ("spot_sigma" in tried) == (method == "log")
 
 
 def test_a_key_with_which_a_tenth_of_the_features_is_missed_is_not_advised(
