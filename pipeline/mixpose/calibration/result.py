@@ -236,7 +236,7 @@ def _deviations(found: Calibration) -> list[tuple[float, float]]:
     for block in found.blocks:
         if block.kind in ("pose", "position") and block.sensor is not None:
             part = found.deviations[block.place]
-            turn = float(np.degrees(np.sqrt((part[3:] ** 2).sum()))) if len(part) > 3 else 0.0
+            turn = float(np.degrees(np.sqrt((part[3:] ** 2).sum())))  # none of a range sensor
             own[block.sensor] = (turn, float(np.sqrt((part[:3] ** 2).sum())))
     known = [(np.inf, np.inf), *own.values()]
     least = min(turn for turn, _ in known), min(shift for _, shift in known)
