@@ -69,6 +69,13 @@ def test_a_flood_of_features_of_which_none_is_used_is_too_many_and_not_too_few(
         assert "not met" not in text
 
 
+def test_without_a_pose_features_are_counted(recording: Path) -> None:
+    session = with_options(recording, 'method = "log"\npolarity = "dark"')
+    text = advice_for(session, FRAME, None)
+    assert "left: 0 features found; without a pose up to 7 are expected" in text
+    assert "fewer than the object has" in text
+
+
 def as_floats(recording: Path, image: NDArray[np.float64]) -> None:
     """Grey values of the left image, in parts of 255."""
     (recording / f"left{FRAME:04d}.png").unlink()

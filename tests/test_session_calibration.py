@@ -14,6 +14,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, load_session
+from mixpose.session.calibration.pieces import size_of
 
 K = np.array([[810.5, 0, 640.25], [0, 805.0, 512.5], [0, 0, 1]])
 D5 = np.array([-0.1, 0.02, 1e-05, -2e-4, 0.3])
@@ -358,3 +359,7 @@ def test_arrays_saved_by_numpy_are_told_where_to_go(tmp_path: Path) -> None:
     assert "c.npz: a NumPy or pickle file; write camera matrix and distortion with" in message
     (tmp_path / "c.p").write_bytes(pickle.dumps({"mtx": [[1.0]]}))
     assert "c.p: a NumPy or pickle file" in message_of(tmp_path, 'calibration = "c.p"')
+
+
+def test_sizes_that_are_missing_or_zero_are_not_known() -> None:
+    assert [size_of(size) for size in (None, [0, 0], [640, 480])] == [None, None, (640, 480)]
