@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
@@ -178,7 +179,9 @@ def test_a_sensor_without_frames_is_reported_as_unused_in_the_sessions_order(
 ) -> None:
     path = tmp_path / "left.csv"
     path.write_text("frame,u,v\n99,0,0\n", encoding="ascii")
-    found = mixpose.run(session, sources={"left": str(path)}, selection=Selection(0, 2))
+    began = time.perf_counter()
+    found = list(mixpose.run(session, sources={"left": str(path)}, selection=Selection(0, 2)))
+    assert 0.0 < sum(one.latency_ms or 0.0 for one in found) < 1e3 * (time.perf_counter() - began)
     for estimate in found:
         assert list(estimate.sensors) == ["left", "right"]
         assert [report.used for report in estimate.sensors.values()] == [False, True]
