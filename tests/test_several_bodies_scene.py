@@ -154,6 +154,8 @@ def test_identical_bodies_lost_together_come_back_in_doubt_for_one_frame() -> No
     places = sorted(rival.T_world_object[0, 3] for rival in told.hypotheses)
     assert places == pytest.approx([-90, 90], abs=2)
     assert sum(rival.weight for rival in told.hypotheses) <= 1.0 + 1e-9
+    assert told.T_world_object is not None
+    np.testing.assert_array_equal(told.hypotheses[0].T_world_object, told.T_world_object)
 
 
 @pytest.mark.parametrize("count", [3, 4])
