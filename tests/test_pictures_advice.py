@@ -76,6 +76,19 @@ def test_without_a_pose_features_are_counted(recording: Path) -> None:
     assert "fewer than the object has" in text
 
 
+def test_where_much_of_an_image_counts_as_feature_a_stricter_threshold_is_advised(
+    recording: Path,
+) -> None:
+    image = left_image(recording)
+    for u, v in np.ndindex(
+        14, 10
+    ):  # 140 disks of some 80 of its 330 000 pixels, where 2 % are much
+        cv2.circle(image, (40 + 40 * u, 40 + 45 * v), 5, 200, -1)
+    write_left(recording, image)
+    text = advice_for(with_options(recording, 'method = "blobs"\nthreshold = 100'), FRAME, None)
+    assert "too much of the image counts as feature: raise threshold = 100, raise min_area" in text
+
+
 def as_floats(recording: Path, image: NDArray[np.float64]) -> None:
     """Grey values of the left image, in parts of 255."""
     (recording / f"left{FRAME:04d}.png").unlink()
