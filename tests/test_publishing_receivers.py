@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from command_line import lines_of, started, wait_until
 from mixpose.poses.header import Header
 from mixpose.publishing import Publishing
 from mixpose.publishing.channel import PublishingRules
+from mixpose.publishing.ws import _Client
 from mixpose.records import Estimate, FrameSet, Moment, RawFrame, SensorReport
 
 CLIP = Path(__file__).parents[1] / "data" / "synthetic" / "one_camera_video" / "camera.avi"
@@ -242,3 +245,14 @@ def test_receivers_that_never_read_cost_a_run_next_to_nothing(
         assert "poses" in line
         assert int(line.split(" dropped")[0].split()[-1]) > 500, line
     assert len(said) == 4
+
+
+@pytest.mark.parametrize(("since_s", "is_stuck"), [(None, False), (0.0, False), (1.0, True)])
+def test_a_browser_is_stuck_from_a_quarter_of_a_second_in_one_send(
+    since_s: float | None, is_stuck: bool
+) -> None:
+    async def told() -> bool:
+        now = asyncio.get_running_loop().time()
+        return _Client(MagicMock(), began=None if since_s is None else now - since_s).is_stuck()
+
+    assert asyncio.run(told()) == is_stuck

@@ -55,6 +55,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "only guards against assignments, which mypy finds too",
     ),
     Harmless(
+        "checking/geometry.py",
+        'if estimate.status == "ok" or (estimate.status == "ambiguous" and weights > _LIKELY):',
+        'if estimate.status == "ok" or (estimate.status == "ambiguous" and weights >= _LIKELY):',
+        "weights that are equal to the last bit",
+    ),
+    Harmless(
         "checking/placement.py",
         "_TRIED = 64",
         "_TRIED = 128",
@@ -71,6 +77,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "arms = prediction.poses[:, :3, :3] @ tip",
         "arms = prediction.poses[:, :6, :3] @ tip",
         "equivalent: of arms three numbers are read, and the fourth is zero",
+    ),
+    Harmless(
+        "frames/live.py",
+        "_AGAIN_S = 0.5  # between two attempts to open it",
+        "_AGAIN_S = 1.0  # between two attempts to open it",
+        "only how soon a source that is not there yet is found",
     ),
     Harmless(
         "learning/bodies.py",
@@ -178,6 +190,12 @@ HARMLESS: tuple[Harmless, ...] = (
         "if self._are_enough(poses[:3], best):",
         "if self._are_enough(poses[:4], best):",
         "only speed: a fourth guess is refined at once",
+    ),
+    Harmless(
+        "search/search.py",
+        "if self._are_enough(poses[:3], best):",
+        "if self._are_enough(poses[:6], best):",
+        "only speed: three more guesses are refined at once",
     ),
     Harmless(
         "search/search.py",
