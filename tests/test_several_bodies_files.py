@@ -205,7 +205,7 @@ def test_bodies_that_change_places_are_counted(
 
 def test_wrong_poses_that_are_near_neither_body_are_no_swap(tmp_path: Path) -> None:
     # together they are nearer to each other's bodies, by 870 to 930 mm, and neither clearly so
-    wrong = {(5, 0): 1000.0, (5, 1): 170.0}
+    wrong: dict[tuple[int, int | None], float] = {(5, 0): 1000.0, (5, 1): 170.0}
     usual = {None: 0.0, 0: 100.0, 1: 200.0}
     poses = [
         estimate(f, body, wrong.get((f, body[1]), usual[body[1]]))
