@@ -239,10 +239,4 @@ HARMLESS: tuple[Harmless, ...] = (
         "(few,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
         "only speed: more poses are looked up, as counts are at least 1",
     ),
-    Harmless(
-        "tracking/in_motion.py",
-        "kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()",
-        "kept = (seen[..., None] | (np.arange(2) < matches.dimensions[:, None, None])).nonzero()",
-        "only speed: more rows, which weigh nothing",
-    ),
 )
