@@ -20,7 +20,6 @@ from mixpose.judgement.evidence import (
     DetectionModel as DetectionModel,
     Prior as Prior,
     flat_prior as flat_prior,
-    gained_by as gained_by,
     odds_of as odds_of,
     paid_by_count as paid_by_count,
 )
@@ -46,6 +45,7 @@ from mixpose.judgement.mistakes import (
     odds_of_each as odds_of_each,
     possible_mistakes as possible_mistakes,
 )
+from mixpose.judgement.shape import Shape as Shape, shape_shown as shape_shown
 from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,
     RememberedNoise as RememberedNoise,

@@ -16,6 +16,7 @@ from mixpose.constants import constant
 from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel
+from mixpose.judgement.shape import Shape
 from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import twist_between
@@ -75,6 +76,7 @@ class Verdict:
     second: Second | None = None  # None where nobody asked
     # log odds of mistakes in the session, by name; None where it was not asked for them
     mistaken: Mapping[str, float] | None = None
+    shape: Shape | None = None  # what frames told of it, while none was ok
 
     @cached_property
     def confidence(self) -> float:

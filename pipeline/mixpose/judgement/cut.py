@@ -17,13 +17,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri, fdtrc, fdtri
 
 from mixpose.judgement.information import inverted
 from mixpose.matching import ErrorRules, Matches
 from mixpose.records import Floats
 
-LARGER: list[float] = np.geomspace(1.0, 30.0, 40).tolist()  # a step is 9 % of a variance
+LARGER: list[float] = np.geomspace(1.0, 40.0, 42).tolist()  # a step is 9 % of a variance
 
 
 def with_cut_spots(
@@ -35,6 +35,7 @@ def with_cut_spots(
     variances: Floats,  # (L, N) of detections, σ_ε²
     errors: ErrorRules,
     outside: float,  # share of truths outside the ellipsoid of that share
+    degrees: float,  # of freedom that the noise is known to
 ) -> tuple[Floats, float]:
     """What a covariance (k, k) is larger by as one detection may be cut, and a factor for both."""
     # points in space are no spots, and three coordinates seldom agree with somebody else's
@@ -42,7 +43,7 @@ def with_cut_spots(
     is_spot = (found.detections >= 0) & in_image[:, None]
     met, k = (is_spot & (found.shares > 0)).nonzero(), len(known)
     if not (len(met[0]) and k and any(errors.chances)):
-        return np.zeros(information.shape), 1.0
+        return np.zeros(information.shape), _larger_by_noise(k, degrees, outside)
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = inverted(information + np.diag(1 / known**2))
     G = (J.reshape(-1, k) @ C).reshape(J.shape)
@@ -76,7 +77,7 @@ def with_cut_spots(
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
     by_case = (along @ G).reshape(-1, k)
     spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
-    return spread, _larger(C, spread, G, along, wider, chances, outside)
+    return spread, _larger(C, spread, G, along, wider, chances, outside, degrees)
 
 
 def _larger(
@@ -87,6 +88,7 @@ def _larger(
     wider: Floats,  # (n, V, 2)
     chances: Floats,  # (n, V); what is left of one is the chance that nothing is cut
     outside: float,
+    noise_degrees: float,
 ) -> float:
     """The factor by which an ellipsoid (k, k) has all but some truths inside."""
     B = inverted(C + spread)
@@ -106,8 +108,17 @@ def _larger(
     some = shares > 1e-12  # of many cases most are next to impossible
     degrees, limits, shares = degrees[some], limits[some], shares[some]
     # the first or the second of most poses
-    enough = (one for one in LARGER[:-1] if chdtrc(degrees, one * limits) @ shares <= outside)
+    enough = (
+        one
+        for one in LARGER[:-1]
+        if fdtrc(degrees, noise_degrees, one * limits / degrees) @ shares <= outside
+    )
     return next(enough, LARGER[-1])
+
+
+def _larger_by_noise(count: int, degrees: float, outside: float) -> float:
+    """The same of noise alone, known to so many degrees of freedom."""
+    return float(fdtri(count, degrees, 1 - outside) * count / chdtri(count, outside))
 
 
 def _axes(S: Floats) -> tuple[Floats, Floats]:

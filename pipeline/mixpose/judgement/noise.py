@@ -53,6 +53,7 @@ class NoiseModel:
     known: float = constant(20.0, "degrees of freedom that tell the noise to 16 %, √(1/2ν)")
     usual: float = constant(0.1, "σ_ε: spots and corners err by 0.01 to 0.3 of it")
     usual_degrees: float = constant(10.0, "of freedom that this counts as: by a factor of 1.25")
+    guess: float = constant(1.0, "of freedom, in what a pose is sure to: two may agree by chance")
     fewest: float = constant(
         10.0, "detections that tell a change of noise from something that cuts every second spot"
     )
@@ -160,9 +161,9 @@ def noise_of(
     by_kind[0] = (counts * by_kind[0] + own[0, 4]) / (counts + spare)
     # fields last: a further frame shows no more of them
     known_to = np.array([degrees, *of_fields])
-    covariance[inner] = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
+    covariance[inner], degrees = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
     given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
-    spread, larger = with_cut_spots(*given)
+    spread, larger = with_cut_spots(*given, degrees)
     covariance[inner] = larger * (covariance[inner] + spread)
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
@@ -178,15 +179,18 @@ def _of_all_kinds(
     drawn: Floats,  # (k, q + 3 N) what a field of unit size moves a pose by
     kinds: Floats,
     model: NoiseModel,
-) -> Floats:
-    """The covariance (k, k) by all kinds of errors; their shares are of all directions together."""
+) -> tuple[Floats, float]:
+    """The covariance (k, k) by all kinds of errors, and the degrees of freedom that it is known to.
+
+    Their shares are of all directions together.
+    """
     covariance = variances[0] * inverse + (drawn * (kinds @ variances)) @ drawn.T
     B = inverted(covariance)
     shares = variances * (np.vecdot(drawn.T, (B @ drawn).T) @ kinds)
     shares[0] = variances[0] * np.vdot(B, inverse)
     shares /= max(float(shares.sum()), 1e-300)
     known = np.maximum(degrees, model.fewest_degrees)
-    return np.asarray(covariance * model.enlargement(1 / float(shares**2 @ (1 / known))))
+    return covariance, 1 / float(shares**2 @ (1 / known))
 
 
 def _level(
@@ -223,9 +227,8 @@ def _level(
             sums = np.zeros_like(past)
             own, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
-    degrees = sum(sums[1].tolist())
-    scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return variances, rarity, scale, told, degrees, ratio
+    scale = pooled(sums, rules, model.guess, model.usual)
+    return variances, rarity, scale, told, sum(sums[1].tolist()) + model.guess, ratio
 
 
 def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, float]:
@@ -370,7 +373,7 @@ def _variances(
     """
     fields, least = 3.0, 1e-6  # degrees of freedom that are as good as none
     of_markers = fields * own[3, 3] + least
-    believed = np.array([least, fields * met**2, fields * met**2, of_markers])
+    believed = np.array([model.guess, fields * met**2, fields * met**2, of_markers])
     expected = moments[:, :4] + np.diag(believed)
     seen = moments[:, 4] + believed * [1.0, model.lasting**2, model.lasting**2, 0.0]
     scale = 1 / np.maximum(expected.diagonal(), least)

@@ -21,15 +21,16 @@ from mixpose.judgement import (
     Alternative,
     Mistake,
     ScoredPose,
+    Shape,
     Verdict,
     decide,
-    gained_by,
     is_far_off,
     is_open,
     is_sure,
     odds_of_each,
     one_misses,
     possible_mistakes,
+    shape_shown,
 )
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
@@ -50,6 +51,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     best = verdict.best
     if best is None:
         return verdict
+    verdict = replace(verdict, shape=_shape(data, best))
     if verdict.status != "ok":
         rivals = [one for one, _ in verdict.kept if one is not best]
         why = reason(data, best, rivals)
@@ -73,21 +75,21 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
         for one in mistakes
         if one.log_odds > 0 or one.name == MIRRORED
     }
-    against = _alternatives(data, best, mistakes)
+    against = _alternatives(data, best, mistakes, verdict.shape)
     # what lasts shows in frames like those before; one that is not is a doubled image, or the like
     is_usual = best.residual_ratio <= rules.acceptance.changed
     return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
 
 
 def _alternatives(
-    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake]
+    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], shape: Shape | None
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
-    yield Alternative(UNSURE, _of_chance_that_lasts(data, best))
+    yield Alternative(UNSURE, _of_chance_that_lasts(data, best, shape))
     # of a scene with mirrors nobody knows which side a frame shows
     mirrored = 0.5 if data.options.mirrors else rules.mistaken
     likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
@@ -100,36 +102,30 @@ def _alternatives(
         yield Alternative(OPEN)
 
 
-def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
+def _of_chance_that_lasts(data: Frame, best: ScoredPose, shape: Shape | None) -> float:
     """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
-    What a frame tells by itself counts, and features that it misses, where frames before met them.
+    What a frame tells by itself counts, or all of what is followed by its shape.
     """
-    track = data.track
-    if track.believed or track.frame is None:
+    if shape is None or data.track.frame is None:
         return -math.inf
-    told = _evidence(data.alone(), Start(best.T_world_object, left_out=best.left_out))
-    if track.shown is not None:
-        told += float(track.shown[best.used.met_by == 0].sum())
+    told = shape.log_odds(data.body.radius, data.rules.judgement.noise)
     more = best.log_evidence - told
     # beyond that of clutter, which counts already
     return math.log(-math.expm1(-more)) - told if more > 0 else -math.inf
 
 
-def shown_after(data: Frame, best: ScoredPose) -> Floats | None:
-    """`Track.shown` after a frame; of a pose that nobody expected, by this frame alone."""
-    if data.track.believed:
+def _shape(data: Frame, best: ScoredPose) -> Shape | None:
+    """`Track.shape` with a frame; of a pose that nobody expected, by this frame alone."""
+    track, T = data.track, best.T_world_object
+    if track.believed:
         return None
-    used, detection = best.used, data.rules.judgement.detection
-    gained = gained_by(used, np.sqrt(best.variances[:, None] + used.extra), detection)
-    # what a covered sensor meets, it meets by chance
-    gained[gained.sum(axis=1) + used.missed * detection.log_missed < detection.log_blind] = 0.0
-    before = data.track.shown
-    if before is None or not _gained(data, best):
-        before = np.zeros(gained.shape[1])
-    # each time that a sensor misses a feature, it is less likely to have been met
-    lost = np.maximum(before + used.weights.max(axis=0) * detection.log_missed, 0.0)
-    return np.asarray(np.where(used.met_by > 0, gained.max(axis=0), lost))
+    alone = best.log_evidence
+    if track.frame is not None:
+        alone = _evidence(data.alone(), Start(T, left_out=best.left_out))
+    before = track.shape if not track.misses and data.goes_on(T) else None
+    model = data.rules.judgement.noise
+    return shape_shown(best.used, best.variances, data.body, T, alone, model, before)
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:

@@ -172,6 +172,11 @@ class Frame(Setup):
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
 
+    def goes_on(self, T_world_object: Floats) -> bool:
+        """Whether a pose is where the best one before puts it, rather than anywhere."""
+        there = self._prior(T_world_object, self.predictions[:1], self.track.misses)
+        return there[0] > self.anywhere[0]
+
     def rival(self, best: ScoredPose, T_world_object: Floats, wide: Floats, **rest: Any) -> Start:
         """A start of what there may be instead of a pose, as far as that leaves room for it."""
         errors, count = self.rules.judgement.noise.errors, int(np.count_nonzero(self.free))

@@ -12,7 +12,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import ClutterRates, Prior, RememberedNoise, nearest_alike
+from mixpose.judgement import ClutterRates, Prior, RememberedNoise, Shape, nearest_alike
 from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
@@ -138,8 +138,7 @@ class Track:
     doubted: bool = False  # whether another body may have what the last pose meets
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
-    # (N,) nats that each feature gained when it was met last, in frames of which none was ok
-    shown: Floats | None = None
+    shape: Shape | None = None  # what frames of which none was ok told of it
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain
     tried: Mapping[str, int] = field(default_factory=dict)

@@ -18,7 +18,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.doubt import decided, of_other_things, shown_after
+from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import likelihood_of
@@ -289,7 +289,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         known=is_ok
         or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
-        shown=None if is_ok else shown_after(data, best),
+        shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
         twice=track.twice if verdict.second is None else verdict.second.there,
