@@ -216,7 +216,9 @@ def test_one_function_differentiates_a_projection_by_the_pose() -> None:
         "tracking/motion.py:followed",
     }
     chained = {name for name, node in FUNCTIONS if "pose_jacobian" in called(node)}
-    assert chained == {"objective/projection.py:_project", "objective/paper.py:_model"}
+    # frames of which the poses err show one side of the body: it is taken from there again
+    own = {"objective/projection.py:_project", "objective/paper.py:_model"}
+    assert chained == {*own, "judgement/shape.py:_by_pose"}
 
 
 def test_one_function_climbs() -> None:

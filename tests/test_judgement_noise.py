@@ -81,11 +81,21 @@ def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
     assert of_first(judged([three])[1]) == [0.0, 0.0]
 
 
-def test_where_no_residuals_say_otherwise_detections_err_by_a_fifth_of_sigma() -> None:
+def test_where_no_residuals_say_otherwise_detections_err_by_what_is_usual() -> None:
     three = sensor("0", np.random.default_rng(0), np.zeros((3, 2)))
     covariance, _ = judged([three], model=ALONE)
     J = three.J.reshape(-1, 6) / 2.0
-    np.testing.assert_allclose(covariance, 0.04 * np.linalg.inv(J.T @ J), rtol=1e-6)
+    np.testing.assert_allclose(covariance, 0.01 * np.linalg.inv(J.T @ J), rtol=1e-6)
+
+
+def test_residuals_that_agree_by_chance_make_no_pose_exact() -> None:
+    # two degrees of freedom, and one of what is usual: a third of its variance, of which this
+    # frame, whose errors may be smaller than those of others, takes a sixth
+    four = sensor("0", np.random.default_rng(0), np.zeros((4, 2)))
+    covariance, _ = judged([four], model=ALONE)
+    J = four.J.reshape(-1, 6) / 2.0
+    least = 0.01 / 3 * np.linalg.inv(J.T @ J)
+    np.testing.assert_allclose(covariance, 5 / 6 * least, rtol=0.02)
 
 
 def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:

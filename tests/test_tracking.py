@@ -124,9 +124,10 @@ def test_errors_have_the_size_that_the_covariance_says(
         assert estimate.covariance is not None
         error = twist_between(TRUTH, estimate.T_world_object)
         squared.append(error @ np.linalg.solve(estimate.covariance, error) / 6)
-    # mean of 60 · 6 squares of unit normals: standard deviation 0.075; noise estimated from 26
-    # redundant measurements adds 8 %, that one of them may be cut makes covariances a tenth larger
-    assert 0.65 < np.mean(squared) < 1.4
+    # mean of 60 · 6 squares of unit normals: standard deviation 0.075; to have 99.9 % inside with a
+    # noise of 26 redundant measurements, F makes covariances 1.44 times as large where errors are
+    # 1.08 times, and that one of them may be cut a tenth: 0.68
+    assert 0.5 < np.mean(squared) < 0.95
 
 
 def test_a_frame_without_the_body_is_lost(body: Body, pinhole_cameras: list[PinholeCamera]) -> None:

@@ -336,24 +336,30 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
 
 
 @pytest.mark.parametrize(
-    ("cameras", "shown", "last"),
+    ("cameras", "shown", "moving", "last"),
     [
-        # five markers of eight, as another body may show them
-        (1, ([0, 1, 2, 3, 4],) * 25, "ambiguous"),
-        (2, ([0, 1, 2, 3, 4],) * 20, "ambiguous"),
+        # five markers of eight, as something else may show them from this side
+        (1, ([0, 1, 2, 3, 4],) * 25, 0.0, "ambiguous"),
+        (2, ([0, 1, 2, 3, 4],) * 20, 0.0, "ambiguous"),
+        # and not from others
+        (1, ([0, 1, 2, 3, 4],) * 25, 1.0, "ok"),
         # a frame that is sure by itself
-        (1, ([0, 1, 2, 3, 4], list(range(8))), "ok"),
+        (1, ([0, 1, 2, 3, 4], list(range(8))), 1.0, "ok"),
         # and others of them, which that has not
-        (1, ([0, 1, 2, 3, 4], [0, 1, 5, 6, 7], [2, 3, 4, 6, 7], [1, 2, 5, 6, 7]), "ok"),
+        (1, ([0, 1, 2, 3, 4], [0, 1, 5, 6, 7], [2, 3, 4, 6, 7], [1, 2, 5, 6, 7]), 1.0, "ok"),
     ],
 )
 def test_what_one_camera_sees_again_and_again_is_not_surer_for_it(
-    pinhole_cameras: list[PinholeCamera], cameras: int, shown: tuple[list[int], ...], last: str
+    pinhole_cameras: list[PinholeCamera],
+    cameras: int,
+    shown: tuple[list[int], ...],
+    moving: float,
+    last: str,
 ) -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions())
     track, statuses = tracker.begin(), []
     for frame, features in enumerate(shown):
-        T = perturb(TRUTH, frame * np.array([1.0, 0.5, 0.0, 0.0, 0.0, 0.01]))
+        T = perturb(TRUTH, moving * frame * np.array([1.0, 0.5, 0.0, 0.0, 0.0, 0.01]))
         points = pinhole_cameras[0].project(transform(T, EIGHT.means[features]))[0]
         rng = np.random.default_rng(frame)
         points += 0.2 * rng.standard_normal(points.shape)

@@ -36,9 +36,30 @@ _NOISE = (
     Mutant(
         "judgement-unknown-noise-is-sigma",
         "judgement/noise.py",
-        "0.0 if degrees >= 1 else rules.typical_degrees",
-        "0.0",
-        "three features in one camera have an exact pose",
+        "pooled(sums, rules, model.guess, model.usual)",
+        "pooled(sums, rules, model.guess, 1.0)",
+        "three features in one camera err by a whole σ_ε",
+    ),
+    Mutant(
+        "judgement-other-sides-tell-nothing-more",
+        "judgement/shape.py",
+        "information=before.information + information,",
+        "information=information,",
+        "what one camera sees of the body one feature after the other never makes it sure",
+    ),
+    Mutant(
+        "judgement-poses-that-err-show-other-sides",
+        "judgement/shape.py",
+        "< TURNED * noise",
+        "< 0.0 * noise",
+        "four markers at rest are the body after some frames, as their poses err",
+    ),
+    Mutant(
+        "judgement-choosing-a-pose-costs-nothing",
+        "judgement/shape.py",
+        "spent=min(before.spent, one.spent),",
+        "spent=0.0,",
+        "any thing of four markers is the body",
     ),
 )
 

@@ -99,14 +99,6 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
-        "tracking-other-features-tell-nothing-more",
-        "tracking/doubt.py",
-        "told += float(track.shown[best.used.met_by == 0].sum())",
-        "told += 0.0",
-        "what one camera sees of the body one feature after the other never makes it sure",
-        (_STARTS,),
-    ),
-    Mutant(
         "tracking-companions-for-nothing",
         "tracking/track.py",
         "share = rules.beside *",

@@ -153,7 +153,9 @@ def noise_of(
         )
         own[0, 0], own[0, 4], own[1:, 4] = spare, rest @ rest, pulls**2 @ kinds[:, 1:]
     moments = model.memory * before.moments + own
-    by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
+    usual = model.usual**2 / float(scale.mean())
+    most = sum(found.met.tolist()) / len(found.names)
+    by_kind, of_fields = _variances(moments, own, most, usual, model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
     # independent errors are of this frame, whose variance is one of a scaled inverse χ² of ν
     # degrees of freedom: its mean, which all frames show, counts as ν − 2
@@ -363,19 +365,19 @@ def expected_squares(
 
 
 def _variances(
-    moments: Floats, own: Floats, met: float, model: NoiseModel
+    moments: Floats, own: Floats, met: float, usual: float, model: NoiseModel
 ) -> tuple[Floats, Floats]:
     """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter.
 
-    From normal equations of all frames and of one alone, where sensors meet so many features.  What
-    is believed before, as that markers are where they are said to be, counts as a camera's fields
-    along an axis in it: an offset, and two that turn, scale and shear.
+    From normal equations of all frames and of one alone, where sensors meet so many features, and
+    the `usual` variance.  What is believed before, as that markers are where they are said to be,
+    counts as a camera's fields along an axis in it: an offset, and two that turn, scale and shear.
     """
     fields, least = 3.0, 1e-6  # degrees of freedom that are as good as none
     of_markers = fields * own[3, 3] + least
     believed = np.array([model.guess, fields * met**2, fields * met**2, of_markers])
     expected = moments[:, :4] + np.diag(believed)
-    seen = moments[:, 4] + believed * [1.0, model.lasting**2, model.lasting**2, 0.0]
+    seen = moments[:, 4] + believed * [usual, model.lasting**2, model.lasting**2, 0.0]
     scale = 1 / np.maximum(expected.diagonal(), least)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
     # a twentieth of the squares is not taken for fields

@@ -28,8 +28,8 @@ from mixpose.matching import Matches
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats
 
-TURNED = 2 * float(chdtri(3, 0.001))
-"""By more than two poses err, squared, in 99.9 %: what has not turned shows the same side."""
+TURNED = 2 * float(chdtri(3, 1e-6))
+"""What two poses err by, squared, but for one in a million: what turned less shows one side."""
 
 NOISE = np.geomspace(0.01, 1.0, 25) ** 2  # s², σ_ε²
 
