@@ -89,12 +89,12 @@ def test_where_no_residuals_say_otherwise_detections_err_by_what_is_usual() -> N
 
 
 def test_residuals_that_agree_by_chance_make_no_pose_exact() -> None:
-    # two degrees of freedom, and one of what is usual: a third of its variance, of which this
+    # two degrees of freedom, and a tenth of what is usual: of that variance 1 in 21, of which this
     # frame, whose errors may be smaller than those of others, takes a sixth
     four = sensor("0", np.random.default_rng(0), np.zeros((4, 2)))
     covariance, _ = judged([four], model=ALONE)
     J = four.J.reshape(-1, 6) / 2.0
-    least = 0.01 / 3 * np.linalg.inv(J.T @ J)
+    least = 0.01 / 21 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(covariance, 5 / 6 * least, rtol=0.02)
 
 

@@ -53,7 +53,9 @@ class NoiseModel:
     known: float = constant(20.0, "degrees of freedom that tell the noise to 16 %, √(1/2ν)")
     usual: float = constant(0.1, "σ_ε: spots and corners err by 0.01 to 0.3 of it")
     usual_degrees: float = constant(10.0, "of freedom that this counts as: by a factor of 1.25")
-    guess: float = constant(1.0, "of freedom, in what a pose is sure to: two may agree by chance")
+    guess: float = constant(
+        0.1, "of freedom that it counts as in what a pose is sure to: residuals may agree by chance"
+    )
     fewest: float = constant(
         10.0, "detections that tell a change of noise from something that cuts every second spot"
     )
@@ -163,10 +165,10 @@ def noise_of(
     by_kind[0] = (counts * by_kind[0] + own[0, 4]) / (counts + spare)
     # fields last: a further frame shows no more of them
     known_to = np.array([degrees, *of_fields])
-    covariance[inner], degrees = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
+    covariance[inner], larger = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
     given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
-    spread, larger = with_cut_spots(*given, degrees)
-    covariance[inner] = larger * (covariance[inner] + spread)
+    spread, needed = with_cut_spots(*given, degrees)
+    covariance[inner] = max(larger, needed) * (covariance[inner] + spread)
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
@@ -182,7 +184,7 @@ def _of_all_kinds(
     kinds: Floats,
     model: NoiseModel,
 ) -> tuple[Floats, float]:
-    """The covariance (k, k) by all kinds of errors, and the degrees of freedom that it is known to.
+    """The covariance (k, k) by all kinds of errors, and by what it is larger as they are not known.
 
     Their shares are of all directions together.
     """
@@ -192,7 +194,7 @@ def _of_all_kinds(
     shares[0] = variances[0] * np.vdot(B, inverse)
     shares /= max(float(shares.sum()), 1e-300)
     known = np.maximum(degrees, model.fewest_degrees)
-    return covariance, 1 / float(shares**2 @ (1 / known))
+    return covariance, float(model.enlargement(1 / float(shares**2 @ (1 / known))))
 
 
 def _level(
@@ -230,7 +232,14 @@ def _level(
             own, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
     scale = pooled(sums, rules, model.guess, model.usual)
-    return variances, rarity, scale, told, sum(sums[1].tolist()) + model.guess, ratio
+    return (
+        variances,
+        rarity,
+        scale,
+        told,
+        max(sum(sums[1].tolist()) + model.guess, model.fewest_degrees),
+        ratio,
+    )
 
 
 def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, float]:
