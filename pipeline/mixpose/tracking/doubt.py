@@ -51,7 +51,8 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     best = verdict.best
     if best is None:
         return verdict
-    verdict = replace(verdict, shape=_shape(data, best))
+    told, shape = _told(data, best)
+    verdict = replace(verdict, shape=shape)
     if verdict.status != "ok":
         rivals = [one for one, _ in verdict.kept if one is not best]
         why = reason(data, best, rivals)
@@ -75,21 +76,21 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
         for one in mistakes
         if one.log_odds > 0 or one.name == MIRRORED
     }
-    against = _alternatives(data, best, mistakes, verdict.shape)
+    against = _alternatives(data, best, mistakes, told)
     # what lasts shows in frames like those before; one that is not is a doubled image, or the like
     is_usual = best.residual_ratio <= rules.acceptance.changed
     return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
 
 
 def _alternatives(
-    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], shape: Shape | None
+    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], told: float
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
-    yield Alternative(UNSURE, _of_chance_that_lasts(data, best, shape))
+    yield Alternative(UNSURE, _of_chance_that_lasts(data, best, told))
     # of a scene with mirrors nobody knows which side a frame shows
     mirrored = 0.5 if data.options.mirrors else rules.mistaken
     likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
@@ -102,30 +103,36 @@ def _alternatives(
         yield Alternative(OPEN)
 
 
-def _of_chance_that_lasts(data: Frame, best: ScoredPose, shape: Shape | None) -> float:
+def _of_chance_that_lasts(data: Frame, best: ScoredPose, told: float) -> float:
     """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
-    What a frame tells by itself counts, or all of what is followed by its shape.
+    What is `told` of the body counts, by a frame itself or by all that go on from each other.
     """
-    if shape is None or data.track.frame is None:
+    if data.track.believed or data.track.frame is None:
         return -math.inf
-    told = shape.log_odds(data.body.radius, data.rules.judgement.noise)
     more = best.log_evidence - told
     # beyond that of clutter, which counts already
     return math.log(-math.expm1(-more)) - told if more > 0 else -math.inf
 
 
-def _shape(data: Frame, best: ScoredPose) -> Shape | None:
-    """`Track.shape` with a frame; of a pose that nobody expected, by this frame alone."""
-    track, T = data.track, best.T_world_object
+def _told(data: Frame, best: ScoredPose) -> tuple[float, Shape | None]:
+    """Log odds of the body against clutter that lasts, and `Track.shape` with a frame.
+
+    A pose that nobody expected goes by its frame alone; that of a frame which is sure by itself
+    needs no others.
+    """
+    track, T, rules = data.track, best.T_world_object, data.rules
     if track.believed:
-        return None
+        return math.inf, None
     alone = best.log_evidence
     if track.frame is not None:
         alone = _evidence(data.alone(), Start(T, left_out=best.left_out))
+    if alone > -rules.acceptance.log_doubt:
+        return alone, None
     before = track.shape if not track.misses and data.goes_on(T) else None
-    model = data.rules.judgement.noise
-    return shape_shown(best.used, best.variances, data.body, T, alone, model, before)
+    model = rules.judgement.noise
+    shape = shape_shown(best.used, best.variances, data.body, T, alone, model, before)
+    return shape.log_odds(data.body.radius, model), shape
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
