@@ -110,7 +110,7 @@ def odds_of(
     Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
     """
     roots, m = np.sqrt(variances[..., None] + found.extra), found.dimensions[:, None]
-    gained = gained_by(found, roots, detection, spreads)
+    gained = _gained_by(found, roots, detection, spreads)
     # what a cloud misses, it misses in all of its images at once
     images = found.images[found.owner]
     missed = (found.weights - found.shares) * (detection.log_missed / images[:, None])
@@ -143,7 +143,7 @@ def odds_of(
     return gained, missed + unseen, coordinates
 
 
-def gained_by(
+def _gained_by(
     found: Matches, roots: Floats, detection: DetectionModel, spreads: Floats | None = None
 ) -> Floats:
     """What each feature (..., L, N) gains against clutter in each sensor by itself, in nats."""

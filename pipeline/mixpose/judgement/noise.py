@@ -8,7 +8,8 @@ all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, field
 
 is expected of residuals r (C. R. Henderson's method of moments), and the covariance of a pose is
 s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as by Student, with the degrees of freedom
-that B. L. Welch and F. E. Satterthwaite give to a sum of variances of shares w_k: 1/ν = Σ w_k²/ν_k.
+that B. L. Welch and F. E. Satterthwaite give to a sum of variances of shares w_k: 1/ν = Σ w_k²/ν_k;
+and by more where the tail of F needs it, see `mixpose.judgement.cut`.
 
 Fields of a sensor that last, of sizes γ in σ_ε, show in fading sums A of PᵀWRP and v of PᵀWr.  With
 γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance
@@ -164,10 +165,10 @@ def noise_of(
     counts, spare = model.of_frame - 2, max(spare, 0.0)
     by_kind[0] = (counts * by_kind[0] + own[0, 4]) / (counts + spare)
     # fields last: a further frame shows no more of them
-    known_to = np.array([degrees, *of_fields])
+    known_to = np.maximum([degrees, *of_fields], model.fewest_degrees)
     covariance[inner], larger = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
     given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
-    spread, needed = with_cut_spots(*given, degrees)
+    spread, needed = with_cut_spots(*given, float(known_to[0]))
     covariance[inner] = max(larger, needed) * (covariance[inner] + spread)
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
@@ -193,8 +194,7 @@ def _of_all_kinds(
     shares = variances * (np.vecdot(drawn.T, (B @ drawn).T) @ kinds)
     shares[0] = variances[0] * np.vdot(B, inverse)
     shares /= max(float(shares.sum()), 1e-300)
-    known = np.maximum(degrees, model.fewest_degrees)
-    return covariance, float(model.enlargement(1 / float(shares**2 @ (1 / known))))
+    return covariance, float(model.enlargement(1 / float(shares**2 @ (1 / degrees))))
 
 
 def _level(
@@ -232,14 +232,7 @@ def _level(
             own, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
     scale = pooled(sums, rules, model.guess, model.usual)
-    return (
-        variances,
-        rarity,
-        scale,
-        told,
-        max(sum(sums[1].tolist()) + model.guess, model.fewest_degrees),
-        ratio,
-    )
+    return variances, rarity, scale, told, sum(sums[1].tolist()) + model.guess, ratio
 
 
 def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, float]:

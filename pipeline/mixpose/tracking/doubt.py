@@ -90,7 +90,7 @@ def _alternatives(
     if data.options.mirrors and is_flat(data):
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
-    yield Alternative(UNSURE, _of_chance_that_lasts(data, best, told))
+    yield Alternative(UNSURE, _of_chance_that_lasts(best, told))
     # of a scene with mirrors nobody knows which side a frame shows
     mirrored = 0.5 if data.options.mirrors else rules.mistaken
     likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
@@ -103,13 +103,11 @@ def _alternatives(
         yield Alternative(OPEN)
 
 
-def _of_chance_that_lasts(data: Frame, best: ScoredPose, told: float) -> float:
+def _of_chance_that_lasts(best: ScoredPose, told: float) -> float:
     """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
     What is `told` of the body counts, by a frame itself or by all that go on from each other.
     """
-    if data.track.believed or data.track.frame is None:
-        return -math.inf
     more = best.log_evidence - told
     # beyond that of clutter, which counts already
     return math.log(-math.expm1(-more)) - told if more > 0 else -math.inf
