@@ -116,10 +116,10 @@ def test_what_frames_tell_of_delays_leaves_out_what_pose_and_velocity_explain() 
     found, before = delays_after(frame, best), track.delays
     assert found.names == ("side",)
     met, expected = offsets_of(frame, best.used), frame.expected(best.T_world_object)
-    # a feature that a sensor does not see says nothing, not even how many there are
-    weights = best.used.weights.copy()
-    weights[1, 0] = 0.0
-    assert len(offsets_of(frame, replace(best.used, weights=weights)).rows) == len(met.rows) - 2
+    # a feature that nothing meets says nothing, not even how many there are
+    shares = best.used.shares.copy()
+    shares[1, 0] = 0.0
+    assert len(offsets_of(frame, replace(best.used, shares=shares)).rows) == len(met.rows) - 2
     variance = max(float(met.offsets @ met.offsets) / (len(met.offsets) - 6), LEAST_VARIANCE)
     late = np.where(met.sensor == 1, met.rows @ expected.velocity, 0.0)
     ways = met.rows * met.late[:, None] * expected.deviation

@@ -146,16 +146,16 @@ def offsets_of(
     Nor do they pull more than at a blur as `wide`, in σ_ε.
     """
     views = [view for view in frame.still or frame.views if view.name in matches.names]
-    seen = matches.weights > 0
-    late, blurs = _seconds(views, matches.places, seen), np.ones(len(views))
+    met = matches.shares > 0
+    late, blurs = _seconds(views, matches.places, met), np.ones(len(views))
     if expected is not None:
-        beside, model = _off(views, late, matches.J, seen, expected), frame.rules.judgement.noise
+        beside, model = _off(views, late, matches.J, met, expected), frame.rules.judgement.noise
         known = model.memory * frame.track.residuals.of(matches.names)
         _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
         blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), wide)
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
-    kept = (seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
+    kept = (met[..., None] & (np.arange(2) < matches.dimensions[:, None, None])).nonzero()
     pull = pull[kept[:2]]
     return Offsets(
         rows=matches.J[kept] * pull[:, None],
