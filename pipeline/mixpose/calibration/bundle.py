@@ -156,7 +156,7 @@ def _pose_columns(
     used = [0] if not rows.shares[:, 1:].any() else [0, 1, 2, 3]
     J = (rows.by_pose[:, :, free] * root)[:, :, None] * rows.shares[:, None, used, None]
     place = clock.nodes[rows.pairs.frame][:, used, None] * d + np.arange(d)
-    columns = np.repeat(place.reshape(n, 1, -1), m, axis=1)
+    columns = np.repeat(place.reshape(n, 1, d * len(used)), m, axis=1)
     return J.ravel(), columns.ravel(), np.full(n * m, d * len(used))
 
 

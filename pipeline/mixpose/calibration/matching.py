@@ -187,7 +187,8 @@ def _near(
 ) -> tuple[Indices, Indices, Indices, Floats, Mask]:
     """Pairs within reach: frames, features, detections, shares, and whether they are nearest."""
     away = np.where(visible[..., None], y, np.nan)[:, :, None] - points[:, None]
-    squared = np.nan_to_num((away * away).sum(axis=3), copy=False, nan=np.inf)
+    squared = (away * away).sum(axis=3)
+    squared[np.isnan(squared)] = np.inf
     kernel = np.exp(-squared / (4 * blur * blur)) * (squared < reach * reach)
     rivals = np.maximum(kernel.sum(axis=2)[:, :, None], kernel.sum(axis=1)[:, None])
     least = squared == squared.min(axis=2)[:, :, None]
