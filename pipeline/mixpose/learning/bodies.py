@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -188,17 +189,22 @@ def _going_along(
     slack = rules.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())
     cloud, triples = congruent_triples_of_each(points, others.apart, slack)
     poses = motions(points, others.points[cloud[:, None], triples])
-    for k in np.unique(cloud):
-        own = cloud == k
-        moved = transform(poses[own], reference.points)
-        away = cdist(others.points[k], moved.reshape(-1, 3))
-        nearest = away.argmin(axis=0)
-        away = away[nearest, np.arange(len(nearest))].reshape(moved.shape[:2])
-        reach = others.reach[k][nearest].reshape(away.shape)
-        share = away / (2 * rules.gate * np.hypot(reach, reference.reach))
-        met = share < 1
-        met &= (share[:, base] < 1).all(axis=1)[:, None]
-        counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
-        best = int(np.argmax(counts))
+    moved = transform(poses, reference.points)
+    away, reach = np.empty((2, *moved.shape[:2]))
+    edges = np.searchsorted(cloud, np.arange(len(others.points) + 1))
+    parts = [slice(*each) for each in pairwise(edges.tolist())]
+    for k, own in enumerate(parts):
+        found = cdist(others.points[k], moved[own].reshape(-1, 3))
+        nearest = found.argmin(axis=0)
+        away[own] = found[nearest, np.arange(len(nearest))].reshape(away[own].shape)
+        reach[own] = others.reach[k, nearest].reshape(away[own].shape)
+    share = away / (2 * rules.gate * np.hypot(reach, reference.reach))
+    met = share < 1
+    met &= met[:, base].all(axis=1)[:, None]
+    counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
+    for k, own in enumerate(parts):
+        if own.start == own.stop:
+            continue
+        best = own.start + int(np.argmax(counts[own]))
         if met[best].any():
-            yield met[best], others.points[k, triples[own][best]]
+            yield met[best], others.points[k, triples[best]]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.learning.points import Cloud
@@ -41,12 +41,12 @@ class Placement:
     met: Indices  # (N,): the point of the cloud that each point of the shape is; -1 for none
     off: float  # root mean square distance of the two, by what they may be off
 
-    @property
+    @cached_property
     def own(self) -> Indices:
         """Points of the shape that are met."""
         return np.flatnonzero(self.met >= 0)
 
-    @property
+    @cached_property
     def there(self) -> Indices:
         """Points of the cloud that they meet."""
         return self.met[self.own]
@@ -160,6 +160,7 @@ def _weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
     weight = 1 / reach**2
     weight = weight / weight.sum()
     a, b = weight @ source, weight @ target
-    turn, _ = Rotation.align_vectors(target - b, source - a, weights=weight)
-    R = turn.as_matrix()
+    # as SciPy's Rotation.align_vectors, which takes five times as long
+    U, _, Vt = np.linalg.svd((weight * (target - b).T) @ (source - a))
+    R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
     return from_parts(R, b - R @ a)

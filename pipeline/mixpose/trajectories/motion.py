@@ -34,7 +34,8 @@ ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
 )
-_TRACE = np.eye(3).ravel()
+_EYE = np.eye(3)
+_TRACE = _EYE.ravel()
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 
@@ -107,10 +108,11 @@ def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, F
     S = P[:, :6, :6] + covariance
     scale = 1 / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
     both = scale[:, :, None] * scale[:, None]
-    inverse = np.linalg.inv(S * both) * both
+    scaled = S * both
+    inverse = np.linalg.inv(scaled) * both
     gains = P[:, :, :6] @ inverse
     squared = ((inverse @ rest[..., None])[..., 0] * rest).sum(axis=1)
-    log_determinants = np.linalg.slogdet(S * both)[1] - 2 * np.log(scale).sum(axis=1)
+    log_determinants = np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum(axis=1)
     # Joseph's form: symmetric, and positive whatever rounding does
     left = P - gains @ P[:, :6]
     covariances = left + (gains @ covariance - left[:, :, :6]) @ gains.swapaxes(1, 2)
@@ -166,7 +168,7 @@ def _turn(across: Floats) -> Floats:
     """Rotations exp [ω] (G, 3, 3), by O. Rodrigues."""
     angle = np.sqrt((across**2).sum(axis=(1, 2), keepdims=True) / 2) + 1e-300
     half = np.sin(angle / 2) / angle
-    return np.asarray(np.eye(3) + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
+    return np.asarray(_EYE + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
 
 
 def _perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
@@ -202,9 +204,10 @@ def _step(elapsed: float, p: int) -> tuple[Floats, Floats, Floats]:
 
 def _process_noise(elapsed: float, p: int, noise: Floats) -> Floats:
     """Q (G, 6 p, 6 p)."""
-    by_axis = (noise[:, :, None] * np.eye(6))[:, None, :, None]
-    Q = _noise_of_step(elapsed, p)[:, None, :, None] * by_axis
-    return np.asarray(Q.reshape(len(noise), 6 * p, 6 * p))
+    Q = np.zeros((len(noise), p, 6, p, 6))
+    # what each coordinate of a pose has with itself: (6, G, p, p)
+    Q[:, :, range(6), :, range(6)] = noise.T[:, :, None, None] * _noise_of_step(elapsed, p)
+    return Q.reshape(len(noise), 6 * p, 6 * p)
 
 
 @lru_cache(maxsize=64)
