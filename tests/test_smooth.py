@@ -187,7 +187,7 @@ def reaching(frames: int, seed: int) -> Floats:
 
 def test_a_hand_that_rests_and_shakes_errs_by_what_covariances_say() -> None:
     covariance, rules, squared = covariance_of(0.3, 0.003), replace(QUICK, frames=120), []
-    for seed in range(3):
+    for seed in range(2):
         truth = reaching(180, seed)
         smooth = smooth_body(lines_of(measured(truth, covariance, seed), covariance), rules=rules)
         for one, T in zip(smooth.estimates, truth, strict=True):
