@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.learning.points import Cloud
@@ -160,7 +161,6 @@ def _weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
     weight = 1 / reach**2
     weight = weight / weight.sum()
     a, b = weight @ source, weight @ target
-    # as SciPy's Rotation.align_vectors, which takes five times as long
-    U, _, Vt = np.linalg.svd((weight * (target - b).T) @ (source - a))
-    R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    turn, _ = Rotation.align_vectors(target - b, source - a, weights=weight)
+    R = turn.as_matrix()
     return from_parts(R, b - R @ a)
