@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, PointFeature
-from mixpose.calibration import Rig, SeenFrame, Task
+from mixpose.calibration import CalibrationRules, Rig, SeenFrame, Task
 from mixpose.calibration.task import Hypotheses
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform
 from mixpose.sensors import PinholeCamera, RangeSensor
@@ -26,6 +26,8 @@ BODY = Body("six", tuple(PointFeature(p) for p in POINTS))
 K = np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]])
 FPS = 30.0
 ALL = np.ones(6, dtype=np.bool_)
+# adjusted once where frames held back would be told, too, by five adjustments more
+NO_FRAME_HELD_BACK = CalibrationRules(least_frames=1000)
 PLACES = np.array([[0, -1000, 0], [1000, 0, 0], [0, 0, 1000.0]])
 
 

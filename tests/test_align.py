@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, command, mixpose
+from command_line import assert_one_line, command
 from pose_lines import covariance_of, lines_of, write_poses
 
 import mixpose as package
@@ -129,7 +129,7 @@ def test_the_aligned_session_sees_the_same_in_another_world(tmp_path: Path) -> N
     (tmp_path / "other").mkdir()
     write_poses(tmp_path / "poses.jsonl", estimates_at(FLOOR[None]))
     aligned = tmp_path / "other/aligned.toml"
-    done = mixpose("align", "session.toml", "--floor", "poses.jsonl", "-o", aligned, cwd=tmp_path)
+    done = command("align", "session.toml", "--floor", "poses.jsonl", "-o", aligned, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     old, new = (package.load_session(p) for p in (tmp_path / "session.toml", aligned))
     places = np.array([[0.0, 0, 0], [50, 20, 10], [-30, 5, 400]])
@@ -149,8 +149,8 @@ def test_the_aligned_session_sees_the_same_in_another_world(tmp_path: Path) -> N
     assert 'source = "../frames/*.png"' in text
     # what mixpose wrote may be written again, and what it did not may not
     again = ("align", "session.toml", "--floor", "poses.jsonl", "-o")
-    assert mixpose(*again, aligned, cwd=tmp_path).returncode == 0
-    assert mixpose(*again, "session.toml", cwd=tmp_path).returncode == 2
+    assert command(*again, aligned, cwd=tmp_path).returncode == 0
+    assert command(*again, "session.toml", cwd=tmp_path).returncode == 2
 
 
 def test_a_session_with_held_directions_and_words_that_name_nothing_are_refused(
@@ -159,10 +159,10 @@ def test_a_session_with_held_directions_and_words_that_name_nothing_are_refused(
     held = '[estimator]\nfree = ["x", "y", "rz"]\n\n[[sensor]]\nname = "camera"'
     (tmp_path / "held.toml").write_text(SESSION.replace('[[sensor]]\nname = "camera"', held, 1))
     (tmp_path / "session.toml").write_text(SESSION)
-    done = mixpose("align", "held.toml", "--floor", "tool@3", "-o", "a.toml", cwd=tmp_path)
+    done = command("align", "held.toml", "--floor", "tool@3", "-o", "a.toml", cwd=tmp_path)
     assert done.returncode == 2
     assert "estimator.free" in done.stderr
-    done = mixpose("align", "session.toml", "--floor", "board@3", "-o", "a.toml", cwd=tmp_path)
+    done = command("align", "session.toml", "--floor", "board@3", "-o", "a.toml", cwd=tmp_path)
     assert done.returncode == 2
     assert "OBJECT@FRAME with one of tool" in done.stderr
 

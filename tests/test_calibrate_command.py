@@ -74,7 +74,7 @@ def test_of_several_bodies_the_one_that_is_looked_at_is_told(bumped: Path) -> No
     path = bumped.with_name("two.toml")
     text = bumped.read_text().replace("[object]", "[[object]]").replace("[start]", "[object.start]")
     path.write_text(text + other)
-    done = mixpose("calibrate", path, "--check")
+    done = command("calibrate", path, "--check")
     assert "mixpose: of 2 bodies 'tracker' is looked at\n" in done.stderr
 
 

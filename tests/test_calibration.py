@@ -16,6 +16,7 @@ from simulated_rigs import (
     ALL,
     BODY,
     FPS,
+    NO_FRAME_HELD_BACK,
     PLACES,
     POINTS,
     alone,
@@ -93,7 +94,7 @@ def test_marker_coordinates_2_mm_off_are_learnt_up_to_the_gauge() -> None:
     true = POINTS + 2 * off / np.linalg.norm(off, axis=1)[:, None]
     frames = recording(sensors, 40, 0.02, points=true)
     task = task_of(sensors, frames, free={}, body_free=True)
-    found = calibrate(task, found=alone(sensors, frames))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     a, b = (p - p.mean(axis=0) for p in (found.after.points, true))
     U, _, Vt = np.linalg.svd(a.T @ b)
     assert np.linalg.norm(a @ (U @ Vt) - b, axis=1).max() < 0.1
@@ -112,7 +113,7 @@ def test_three_range_sensors_30_mm_off_are_found_in_the_papers_gauge() -> None:
         free=dict.fromkeys(range(3), ("position",)),
         T_held=perturb(motion(0.0), np.array([2, -2, 1, 0.03, 0.02, -0.03])),
     )
-    found = calibrate(task)
+    found = calibrate(task, NO_FRAME_HELD_BACK)
     places = np.array([s.position for s in found.after.sensors])  # type: ignore[attr-defined]
 
     def in_gauge(p: Floats) -> list[float]:
@@ -167,7 +168,7 @@ def test_range_biases_come_from_known_poses() -> None:
     frames = recording(true, 40, 1.0)
     known = {frame.number: motion(frame.number / FPS) for frame in frames}
     task = task_of(sensors, frames, 5.0, free=dict.fromkeys(range(3), ("range_bias",)), known=known)
-    found = calibrate(task)
+    found = calibrate(task, NO_FRAME_HELD_BACK)
     biases = [s.range_bias for s in found.after.sensors]  # type: ignore[attr-defined]
     # 240 ranges of 1 mm noise each: 0.07 mm
     assert biases == pytest.approx([120, 180, 260], abs=0.3)
@@ -179,7 +180,7 @@ def test_what_a_body_that_never_moves_does_not_tell_is_refused_by_name() -> None
     still = tuple(replace(frame, points=frames[0].points) for frame in frames)
     known = {frame.number: motion(0.0) for frame in still}
     free = {0: ("position", "range_bias")}
-    found = calibrate(task_of(sensors, still, 5.0, free=free, known=known))
+    found = calibrate(task_of(sensors, still, 5.0, free=free, known=known), NO_FRAME_HELD_BACK)
     assert found.refused
     assert all("s0:" in text for text in found.refused)
     assert np.isinf(found.deviations).any()
@@ -189,7 +190,7 @@ def test_a_camera_without_a_common_view_is_named_and_stays() -> None:
     sensors = cameras(3)
     frames = recording(sensors, 10, 0.05)
     frames = tuple(replace(f, points={k: y for k, y in f.points.items() if k != 2}) for f in frames)
-    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    found = calibrate(task_of(sensors, frames), NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     assert found.unlinked == (2,)
     assert found.after.sensors[2] is found.before.sensors[2]
 
@@ -202,7 +203,7 @@ def test_a_frame_of_clutter_is_left_out_by_number() -> None:
     noise = {k: rng.uniform(50, 450, (6, 2)) for k in (0, 1)}
     frames[5] = replace(frames[5], points=noise)
     task = bumped(task_of(sensors, tuple(frames)), 1, 1.0, 5.0)
-    found = calibrate(task, found=known)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=known)
     assert 5 not in found.used
     truth = sensors[1].T_sensor_world
     assert rotation_angle_deg(found.after.sensors[1].T_sensor_world, truth) < 0.03  # type: ignore[attr-defined]
@@ -213,11 +214,13 @@ def test_a_check_names_the_one_camera_of_three_that_was_bumped() -> None:
     frames = recording(sensors, 14, 0.05)
     for index, turn_deg in ((0, 0.5), (2, 0.0)):
         found = calibrate(
-            bumped(task_of(sensors, frames), index, turn_deg, 4.0), found=alone(sensors, frames)
+            bumped(task_of(sensors, frames), index, turn_deg, 4.0),
+            NO_FRAME_HELD_BACK,
+            found=alone(sensors, frames),
         )
         told = displacements(found, CalibrationRules())
         assert [one.name for one in told if one.moved] == [f"s{index}"]
-    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    found = calibrate(task_of(sensors, frames), NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     assert not any(one.moved for one in displacements(found, CalibrationRules()))
 
 

@@ -10,6 +10,7 @@ import pytest
 from simulated_rigs import (
     BODY,
     FPS,
+    NO_FRAME_HELD_BACK,
     PLACES,
     POINTS,
     alone,
@@ -38,9 +39,14 @@ def test_deviations_know_of_a_bias_that_is_held_and_may_be_off() -> None:
     sensors = [RangeSensor(PLACES[0])]
     frames = recording(sensors, 40, 0.1)
     task = task_of(sensors, frames, 5.0, free={0: ("position",)}, known=POSES)
-    plain = calibrate(task)
-    stated = calibrate(replace(task, errors={0: CalibrationError(range_bias=1.0)}))
-    off = calibrate(replace(task, rig=task.rig.exchanged(0, RangeSensor(PLACES[0], range_bias=1))))
+    plain = calibrate(task, NO_FRAME_HELD_BACK)
+    stated = calibrate(
+        replace(task, errors={0: CalibrationError(range_bias=1.0)}), NO_FRAME_HELD_BACK
+    )
+    off = calibrate(
+        replace(task, rig=task.rig.exchanged(0, RangeSensor(PLACES[0], range_bias=1))),
+        NO_FRAME_HELD_BACK,
+    )
     # to first order the place moves by what a bias of one standard deviation moves it
     added = np.sqrt(stated.deviations**2 - plain.deviations**2)
     assert added == pytest.approx(np.abs(places(off) - places(plain)), rel=0.02, abs=1e-3)
@@ -52,7 +58,7 @@ def test_a_turn_that_is_held_makes_the_other_camera_as_uncertain() -> None:
     sensors = cameras(2)
     frames = recording(sensors, 12, 0.02)
     task = replace(task_of(sensors, frames), errors={0: CalibrationError(rotation_deg=0.2)})
-    found = calibrate(task, found=alone(sensors, frames))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     turn = np.degrees(np.sqrt((found.deviations[3:] ** 2).sum()))
     # the second turns with the first: 0.2 degrees about each of three axes
     assert turn == pytest.approx(0.2 * np.sqrt(3), rel=0.02)
@@ -68,7 +74,9 @@ def test_a_direction_that_a_bias_hides_is_named_and_stays() -> None:
     sensors = [RangeSensor(PLACES[0])]
     frames = recording(sensors, 40, 0.1)
     task = task_of(sensors, frames, 5.0, free={0: ("position",)}, known=POSES)
-    found = calibrate(replace(task, errors={0: CalibrationError(range_bias=900.0)}))
+    found = calibrate(
+        replace(task, errors={0: CalibrationError(range_bias=900.0)}), NO_FRAME_HELD_BACK
+    )
     # the sensor stands 1 m away along y: a quarter of that is no knowledge of it
     assert found.refused
     assert all(text.startswith("s0:position y") for text in found.refused)
@@ -78,7 +86,7 @@ def test_biases_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     sensors = [RangeSensor(p) for p in PLACES]
     frames = recording(sensors, 20, 0.1)
     free = dict.fromkeys(range(3), ("position",))
-    found = calibrate(task_of(sensors, frames, 5.0, free=free, known=POSES))
+    found = calibrate(task_of(sensors, frames, 5.0, free=free, known=POSES), NO_FRAME_HELD_BACK)
     told = [line for line in lines_of(found, "mm") if line.startswith("held")]
     assert len(told) == 1
     # a bias of 5 mm moves a sensor about 5 mm along its line of sight, or more across
@@ -89,8 +97,13 @@ def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it()
     sensors = cameras(2)
     off = POINTS + np.eye(6)[:, 3:4] * [0.0, 0.0, 2.0]
     exact, wrong = (recording(sensors, 16, 0.05, points=each) for each in (POINTS, off))
-    assert calibrate(task_of(sensors, exact), found=alone(sensors, exact)).contradicted is None
-    found = calibrate(task_of(sensors, wrong), found=alone(sensors, wrong))
+    assert (
+        calibrate(
+            task_of(sensors, exact), NO_FRAME_HELD_BACK, found=alone(sensors, exact)
+        ).contradicted
+        is None
+    )
+    found = calibrate(task_of(sensors, wrong), NO_FRAME_HELD_BACK, found=alone(sensors, wrong))
     true, T = (s[1].T_sensor_world for s in (sensors, found.after.sensors))  # type: ignore[attr-defined]
     away = np.abs(T[:3, 3] - true[:3, 3]) / found.deviations[:3]
     assert away.max() > 2.5  # 0.5 % of cameras whose deviations hold are that far off
@@ -100,13 +113,15 @@ def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it()
     assert held.moves > 2.5
     assert any("add --free body to what is free" in text for text in doubts_of(found, "mm"))
     freed = task_of(sensors, wrong, body_free=True)
-    assert calibrate(freed, found=alone(sensors, wrong)).contradicted is None
+    assert calibrate(freed, NO_FRAME_HELD_BACK, found=alone(sensors, wrong)).contradicted is None
 
 
 def test_a_late_camera_whose_delay_is_held_is_named() -> None:
     sensors = cameras(2)
     frames = recording(sensors, 16, 0.05, late=0.004)
-    held = calibrate(task_of(sensors, frames), found=alone(sensors, frames)).contradicted
+    held = calibrate(
+        task_of(sensors, frames), NO_FRAME_HELD_BACK, found=alone(sensors, frames)
+    ).contradicted
     assert held is not None
     assert held.words.endswith(":delay")  # of one or the other: only their difference is told
 
@@ -139,7 +154,9 @@ def test_a_camera_that_sees_three_features_at_a_time_is_placed_by_the_others() -
         sensors[:2], [replace(f, points={0: f.points[0], 1: f.points[1]}) for f in frames]
     )
     known |= {(frame.number, 2): NOTHING for frame in frames}
-    found = calibrate(bumped(task_of(sensors, frames), 2, 3.0, 40.0), found=known)
+    found = calibrate(
+        bumped(task_of(sensors, frames), 2, 3.0, 40.0), NO_FRAME_HELD_BACK, found=known
+    )
     truth = sensors[2].T_sensor_world
     T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
     # three standard deviations as told: 0.033 degrees, 0.47 mm
@@ -152,7 +169,9 @@ def test_one_camera_that_knows_no_pose_alone_is_placed_by_known_poses() -> None:
     sensors = cameras(1)
     frames = recording(sensors, 6, 0.05)
     task = bumped(task_of(sensors, frames, free={0: ("pose",)}, known=POSES), 0, 1.0, 5.0)
-    found = calibrate(task, found={(frame.number, 0): NOTHING for frame in frames})
+    found = calibrate(
+        task, NO_FRAME_HELD_BACK, found={(frame.number, 0): NOTHING for frame in frames}
+    )
     T = found.after.sensors[0].T_sensor_world  # type: ignore[attr-defined]
     # three standard deviations as told: 0.016 degrees
     assert rotation_angle_deg(T, sensors[0].T_sensor_world) < 0.05

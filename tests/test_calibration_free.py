@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 from rounding import rounding
 from scipy.spatial.transform import Rotation
-from simulated_rigs import BODY, FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
+from simulated_rigs import (
+    BODY,
+    FPS,
+    NO_FRAME_HELD_BACK,
+    POINTS,
+    alone,
+    bumped,
+    cameras,
+    motion,
+    recording,
+    task_of,
+)
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame, calibrate
@@ -46,7 +57,9 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
     frames = recording(true, 40, 0.02)
     free = {1: ("pose", "focal", "principal_point")}
     believed = [true[0], replace(true[1], camera_matrix=matrix)]
-    found = calibrate(task_of(believed, frames, free=free), found=alone(true, frames))
+    found = calibrate(
+        task_of(believed, frames, free=free), NO_FRAME_HELD_BACK, found=alone(true, frames)
+    )
     off = found.after.sensors[1].camera_matrix - true[1].camera_matrix  # type: ignore[attr-defined]
     assert [(b.kind, b.names) for b in found.blocks[1:]] == [
         ("focal", ("f",)),
@@ -88,7 +101,7 @@ def test_cameras_that_read_row_after_row_are_no_worse() -> None:
     frames = recording(sensors, 40, 0.02, look=look)
     task = task_of(sensors, frames)
     task = replace(task, rig=replace(task.rig, readouts=np.full(2, readout)))
-    found = calibrate(task, found=alone(sensors, frames))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     # as if all rows were read at once; without readouts 0.38 px are left
     assert (found.noise < 0.022).all()
     off = centre_of(found.after.sensors[1]) - centre_of(sensors[1])
@@ -105,7 +118,7 @@ def test_images_of_large_spheres_move_no_camera() -> None:
 
     frames = recording(true, 40, 0.02, look=look)
     task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large), body=large)
-    found = calibrate(task, found=alone(true, frames))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(true, frames))
     off = centre_of(found.after.sensors[1]) - centre_of(true[1])
     # as points they would move it by 0.4 mm, nine standard deviations
     assert np.linalg.norm(off) < 3 * np.linalg.norm(found.deviations[:3])
@@ -117,7 +130,7 @@ def test_a_body_that_is_sought_does_not_make_frames_differ(seed: int) -> None:
     sensors = cameras(3)
     frames = recording(sensors, 40, 0.05, seed=seed)
     task = task_of(sensors, frames, body_free=True)
-    assert calibrate(task, found=alone(sensors, frames)).inflation == 1
+    assert calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames)).inflation == 1
 
 
 def test_a_clock_that_is_late_and_runs_slow_is_found() -> None:
@@ -125,7 +138,9 @@ def test_a_clock_that_is_late_and_runs_slow_is_found() -> None:
     middle = 59 / FPS / 2
     frames = recording(sensors, 60, 0.02, late=lambda time: 0.004 + 0.003 * (time - middle))
     free = {1: ("pose", "delay", "drift")}
-    found = calibrate(task_of(sensors, frames, free=free), found=alone(sensors, frames))
+    found = calibrate(
+        task_of(sensors, frames, free=free), NO_FRAME_HELD_BACK, found=alone(sensors, frames)
+    )
     assert found.after.delays[1] == pytest.approx(0.004, abs=0.1e-3)
     assert found.after.drifts[1] == pytest.approx(0.003, abs=0.2e-3)
     assert (found.deviations[6:] < [0.05e-3, 0.1e-3]).all()
@@ -146,7 +161,7 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
         key: replace(one, poses=from_parts(one.poses[:, :3, :3], 0.97 * one.poses[:, :3, 3]))
         for key, one in alone(true, frames).items()
     }
-    found = in_length(calibrate(task, found=small_poses), f"s0:s1={length}")
+    found = in_length(calibrate(task, NO_FRAME_HELD_BACK, found=small_poses), f"s0:s1={length}")
     a, b = (centre_of(sensor) for sensor in found.after.sensors)
     assert np.linalg.norm(b - a) == pytest.approx(length)
     size = np.linalg.norm(found.after.points - found.after.points.mean(axis=0), axis=1)
@@ -165,7 +180,9 @@ def test_what_the_known_length_errs_by_is_in_all_deviations() -> None:
     sensors = cameras(3)
     frames = recording(sensors, 8, 0.02)
     free: dict[int, Any] = {1: ("pose",), 2: ("pose", "focal")}
-    found = calibrate(task_of(sensors, frames, free=free), found=alone(sensors, frames))
+    found = calibrate(
+        task_of(sensors, frames, free=free), NO_FRAME_HELD_BACK, found=alone(sensors, frames)
+    )
     words = f"s0:s1={2 * np.linalg.norm(centre_of(sensors[1]) - centre_of(sensors[0]))}"
     rng = np.random.default_rng(0)
     for _ in range(4):  # one error of the rig, small enough to be linear, and what comes of it
@@ -185,7 +202,7 @@ def test_what_the_known_length_errs_by_is_in_all_deviations() -> None:
 def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None:
     sensors = cameras(2)
     frames = recording(sensors, 12, 0.05)
-    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    found = calibrate(task_of(sensors, frames), NO_FRAME_HELD_BACK, found=alone(sensors, frames))
     first, second = (one.T_sensor_world for one in found.after.sensors)  # type: ignore[attr-defined]
     moved = in_world(found, "s1")
     a, b = (one.T_sensor_world for one in moved.after.sensors)  # type: ignore[attr-defined]
@@ -207,7 +224,9 @@ def test_deviations_in_the_frame_of_a_sensor_know_how_that_errs() -> None:
     frames = recording(sensors, 20, 0.05)
     free: Any = {0: ("pose",), 1: ("pose",), 2: ("position",)}
     known = alone(sensors[:2], [frame.without({2}) for frame in frames])
-    found = calibrate(task_of(sensors, frames, free=free, known=poses), found=known)
+    found = calibrate(
+        task_of(sensors, frames, free=free, known=poses), NO_FRAME_HELD_BACK, found=known
+    )
     step = 1e-3 * np.random.default_rng(3).normal(0, 1, 15) * np.repeat([1, 1e-3, 1, 1e-3, 1], 3)
     told = in_world(replace(found, covariance=np.outer(step, step)), "s1").deviations
     off = in_world(replace(found, after=rig_moved(found.after, found.blocks, step)), "s1").after
@@ -236,7 +255,7 @@ def test_a_camera_that_shares_no_view_with_the_first_is_linked_through_another()
         frames.append(replace(frame, points=points))
     known = alone(sensors, tuple(frames))
     task = bumped(bumped(task_of(sensors, tuple(frames)), 2, 2.0, 20.0), 1, 1.0, 5.0)
-    found = calibrate(task, found=known)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=known)
     assert {k: other for k, (other, _) in found.through.items()} == {1: 0, 2: 1}
     T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
     assert rotation_angle_deg(T, sensors[2].T_sensor_world) < 0.05
@@ -277,6 +296,6 @@ def test_frames_that_are_chosen_tell_more_than_frames_spread_evenly() -> None:
     for chosen in (informative(frames, 2, 12, runs=False), frames[:: 400 // 12][:12]):
         known = alone(sensors, chosen, lambda k: motion(max(k - 360, 0) / FPS))
         task = task_of(sensors, tuple(chosen), free={1: ("pose", "focal")})
-        told.append(calibrate(task, found=known).deviations[-1])
+        told.append(calibrate(task, NO_FRAME_HELD_BACK, found=known).deviations[-1])
     # a focal length takes several distances and turns: 1.6 px against 2.9 px
     assert told[0] < 0.7 * told[1]

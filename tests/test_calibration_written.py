@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calibration_texts import kalibr
-from simulated_rigs import POINTS, alone, cameras, recording, task_of
+from simulated_rigs import NO_FRAME_HELD_BACK, POINTS, alone, cameras, recording, task_of
 
 from mixpose.calibration import Calibration, Rig, calibrate
 from mixpose.calibration.rig import centre_of
@@ -37,7 +37,7 @@ def calibrated(session: Session, **options: Any) -> Calibration:
     sensors: Any = [one.sensor for one in session.sensors]
     frames = recording(sensors, FRAMES, 0.01)
     task = replace(task_of(sensors, frames, **options), rig=rig_of(session), body=session.body)
-    return calibrate(task, found=alone(sensors, frames))
+    return calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
 
 
 def text_of(objects: str = "[object]", head: str = "") -> str:

@@ -6,8 +6,6 @@ import csv
 import json
 import os
 import re
-import subprocess
-import sys
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import command
 from scipy.spatial.transform import Rotation
 
 import mixpose
@@ -235,8 +234,7 @@ def test_a_table_of_pixels_is_no_cloud(seven: Recording) -> None:
 
 
 def run(*arguments: str | Path) -> str:
-    command = [sys.executable, "-m", "mixpose", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = command(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import command
 from moving_bodies import (
     CAMERA_MATRIX,
     RESOLUTION,
@@ -225,8 +224,7 @@ def test_one_camera_is_refused_with_what_to_do_instead(tmp_path: Path) -> None:
 def test_the_command_writes_a_table_that_the_same_session_reads(tmp_path: Path) -> None:
     points, poses = moving(4, 5)
     path = write_recording(tmp_path, detections([(points, poses)], CAMERAS, SHORT, 1), CAMERAS)
-    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = command("learn", path, "-o", "body.csv", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "body.csv: 4 markers" in done.stdout
     assert "4 other points stood still" in done.stderr
@@ -242,8 +240,7 @@ def test_what_no_camera_saw_is_said_to_be_left_out(tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_text("frame,x,y,z\n0,1,2,3\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as session:
         session.write('\n[[sensor]]\nname = "points"\nmodel = "cloud"\nsource = "points.csv"\n')
-    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = command("learn", path, "-o", "body.csv", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "points: bodies are learnt from what cameras see, and not from this" in done.stderr
 
@@ -251,8 +248,7 @@ def test_what_no_camera_saw_is_said_to_be_left_out(tmp_path: Path) -> None:
 def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
     path = write_recording(tmp_path, [[np.zeros((0, 2))] * 2], CAMERAS)
     (tmp_path / "body.csv").write_text("name,x,y,z\na,0,0,0\n", encoding="utf-8")
-    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = command("learn", path, "-o", "body.csv", cwd=tmp_path)
     assert done.returncode == 2
     assert "holds something that mixpose did not write" in done.stderr
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import command, mixpose
+from command_line import command
 from pose_lines import covariance_of, lines_of, measured, write_poses
 from scipy.signal import lfilter
 from scipy.stats import chi2
@@ -178,11 +178,11 @@ def test_a_tip_is_written_into_the_session_and_told_with_each_pose(tmp_path: Pat
         Path(__file__).parents[1] / "data/synthetic/two_cameras/session.toml", tmp_path / "s.toml"
     )
     options = ("--frames", "24", "--translation", "0", "--rotation", "30", "--seed", "3")
-    assert mixpose("simulate", "s.toml", "-o", "try", *options, cwd=tmp_path).returncode == 0
+    assert command("simulate", "s.toml", "-o", "try", *options, cwd=tmp_path).returncode == 0
     session, poses = tmp_path / "try/session.toml", tmp_path / "poses.jsonl"
     write_poses(poses, list(package.run(package.load_session(session))))
     before = session.read_text(encoding="utf-8")
-    done = mixpose("pivot", poses, "--into", session)
+    done = command("pivot", poses, "--into", session)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("tip of tracker: (")
     after = session.read_text(encoding="utf-8")
@@ -216,11 +216,11 @@ def test_options_that_name_nothing_are_refused(tmp_path: Path) -> None:
     pivoting = run_of(1)
     path = tmp_path / "poses.jsonl"
     write_poses(path, lines_of(pivoting.poses, pivoting.covariances[0]))
-    done = mixpose("pivot", path, "--reference", "base")
+    done = command("pivot", path, "--reference", "base")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "--reference base" in done.stderr
-    assert mixpose("pivot", path, "--reference", "tool").returncode == 2
-    assert mixpose("pivot", path, "--into", tmp_path / "none.toml").returncode == 2
+    assert command("pivot", path, "--reference", "tool").returncode == 2
+    assert command("pivot", path, "--into", tmp_path / "none.toml").returncode == 2
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])

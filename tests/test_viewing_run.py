@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, mixpose, wait_until
+from command_line import assert_one_line, command, wait_until
 from report_runs import estimate
 
 from mixpose.errors import SessionError
@@ -79,7 +79,7 @@ def test_a_run_steps_as_the_page_says_and_goes_on_when_nobody_looks(tmp_path: Pa
         said = process.stderr.read()
         assert process.wait() == 0
     assert said == "mixpose: 8 frames: 8 ok\n"
-    assert poses(written) == poses(mixpose("run", TWO, "--stop", "8").stdout)
+    assert poses(written) == poses(command("run", TWO, "--stop", "8").stdout)
 
 
 @needs_proc
@@ -170,8 +170,8 @@ def test_without_its_package_the_page_says_what_to_install(monkeypatch: pytest.M
 
 
 def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
-    assert_one_line(mixpose("run", TWO, "--pause"), 2, "--pause", "--view")
-    many = mixpose("run", TWO, RANGES, "-o", tmp_path / "many", "--view")
+    assert_one_line(command("run", TWO, "--pause"), 2, "--pause", "--view")
+    many = command("run", TWO, RANGES, "-o", tmp_path / "many", "--view")
     assert_one_line(many, 2, "--view: found 2 sessions, allowed with one only")
     with pytest.raises(SessionError, match="--pause: a live source does not wait"):
         Viewer(load_session(TWO), "0", print, on_files=False, paused=True)

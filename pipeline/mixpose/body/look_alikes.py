@@ -128,17 +128,18 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
         if _is_narrow(points[base], tolerance):
             continue
         images = congruent_triples(points[base], targets, 2 * tolerance)
-        for image in images:
-            pairs = set(zip(triple, image.tolist(), strict=True))
-            if body is other and all(i == j for i, j in pairs):
-                continue
-            if any(pairs <= _pairs(known) for known in found):
-                continue
-            part = _grown(body, other, base, image, tolerance)
+        if body is other:
+            images = images[(images != base).any(axis=1)]
+        for known in found:
+            images = images[~_within(images, base, known)]
+        while len(images):
+            part = _grown(body, other, base, images[0], tolerance)
+            images = images[1:]
             if part is None or any(_pairs(part) <= _pairs(known) for known in found):
                 continue
             found = [known for known in found if not _pairs(known) <= _pairs(part)]
             found.append(part)
+            images = images[~_within(images, base, part)]
     return tuple(sorted(found, key=lambda part: (-len(part.features), part.off)))
 
 
@@ -306,6 +307,12 @@ def _grown(
     if near.sum() < FEWEST:
         return None
     return _fitted(body, other, np.flatnonzero(near), partners[near])
+
+
+def _within(images: NDArray[np.intp], base: list[int], part: LookAlike) -> NDArray[np.bool_]:
+    """Whether a part pairs a triple of the body with images (K, 3) of it."""
+    partners = dict(zip(part.features, part.partners, strict=True))
+    return np.asarray((images == [partners.get(own, -1) for own in base]).all(axis=1))
 
 
 def _pairs(part: LookAlike) -> set[tuple[int, int]]:

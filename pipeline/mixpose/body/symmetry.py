@@ -126,13 +126,25 @@ def widest_triple(points: Floats) -> tuple[int, int, int]:
 
 def congruent_triples(base: Floats, points: Floats, slack: float) -> NDArray[np.intp]:
     """Ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
-    sides = np.linalg.norm(base[[1, 2, 2]] - base[[0, 0, 1]], axis=1)
     apart = cdist(points, points)
     np.fill_diagonal(apart, np.inf)
-    i, j = np.nonzero(np.abs(apart - sides[0]) <= slack)
-    fits = (np.abs(apart[i] - sides[1]) <= slack) & (np.abs(apart[j] - sides[2]) <= slack)
+    return congruent_triples_of_each(base, apart[None], np.array([slack]))[1]
+
+
+def congruent_triples_of_each(
+    base: Floats, apart: Floats, slack: Floats
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Such triples of several clouds of points, by distances (C, N, N); and the cloud (K,) of each.
+
+    Sides may be off by the slack (C,) of the cloud.
+    """
+    sides = np.linalg.norm(base[[1, 2, 2]] - base[[0, 0, 1]], axis=1)
+    cloud, i, j = np.nonzero(np.abs(apart - sides[0]) <= slack[:, None, None])
+    most = slack[cloud, None]
+    fits = np.abs(apart[cloud, i] - sides[1]) <= most
+    fits &= np.abs(apart[cloud, j] - sides[2]) <= most
     pair, k = np.nonzero(fits)
-    return np.column_stack([i[pair], j[pair], k])
+    return cloud[pair], np.column_stack([i[pair], j[pair], k])
 
 
 def motions(source: Floats, targets: Floats) -> Floats:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -121,21 +121,23 @@ def normal_equations(
     P = len(free) * len(bundle.frames)
     edges = G + np.cumsum([0] + [rows.by_held.shape[2] for rows, _ in weighted])
     Q = int(edges[-1])  # parameters that are free and that are held
-    H_gg, b_g = np.zeros((Q, Q)), np.zeros(Q)
-    W, b_p, H_pp = np.zeros((P, Q)), np.zeros(P), sp.csr_matrix((P, P))
+    # of all sensors at once: what SciPy does beside the sums takes longer than these
+    A = np.zeros((sum(rows.residual.size for rows, _ in weighted), Q))
+    parts, r, done = [], np.zeros(len(A)), 0
     for (rows, weight), start, stop in zip(weighted, edges, edges[1:]):
-        root = np.sqrt(weight)
-        A = np.zeros((*rows.residual.shape, Q))
-        A[:, :, :G], A[:, :, start:stop] = rows.by_rig, rows.by_held
-        A = (A * root[:, None, None]).reshape(rows.residual.size, Q)
-        r = (rows.residual * root[:, None]).ravel()
-        H_gg += A.T @ A
-        b_g += A.T @ r
-        if P:
-            B = _pose_columns(rows, bundle.clock, root, free, P)
-            H_pp, W, b_p = H_pp + B.T @ B, W + B.T @ A, b_p + B.T @ r
+        root, size = np.sqrt(weight)[:, None, None], rows.residual.size
+        own = slice(done, done + size)
+        A[own, :G] = (rows.by_rig * root).reshape(size, G)
+        A[own, start:stop] = (rows.by_held * root).reshape(size, stop - start)
+        r[own] = (rows.residual * root[:, 0]).ravel()
+        parts.append(_pose_columns(rows, bundle.clock, root, free))
+        done += size
+    H_gg, b_g = A.T @ A, A.T @ r
     if not P:
-        return H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: b_p
+        return H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: np.zeros(0)
+    values, columns, filled = (np.concatenate(each) for each in zip(*parts, strict=True))
+    B = sp.csr_matrix((values, columns, np.append(0, np.cumsum(filled))), shape=(len(A), P))
+    H_pp, W, b_p = B.T @ B, B.T @ A, B.T @ r
     diagonal = H_pp.diagonal()
     floor = 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
     factor = splu((H_pp + sp.diags(damping * diagonal + floor)).tocsc())
@@ -145,21 +147,17 @@ def normal_equations(
     return (S[:G] + S[:G].T) / 2, S[G:].T, b, lambda step: factor.solve(b_p - W[:, :G] @ step)
 
 
-def _pose_columns(rows: Rows, clock: Clock, root: Floats, free: Indices, P: int) -> Any:
-    """Sparse Jacobian (n m, P) of weighted residuals by the free directions of all poses."""
+def _pose_columns(
+    rows: Rows, clock: Clock, root: Floats, free: Indices
+) -> tuple[Floats, Indices, Indices]:
+    """Weighted residuals (n m,) by the free directions of poses: values, where, and how many."""
     n, m = rows.residual.shape
     d = len(free)
     used = [0] if not rows.shares[:, 1:].any() else [0, 1, 2, 3]
-    J = rows.by_pose[:, :, free] * root[:, None, None]
-    value, column = [], []
-    for node in used:
-        value.append(J * rows.shares[:, node, None, None])
-        place = clock.nodes[rows.pairs.frame, node, None] * d + np.arange(d)
-        column.append(np.repeat(place[:, None, :], m, axis=1))
-    values = np.concatenate(value, axis=2).ravel()
-    columns = np.concatenate(column, axis=2).ravel()
-    row = np.repeat(np.arange(n * m), d * len(used))
-    return sp.csr_matrix((values, (row, columns)), shape=(n * m, P))
+    J = (rows.by_pose[:, :, free] * root)[:, :, None] * rows.shares[:, None, used, None]
+    place = clock.nodes[rows.pairs.frame][:, used, None] * d + np.arange(d)
+    columns = np.repeat(place.reshape(n, 1, d * len(used)), m, axis=1)
+    return J.ravel(), columns.ravel(), np.full(n * m, d * len(used))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,11 @@ pose is the cubic through the frames next to it, in the twists that lead there f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.calibration.rig import Rig, State
@@ -25,6 +24,7 @@ from mixpose.rigid import perturb, twist_between
 from mixpose.sensors.moving import moments, rows_apart
 
 _NODES = 4  # frames that motion is interpolated through
+_TOGETHER = 32  # frames that pairs are looked for at a time
 _STEP = 1e-3  # of a readout: motion in an image is told over it
 
 
@@ -88,10 +88,10 @@ class Interpolated(NamedTuple):
 
 def interpolate(clock: Clock, poses: Floats, frame: Indices, tau: Floats) -> Interpolated:
     """Twists from frames (n,), of poses (K, 4, 4), to the poses tau (n,) seconds later."""
-    nodes, away = clock.nodes[frame], clock.away[frame]
+    away = clock.away[frame]
     shares, slopes = _lagrange(away, tau)
-    T_here = np.repeat(poses[frame][:, None], _NODES, axis=1)
-    twists = twist_between(T_here, poses[nodes])
+    # once for each frame: there are as many of one as it has pairs
+    twists = twist_between(np.repeat(poses[:, None], _NODES, axis=1), poses[clock.nodes])[frame]
     return Interpolated(
         np.einsum("nj,njk->nk", shares, twists),
         np.einsum("nj,njk->nk", slopes, twists),
@@ -144,21 +144,19 @@ def match(
     Pairs whose weight is less than `faintest` are left out.
     """
     reach = 2 * blur * np.sqrt(-np.log(faintest))
+    y, visible = _seen(state, clock, sensor)
     none = np.zeros(0, dtype=np.intp)
-    dimension = state.rig.sensors[sensor].dimension
-    parts: list[tuple[NDArray[np.generic], ...]] = [
-        (none, none, none, np.zeros((0, dimension)), np.zeros(0), none > 0)
-    ]
-    for k, features, y, points in _seen(state, frames, clock, sensor):
-        i, j, share, nearest = _near(y, points, blur, reach)
-        parts.append((np.full(len(i), k), features[i], j, points[j], share, nearest))
+    parts = [(none, none, none, y[none, 0], np.zeros(0), none > 0)]
+    for first in range(0, len(frames), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        points = _filled_up(frames[some], sensor, y.shape[2])
+        k, i, j, share, nearest = _near(y[some], visible[some], points, blur, reach)
+        parts.append((first + k, i, j, points[k, j], share, nearest))
     return Pairs(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def _seen(
-    state: State, frames: Sequence[SeenFrame], clock: Clock, sensor: int
-) -> Iterator[tuple[int, Indices, Floats, Floats]]:
-    """Of frames in which a sensor sees something: features in view, where, and detections."""
+def _seen(state: State, clock: Clock, sensor: int) -> tuple[Floats, Mask]:
+    """Where features (K, N, m) are for a sensor when it looks, and whether they are in view."""
     poses, frame = state.poses, np.arange(len(state.poses))
     tau = clock.tau(state.rig, sensor, frame)
     if tau.any():
@@ -172,32 +170,43 @@ def _seen(
         rate, eye = (y_ahead - y) / step, state.rig.sensors[sensor]
         after = moments(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / rows_apart(eye))
         y, visible = y + rate * after[..., None], visible & there
-    for k, each in enumerate(frames):
-        points = each.points.get(sensor)
-        if points is not None and len(points) and visible[k].any():
-            features = np.flatnonzero(visible[k])
-            yield k, features, y[k, features], points
+    return y, visible
+
+
+def _filled_up(frames: Sequence[SeenFrame], sensor: int, dimension: int) -> Floats:
+    """Detections (K, D, m) of frames, infinitely far where there are fewer."""
+    seen = [frame.points.get(sensor, np.zeros((0, dimension))) for frame in frames]
+    points = np.full((len(frames), max(1, *map(len, seen)), dimension), np.inf)
+    for k, each in enumerate(seen):
+        points[k, : len(each)] = each
+    return points
 
 
 def _near(
-    y: Floats, points: Floats, blur: float, reach: float
-) -> tuple[Indices, Indices, Floats, Mask]:
-    """Pairs within reach: features, detections, shares, and whether they are nearest."""
-    away = y[:, None, :] - points[None, :, :]
-    squared = (away * away).sum(axis=2)
+    y: Floats, visible: Mask, points: Floats, blur: float, reach: float
+) -> tuple[Indices, Indices, Indices, Floats, Mask]:
+    """Pairs within reach: frames, features, detections, shares, and whether they are nearest."""
+    away = np.where(visible[..., None], y, np.nan)[:, :, None] - points[:, None]
+    squared = (away * away).sum(axis=3)
+    squared[np.isnan(squared)] = np.inf
     kernel = np.exp(-squared / (4 * blur * blur)) * (squared < reach * reach)
-    rivals = np.maximum(kernel.sum(axis=1)[:, None], kernel.sum(axis=0))
-    least = (squared == squared.min(axis=1)[:, None]) & (squared == squared.min(axis=0))
-    i, j = np.nonzero(kernel)
-    return i, j, kernel[i, j] / rivals[i, j], least[i, j]
+    rivals = np.maximum(kernel.sum(axis=2)[:, :, None], kernel.sum(axis=1)[:, None])
+    least = squared == squared.min(axis=2)[:, :, None]
+    least &= squared == squared.min(axis=1)[:, None]
+    k, i, j = there = np.nonzero(kernel)
+    return k, i, j, kernel[there] / rivals[there], least[there]
 
 
 def nearest_distance(
     state: State, frames: Sequence[SeenFrame], clock: Clock, sensor: int
 ) -> Floats:
     """Distance of every predicted feature in view to the nearest detection, all frames together."""
-    found = [cKDTree(points).query(y)[0] for _, _, y, points in _seen(state, frames, clock, sensor)]
-    return np.concatenate([np.zeros(0), *found])
+    found = [np.zeros(0)]
+    for frame, y, visible in zip(frames, *_seen(state, clock, sensor), strict=True):
+        points = frame.points.get(sensor)
+        if points is not None and len(points):
+            found.append(cKDTree(points).query(y[visible])[0])
+    return np.concatenate(found)
 
 
 def feature_spacing(state: State, sensor: int) -> float:

@@ -5,13 +5,15 @@ Each begins with a shape: points of one frame that lie alike in others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from mixpose.body.symmetry import congruent_triples, motions
+from mixpose.body.symmetry import congruent_triples_of_each, motions
 from mixpose.calibration.task import Progress, silent
 from mixpose.learning.copies import is_chance, left_by, with_copies
 from mixpose.learning.growing import Found, grown, placed
@@ -108,7 +110,7 @@ def _shapes(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Genera
     found = list[tuple[int, Shape]]()
     for part in np.array_split(usable, min(rules.references, len(usable))):
         reference = clouds[part[np.argmax(sizes[part])]]
-        others = [clouds[k] for k in compared if clouds[k] is not reference]
+        others = _Others.of([clouds[k] for k in compared if clouds[k] is not reference])
         for triple in _near_triples(reference, rules, rng):
             scored = _scored(reference, triple, others, rules)
             if scored is not None:
@@ -138,20 +140,16 @@ def _near_triples(
 
 
 def _scored(
-    reference: Cloud, triple: tuple[int, int, int], others: Sequence[Cloud], rules: LearningRules
+    reference: Cloud, triple: tuple[int, int, int], others: _Others, rules: LearningRules
 ) -> tuple[int, Shape] | None:
     """What goes along with a triple, and how many points other frames show alike beyond two."""
     base = list(triple)
     goes_along, matched, score = np.zeros(len(reference)), 0, 0
-    seen = [reference.points[base]]
+    seen = reference.points[base][None]
     far = rules.apart * rules.gate * reference.reach[base].max()
-    for other in others:
-        there = _goes_along(reference, base, other, rules)
-        if there is None:
-            continue
-        met, places = there
-        if min(np.abs(places - each).max() for each in seen) > far:
-            seen.append(places)
+    for met, places in _going_along(reference, base, others, rules):
+        if np.abs(places - seen).max(axis=(1, 2)).min() > far:
+            seen = np.concatenate([seen, places[None]])
             matched += 1
             score += int(met.sum()) - FEWEST + 1
             goes_along += met
@@ -161,20 +159,52 @@ def _scored(
     return score, Shape(reference.points[chosen], reference.reach[chosen])
 
 
-def _goes_along(
-    reference: Cloud, base: list[int], other: Cloud, rules: LearningRules
-) -> tuple[Mask, Floats] | None:
-    """Points (P,) of a cloud that lie in another as they do about a triple, and where this is."""
+@dataclass(frozen=True, eq=False)
+class _Others:
+    """Clouds in which triples are looked for, filled up to the same number of points."""
+
+    points: Floats  # (O, P, 3)
+    reach: Floats  # (O, P)
+    apart: Floats  # (O, P, P): distances; infinite of a point to itself, and of those filled up
+    typical: Floats  # (O,): median of reach
+
+    @classmethod
+    def of(cls, clouds: Sequence[Cloud]) -> _Others:
+        """Fill clouds up."""
+        most = max(len(cloud) for cloud in clouds)
+        points, reach = np.full((len(clouds), most, 3), np.inf), np.ones((len(clouds), most))
+        apart = np.full((len(clouds), most, most), np.inf)
+        for k, cloud in enumerate(clouds):
+            points[k, : len(cloud)], reach[k, : len(cloud)] = cloud.points, cloud.reach
+            apart[k, : len(cloud), : len(cloud)] = cdist(cloud.points, cloud.points)
+        apart[:, range(most), range(most)] = np.inf
+        return cls(points, reach, apart, np.array([np.median(cloud.reach) for cloud in clouds]))
+
+
+def _going_along(
+    reference: Cloud, base: list[int], others: _Others, rules: LearningRules
+) -> Iterator[tuple[Mask, Floats]]:
+    """Points (P,) of a cloud that lie in others as they do about a triple, and where this is."""
     points = reference.points[base]
-    typical = np.hypot(np.median(other.reach), reference.reach[base].max())
-    triples = congruent_triples(points, other.points, rules.gate * np.sqrt(2.0) * typical)
-    if not len(triples):
-        return None
-    poses = motions(points, other.points[triples])
-    away, nearest = cKDTree(other.points).query(transform(poses, reference.points))
-    share = away / (2 * rules.gate * np.hypot(other.reach[nearest], reference.reach))
+    slack = rules.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())
+    cloud, triples = congruent_triples_of_each(points, others.apart, slack)
+    poses = motions(points, others.points[cloud[:, None], triples])
+    moved = transform(poses, reference.points)
+    away, reach = np.empty((2, *moved.shape[:2]))
+    edges = np.searchsorted(cloud, np.arange(len(others.points) + 1))
+    parts = [slice(*each) for each in pairwise(edges.tolist())]
+    for k, own in enumerate(parts):
+        found = cdist(others.points[k], moved[own].reshape(-1, 3))
+        nearest = found.argmin(axis=0)
+        away[own] = found[nearest, np.arange(len(nearest))].reshape(away[own].shape)
+        reach[own] = others.reach[k, nearest].reshape(away[own].shape)
+    share = away / (2 * rules.gate * np.hypot(reach, reference.reach))
     met = share < 1
-    met &= (share[:, base] < 1).all(axis=1)[:, None]
+    met &= met[:, base].all(axis=1)[:, None]
     counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
-    best = int(np.argmax(counts))
-    return (met[best], other.points[triples[best]]) if met[best].any() else None
+    for k, own in enumerate(parts):
+        if own.start == own.stop:
+            continue
+        best = own.start + int(np.argmax(counts[own]))
+        if met[best].any():
+            yield met[best], others.points[k, triples[best]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -41,12 +42,12 @@ class Placement:
     met: Indices  # (N,): the point of the cloud that each point of the shape is; -1 for none
     off: float  # root mean square distance of the two, by what they may be off
 
-    @property
+    @cached_property
     def own(self) -> Indices:
         """Points of the shape that are met."""
         return np.flatnonzero(self.met >= 0)
 
-    @property
+    @cached_property
     def there(self) -> Indices:
         """Points of the cloud that they meet."""
         return self.met[self.own]

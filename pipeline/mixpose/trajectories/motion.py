@@ -34,7 +34,8 @@ ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
 )
-_TRACE = np.eye(3).ravel()
+_EYE = np.eye(3)
+_TRACE = _EYE.ravel()
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 
@@ -60,7 +61,7 @@ class States(NamedTuple):
 
     def moved(self, errors: Floats, covariances: Floats) -> States:
         """These states moved by errors (G, 6 p), with other covariances."""
-        poses = _perturbed(self.poses, errors[:, :3], _turn(_across(errors[:, 3:6])))
+        poses = perturbed(self.poses, errors[:, :3], turn_by(skew(errors[:, 3:6])))
         return States(poses, self.rates + errors[:, 6:].reshape(self.rates.shape), covariances)
 
     def mixed(self, others: States, is_other: Mask) -> States:
@@ -83,9 +84,9 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     moved = powers[1:p] @ states.rates
     if p > 2:  # Magnus: a turn that changes its axis
         changing = (powers[3:5] * [0.5, 1.0])[: p - 2] @ states.rates[:, 1:3, 3:]
-        moved[:, 3:] += (_across(changing) @ states.rates[:, 0, 3:, None])[..., 0]
-    across = _across(moved[:, 3:])
-    turn = _turn(across)
+        moved[:, 3:] += (skew(changing) @ states.rates[:, 0, 3:, None])[..., 0]
+    across = skew(moved[:, 3:])
+    turn = turn_by(across)
     F = by_taylor[None].repeat(len(turn), axis=0)
     # what a turn does to errors of rates is told to first order in it
     F[:, 0, 3:, 0, 3:] = turn
@@ -93,7 +94,7 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     F = F.reshape(states.covariances.shape)
     covariances = F @ states.covariances @ F.swapaxes(1, 2) + _process_noise(elapsed, p, noise)
     rates = by_taylor[: p - 1, 0, : p - 1, 0] @ states.rates
-    return States(_perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
+    return States(perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
 
 
 def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, Floats, Floats]:
@@ -107,10 +108,11 @@ def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, F
     S = P[:, :6, :6] + covariance
     scale = 1 / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
     both = scale[:, :, None] * scale[:, None]
-    inverse = np.linalg.inv(S * both) * both
+    scaled = S * both
+    inverse = np.linalg.inv(scaled) * both
     gains = P[:, :, :6] @ inverse
     squared = ((inverse @ rest[..., None])[..., 0] * rest).sum(axis=1)
-    log_determinants = np.linalg.slogdet(S * both)[1] - 2 * np.log(scale).sum(axis=1)
+    log_determinants = np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum(axis=1)
     # Joseph's form: symmetric, and positive whatever rounding does
     left = P - gains @ P[:, :6]
     covariances = left + (gains @ covariance - left[:, :, :6]) @ gains.swapaxes(1, 2)
@@ -157,19 +159,19 @@ def smoothed(
 # For a few poses at a time the functions of `mixpose.rigid` take five times as long.
 
 
-def _across(vectors: Floats) -> Floats:
+def skew(vectors: Floats) -> Floats:
     """[ω] (G, 3, 3) of vectors (G, 3): x -> ω × x."""
     return np.asarray((vectors @ _ACROSS).reshape(-1, 3, 3))
 
 
-def _turn(across: Floats) -> Floats:
+def turn_by(across: Floats) -> Floats:
     """Rotations exp [ω] (G, 3, 3), by O. Rodrigues."""
     angle = np.sqrt((across**2).sum(axis=(1, 2), keepdims=True) / 2) + 1e-300
     half = np.sin(angle / 2) / angle
-    return np.asarray(np.eye(3) + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
+    return np.asarray(_EYE + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
 
 
-def _perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
+def perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
     """Poses (G, 4, 4) after shifts (G, 3) and turns (G, 3, 3) in world axes."""
     moved = poses.copy()
     moved[:, :3, :3] = turn @ poses[:, :3, :3]
@@ -202,9 +204,10 @@ def _step(elapsed: float, p: int) -> tuple[Floats, Floats, Floats]:
 
 def _process_noise(elapsed: float, p: int, noise: Floats) -> Floats:
     """Q (G, 6 p, 6 p)."""
-    by_axis = (noise[:, :, None] * np.eye(6))[:, None, :, None]
-    Q = _noise_of_step(elapsed, p)[:, None, :, None] * by_axis
-    return np.asarray(Q.reshape(len(noise), 6 * p, 6 * p))
+    Q = np.zeros((len(noise), p, 6, p, 6))
+    # what each coordinate of a pose has with itself: (6, G, p, p)
+    Q[:, :, range(6), :, range(6)] = noise.T[:, :, None, None] * _noise_of_step(elapsed, p)
+    return Q.reshape(len(noise), 6 * p, 6 * p)
 
 
 @lru_cache(maxsize=64)
