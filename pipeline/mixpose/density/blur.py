@@ -115,11 +115,11 @@ def _bells_of_grid(
     step: float, count: int, origin: float, sigma: float, at: bytes
 ) -> tuple[slice, list[Singles]]:
     """The same by what they depend on."""
-    places, margin = np.frombuffer(at), max(DRAWING.cut * sigma, step)
+    places, margin = np.frombuffer(at, np.float64), max(DRAWING.cut * sigma, step)
     first = int(np.clip((places.min() - margin - origin) / step, 0, count - 1))
     last = (places.max() + margin - origin) / step + 2
     part = slice(first, int(np.clip(last, first + 1, count)))
-    grid = origin + step * np.arange(part.start, part.stop)
+    grid = origin + step * np.arange(part.start, part.stop, dtype=np.float64)
     if sigma > 0.3 * step:
         return part, _bell(places, grid, sigma)
     # sums over a grid coarser than that are no integrals: a narrower blur is linear interpolation
