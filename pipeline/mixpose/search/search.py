@@ -130,7 +130,8 @@ class _Search:
             if self._cost["made"] >= budget.max_guesses:
                 after = SearchState(k, done)
                 break
-        is_guessed = self._by_evidence and self._cost["made"] > 0
+        # a pose with evidence is one that some of its detections would have led to
+        is_guessed = self._by_evidence and (self._cost["made"] > 0 or budget.useful >= 0)
         if self._coverage() < budget.sufficient and not is_guessed:
             self._refine(*from_spread_orientations(self._problem))
         return SearchResult(self._candidates(), SearchReport(**self._cost), after)
