@@ -7,6 +7,11 @@ from pathlib import Path
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 RANGE_FRAMES = 5000
 CAMERA_FRAMES = 2000
+RANGES = {  # of the six points at [start], to 0.1 mm
+    "front": (973.4, 890.1, 1023.3, 976.1, 923.7, 1052.6),
+    "side": (967.4, 924.0, 893.7, 800.7, 882.1, 850.4),
+    "top": (1004.2, 1013.1, 1058.9, 988.5, 929.6, 979.3),
+}
 
 
 def long_ranges(folder: Path, names: str) -> list[Path]:
@@ -17,8 +22,8 @@ def long_ranges(folder: Path, names: str) -> list[Path]:
         for line in text.replace(".npy", ".csv").splitlines()
         if not line.startswith(("range_min", "bin_size"))
     )
-    rows = "".join(f"{k},950\n{k},1010\n{k},1080\n" for k in range(RANGE_FRAMES))
-    for name in ("front", "side", "top"):
+    for name, ranges in RANGES.items():
+        rows = "".join(f"{k},{each}\n" for k in range(RANGE_FRAMES) for each in ranges)
         (folder / f"{name}.csv").write_text("frame,range\n" + rows, encoding="utf-8")
     sessions = [folder / f"{name}.toml" for name in names]
     for session in sessions:

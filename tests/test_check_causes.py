@@ -14,6 +14,7 @@ from diagnosed import frames_of, recorded, told, with_points
 
 from mixpose.checking import times_as_large
 from mixpose.checking.changes import Change
+from mixpose.checking.evidence import best_pose
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Tried, diagnosis, simplest
 from mixpose.cli.app import CheckRequest
@@ -50,6 +51,17 @@ def test_two_faults_at_once_are_told_together(right: Session) -> None:
         "'left' and 'right' are swapped, and the body of [object] is mirrored: with the source of "
         "each given to the other, and with one coordinate of all points negated"
     )
+
+
+def test_a_trial_finds_a_pose_of_use_and_spends_nothing_on_others(right: Session) -> None:
+    """The right session explains a frame by 70 nats; one that is mirrored by nothing near it."""
+    ((number, views), *_) = frames_of(right, recorded(right))
+    found, guesses = best_pose(right, right.body, number, views, 10_000, 36.0)
+    assert found is not None
+    assert found.log_evidence > 36.0
+    wrong = mirrored(right)
+    other, as_many = best_pose(wrong, wrong.body, number, views, 10_000, 36.0)
+    assert (other, as_many > guesses) == (None, True)
 
 
 def test_what_explains_one_sensor_only_is_no_cause() -> None:

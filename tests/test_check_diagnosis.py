@@ -322,7 +322,7 @@ def searches_of(monkeypatch: pytest.MonkeyPatch, guesses: float) -> list[int]:
 
     def counted(session: Session, body: Body, number: int, *more: Any) -> Any:
         searched.append(number)
-        return search(session, body, number, *more)[0], guesses * (len(more) - 1)
+        return search(session, body, number, *more)[0], guesses * (len(more) > 1)
 
     monkeypatch.setattr("mixpose.checking.trials.best_pose", counted)
     return searched

@@ -200,7 +200,7 @@ def test_the_children_of_a_killed_parent_end(
 def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_once(
     tmp_path: Path,
 ) -> None:
-    sessions, folder = make_recordings(tmp_path, 2, 200), tmp_path / "poses"
+    sessions, folder = make_recordings(tmp_path, 2, 60), tmp_path / "poses"
     begun = killed_parent(sessions, folder, any)
     assert any(path.exists() for path in begun)  # it was killed midway
     again = command("run", *sessions, "-o", folder, "--workers", "2")
@@ -209,7 +209,7 @@ def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_onc
     for session in sessions:
         assert command("run", session, "-o", alone).returncode == 0
         poses = folder / session.parent.name / "poses.jsonl"
-        assert len(poses_of(poses)) == 201  # with the header
+        assert len(poses_of(poses)) == 61  # with the header
         assert without_latency(poses) == without_latency(alone)
 
 

@@ -84,7 +84,7 @@ def test_a_mutant_whose_tests_run_out_of_time_is_no_killed_one(
     tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     endless = mutant("return 2 * x", "while True: x", name="rigid-endless")
-    monkeypatch.setattr(tool, "TIME_LIMIT_S", 5.0)
+    monkeypatch.setattr(tool, "TIME_LIMIT_S", 3.0)
     outcome = tool.trial(tree, tree.parent / "copy", endless)
     assert (outcome.killed_by, outcome.out_of_time, outcome.verdict) == (None, True, "OUT OF TIME")
     assert not (tree.parent / "copy").exists()

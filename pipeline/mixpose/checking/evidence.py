@@ -114,11 +114,19 @@ def anywhere(session: Session) -> Session:
 
 
 def best_pose(
-    session: Session, body: Body, number: int, views: Views, guesses: float = np.inf
+    session: Session,
+    body: Body,
+    number: int,
+    views: Views,
+    guesses: float = np.inf,
+    useful: float = -np.inf,
 ) -> tuple[ScoredPose | None, int]:
-    """The best pose of a frame, searched for with as many guesses at most, and how many it took."""
+    """The best pose of a frame, searched for with as many guesses at most, and how many it took.
+
+    Where no pose with `useful` evidence is in sight, there may be none.
+    """
     tracker, track = begin(replace(session, body=body))
-    search = replace(tracker.rules.search, max_guesses=guesses)
+    search = replace(tracker.rules.search, max_guesses=guesses, useful=useful)
     tracker = replace(tracker, rules=replace(tracker.rules, search=search))
     with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
         data = tracker.data(track, number, None, views)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,12 +51,12 @@ class _Runner:
     frames: Frames
     poses: list[ScoredPose | None] = field(default_factory=list)
 
-    def advance(self, session: Session) -> int:
-        """Try the next frame; the guesses that took."""
+    def advance(self, session: Session, useful: float) -> int:
+        """Try the next frame, for a pose of `useful` evidence; the guesses that took."""
         number, views = self.frames[len(self.poses)]
         body = self.change.body(session.body)
         seen, most = self.change.views(views), DiagnosisRules().guesses
-        pose, made = best_pose(session, body, number, seen, most)
+        pose, made = best_pose(session, body, number, seen, most, useful)
         self.poses.append(pose)
         return made
 
@@ -153,18 +153,19 @@ def _without_values(case: _Case, others: Sequence[tuple[Change, Frames]]) -> Ite
     runners += [_Runner(change, case.frames) for change in changes(session)]
     rules, left = DiagnosisRules(), DiagnosisRules().all_guesses
     for k in range(len(case.frames)):
-        for place, runner in enumerate(runners):
+        best = 0.0
+        racing = chain(list(runners), _less_simple(case, runners) if k == 0 else ())
+        for place, runner in enumerate(racing):
             if left < 0 and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
-            left -= runner.advance(session)
-        for runner in _less_simple(case, runners) if k == 0 else ():
-            if left < 0:
-                break
-            left -= runner.advance(session)
-            runners.append(runner)
+            # what gains less drops out, and leads to no two changes
+            least = min(rules.margin, rules.behind * best - runner.gain(before))
+            left -= runner.advance(session, max(least, 0.0))
+            best = max(best, runner.gain(before))
+            if place >= len(runners):
+                runners.append(runner)
         tried = [runner for runner in runners if len(runner.poses) > k]
         tried.sort(key=lambda runner: -runner.gain(before))
-        best = tried[0].gain(before) if tried else 0.0
         # where none explains more of the first frame, one may of the second
         runners = [r for r in tried if r.gain(before) >= max(rules.behind * best, 0.0)]
     for runner in runners:
@@ -186,9 +187,13 @@ def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
     if best() or not first:
         alone = by_cameras_alone(session, case.frames[:2])
         yield from [_Runner(change, case.frames) for change in alone]
+    known = set[frozenset[str]]()  # two at once are the same whichever leads
     for one in best():
-        others = [change for change in changes(session) if change.what != one.change.what]
-        yield from [_Runner(change.and_also(one.change), one.frames) for change in others]
+        for change in changes(session):
+            both = frozenset([change.what + change.remedy, one.change.what + one.change.remedy])
+            if change.what != one.change.what and both not in known:
+                known.add(both)
+                yield _Runner(change.and_also(one.change), one.frames)
 
 
 def _with_values(case: _Case, met: Explained) -> Iterator[Tried]:

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 
 from mixpose.constants import constant
 from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
+
+_FEW = 256  # places along an axis: what is known of so few needs 0.2 MB at most
 
 
 @dataclass(frozen=True)
@@ -102,12 +104,22 @@ def _along(
     pattern: GridPattern, axis: int, sigma: float, places: Floats
 ) -> tuple[slice, list[Singles]]:
     """The part of a grid that matters along an axis, and its Gaussians and slopes at places."""
-    step, count = pattern.step, pattern.values.shape[1 - axis]
-    margin = max(DRAWING.cut * sigma, step)
-    first = int(np.clip((places.min() - margin - pattern.origin[axis]) / step, 0, count - 1))
-    last = (places.max() + margin - pattern.origin[axis]) / step + 2
+    count, origin = pattern.values.shape[1 - axis], float(pattern.origin[axis])
+    # tiles of a row or a column, and of the frames after it, share them
+    known = _bells_of_grid if len(places) < _FEW else _bells_of_grid.__wrapped__
+    return known(pattern.step, count, origin, sigma, np.asarray(places, np.float64).tobytes())
+
+
+@lru_cache(maxsize=256)
+def _bells_of_grid(
+    step: float, count: int, origin: float, sigma: float, at: bytes
+) -> tuple[slice, list[Singles]]:
+    """The same by what they depend on."""
+    places, margin = np.frombuffer(at, np.float64), max(DRAWING.cut * sigma, step)
+    first = int(np.clip((places.min() - margin - origin) / step, 0, count - 1))
+    last = (places.max() + margin - origin) / step + 2
     part = slice(first, int(np.clip(last, first + 1, count)))
-    grid = pattern.origin[axis] + step * np.arange(part.start, part.stop)
+    grid = origin + step * np.arange(part.start, part.stop, dtype=np.float64)
     if sigma > 0.3 * step:
         return part, _bell(places, grid, sigma)
     # sums over a grid coarser than that are no integrals: a narrower blur is linear interpolation

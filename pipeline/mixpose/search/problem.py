@@ -47,6 +47,7 @@ class SearchBudget:
     outdone: float = constant(
         12.0, "nats behind the best from which poses are out: right ones were 4.2 behind at most"
     )
+    useful: float = constant(-np.inf, "evidence that a pose must have to be of any use")
     descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2), (0.4, 2)),
         "blurs in σ_ε and steps: clutter near features draws less; one at 1.5 before finds no more",

@@ -130,7 +130,8 @@ class _Search:
             if self._cost["made"] >= budget.max_guesses:
                 after = SearchState(k, done)
                 break
-        is_guessed = self._by_evidence and self._cost["made"] > 0
+        # a pose with evidence is one that some of its detections would have led to
+        is_guessed = self._by_evidence and (self._cost["made"] > 0 or budget.useful >= 0)
         if self._coverage() < budget.sufficient and not is_guessed:
             self._refine(*from_spread_orientations(self._problem))
         return SearchResult(self._candidates(), SearchReport(**self._cost), after)
@@ -142,6 +143,8 @@ class _Search:
         if self._by_evidence and kept:
             least = max(ranks[0] - budget.outdone, budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
+            # a fit hardly gains more than what the right pose may be behind
+            kept = [k for k in kept if ranks[k] > budget.useful - budget.outdone]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
     def _draw(self, generator: Guesses, most: float, skipped: int = 0) -> int:
@@ -218,8 +221,10 @@ class _Search:
         means, kept, images = self._body.means, list[int](), np.zeros((0, len(self._body), 3))
         alike = self._budget.alike * self._body.radius  # root mean square distance of features
         for k, pose in enumerate(self._poses):
+            if len(kept) == count:
+                break
             squares = ((transform(pose, means) - images) ** 2).sum(axis=-1).mean(axis=-1)
-            if len(kept) < count and (squares > alike**2).all():
+            if (squares > alike**2).all():
                 kept.append(k)
                 images = np.append(images, transform(pose @ self._body.symmetries, means), axis=0)
         return kept
