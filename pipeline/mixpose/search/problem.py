@@ -128,6 +128,16 @@ def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetection
     return sensors
 
 
+def can_fix(detections: Sequence[SensorDetections], body: Body, free: Mask) -> bool:
+    """Whether detections have as many coordinates as a pose has free directions (6,)."""
+    if not all(len(one.points) for one in detections):
+        return True  # of a density nobody knows
+    features, count = len(body.nodes.points), 0
+    for one in detections:
+        count += min(len(one.points), features) * one.points.shape[1]
+    return bool(detections) and count >= int(np.count_nonzero(free))
+
+
 def is_pointlike(body: Body) -> bool:
     """Whether every feature of a body is a point."""
     return len(body.nodes.points) == len(body)

@@ -25,7 +25,13 @@ from mixpose.search.poses import (
     label_image,
     unlike,
 )
-from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
+from mixpose.search.problem import (
+    THOROUGH,
+    SearchBudget,
+    SearchProblem,
+    can_fix,
+    sensor_detections,
+)
 from mixpose.search.three_points import Guesses, sparse
 
 
@@ -86,7 +92,7 @@ def search_frame(
             "they stay"
         )
     detections = sensor_detections(views, body)
-    if not detections:
+    if not can_fix(detections, body, free):
         return SearchResult([])
     T = np.eye(4) if T_reference is None else T_reference
     return _Search(SearchProblem(detections, body, free, T, rules, budget, seed)).run(state)

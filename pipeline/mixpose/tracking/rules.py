@@ -88,5 +88,5 @@ class SceneRules:
     touching: float = constant(3.0, "σ_ε between images that run together: twice a spot's width")
     pulled: float = constant(0.1, "offset² in σ_ε² of a spot of two bodies: 2.5 times a blob's")
     thorough: int = constant(
-        10, "frames, of which one is seen whole, and searched for what is away: 1/3 s"
+        10, "frames, of which one is seen whole, and searched for what is long away: 1/3 s"
     )

@@ -221,9 +221,12 @@ class Sharing:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
         coasting = self.bodies[k].rules.motion.coasting
-        # bodies that are there are not held up: others in turn, and what nobody saw yet at once
-        is_turn = track.misses >= coasting and (track.misses + k) % self.rules.thorough == 0
-        is_due = is_turn or not (track.branches or track.misses)
+        # bodies that are there are not held up: others in turn, and what nobody saw yet the seldomer,
+        # the longer that lasts
+        waited, often = track.misses, self.rules.thorough
+        if not self.tracks[k].branches:
+            waited, often = coasting, min(1 + track.misses // coasting, often)
+        is_due = waited >= coasting and (track.misses + k) % often == 0
         if self.claimed and (self.looked or (not is_due and track.misses > coasting)):
             data = replace(data, options=replace(data.options, search="live"))
         if not self.looked or is_due:
