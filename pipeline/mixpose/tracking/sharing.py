@@ -221,7 +221,7 @@ class Sharing:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
         coasting = self.bodies[k].rules.motion.coasting
-        # bodies that are there are not held up: others in turn, and what nobody saw yet the seldomer,
+        # bodies that are there are not held up: others in turn, what nobody saw yet the seldomer
         # the longer that lasts
         waited, often = track.misses, self.rules.thorough
         if not self.tracks[k].branches:
