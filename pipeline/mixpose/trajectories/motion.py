@@ -61,7 +61,7 @@ class States(NamedTuple):
 
     def moved(self, errors: Floats, covariances: Floats) -> States:
         """These states moved by errors (G, 6 p), with other covariances."""
-        poses = perturbed(self.poses, errors[:, :3], turn_by(skew(errors[:, 3:6])))
+        poses = _perturbed(self.poses, errors[:, :3], _turn(_across(errors[:, 3:6])))
         return States(poses, self.rates + errors[:, 6:].reshape(self.rates.shape), covariances)
 
     def mixed(self, others: States, is_other: Mask) -> States:
@@ -84,9 +84,9 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     moved = powers[1:p] @ states.rates
     if p > 2:  # Magnus: a turn that changes its axis
         changing = (powers[3:5] * [0.5, 1.0])[: p - 2] @ states.rates[:, 1:3, 3:]
-        moved[:, 3:] += (skew(changing) @ states.rates[:, 0, 3:, None])[..., 0]
-    across = skew(moved[:, 3:])
-    turn = turn_by(across)
+        moved[:, 3:] += (_across(changing) @ states.rates[:, 0, 3:, None])[..., 0]
+    across = _across(moved[:, 3:])
+    turn = _turn(across)
     F = by_taylor[None].repeat(len(turn), axis=0)
     # what a turn does to errors of rates is told to first order in it
     F[:, 0, 3:, 0, 3:] = turn
@@ -94,7 +94,7 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     F = F.reshape(states.covariances.shape)
     covariances = F @ states.covariances @ F.swapaxes(1, 2) + _process_noise(elapsed, p, noise)
     rates = by_taylor[: p - 1, 0, : p - 1, 0] @ states.rates
-    return States(perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
+    return States(_perturbed(states.poses, moved[:, :3], turn), rates, covariances), F
 
 
 def updated(states: States, pose: Floats, covariance: Floats) -> tuple[States, Floats, Floats]:
@@ -159,19 +159,19 @@ def smoothed(
 # For a few poses at a time the functions of `mixpose.rigid` take five times as long.
 
 
-def skew(vectors: Floats) -> Floats:
+def _across(vectors: Floats) -> Floats:
     """[ω] (G, 3, 3) of vectors (G, 3): x -> ω × x."""
     return np.asarray((vectors @ _ACROSS).reshape(-1, 3, 3))
 
 
-def turn_by(across: Floats) -> Floats:
+def _turn(across: Floats) -> Floats:
     """Rotations exp [ω] (G, 3, 3), by O. Rodrigues."""
     angle = np.sqrt((across**2).sum(axis=(1, 2), keepdims=True) / 2) + 1e-300
     half = np.sin(angle / 2) / angle
     return np.asarray(_EYE + np.sin(angle) / angle * across + 2 * half**2 * across @ across)
 
 
-def perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
+def _perturbed(poses: Floats, shift: Floats, turn: Floats) -> Floats:
     """Poses (G, 4, 4) after shifts (G, 3) and turns (G, 3, 3) in world axes."""
     moved = poses.copy()
     moved[:, :3, :3] = turn @ poses[:, :3, :3]

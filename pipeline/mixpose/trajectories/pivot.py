@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri, fdtri
 
+from mixpose import rigid
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
 from mixpose.records import Floats, Mask
-from mixpose.trajectories.motion import perturbed, skew, turn_by
 
 
 @dataclass(frozen=True)
@@ -198,12 +198,12 @@ def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Float
     by_poses, by_x, rest = [], [], np.zeros((len(steps), 3))
     sides = ((pivoting.poses, x[:3], 1.0), (pivoting.references, x[3:], -1.0))
     for (poses, place, sign), twists in zip(sides, np.split(steps, 2, axis=1), strict=True):
-        moved = perturbed(poses, twists[:, :3], turn_by(skew(twists[:, 3:])))
+        moved = rigid.perturb(poses, twists)
         arms = moved[:, :3, :3] @ place
         rest += sign * (arms + moved[:, :3, 3])
-        # a turn moves an arm across both; on top of another one, by the left Jacobian of SO(3),
-        # which half of that turn is to 2nd order
-        by_turn = -skew(arms) @ turn_by(skew(twists[:, 3:] / 2))
+        # a turn moves an arm across both; on top of another one, by the left Jacobian of SO(3)
+        by_turn = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)
+        by_turn = by_turn @ rigid.rotation_matrix(twists[:, 3:] / 2)  # which this is to 2nd order
         J = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn], axis=2)
         by_poses.append(sign * J)
         by_x.append(sign * moved[:, :3, :3])
