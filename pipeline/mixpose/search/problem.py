@@ -132,10 +132,9 @@ def can_fix(detections: Sequence[SensorDetections], body: Body, free: Mask) -> b
     """Whether detections have as many coordinates as a pose has free directions (6,)."""
     if not all(len(one.points) for one in detections):
         return True  # of a density nobody knows
-    features, count = len(body.nodes.points), 0
-    for one in detections:
-        count += min(len(one.points), features) * one.points.shape[1]
-    return bool(detections) and count >= int(np.count_nonzero(free))
+    features = len(body.nodes.points)
+    told = sum(min(len(one.points), features) * one.points.shape[1] for one in detections)
+    return bool(detections) and told >= int(np.count_nonzero(free))
 
 
 def is_pointlike(body: Body) -> bool:

@@ -223,10 +223,10 @@ class Sharing:
         coasting = self.bodies[k].rules.motion.coasting
         # bodies that are there are not held up: others in turn, what nobody saw yet the seldomer
         # the longer that lasts
-        waited, often = track.misses, self.rules.thorough
-        if not self.tracks[k].branches:
-            waited, often = coasting, min(1 + track.misses // coasting, often)
-        is_due = waited >= coasting and (track.misses + k) % often == 0
+        is_new, often = not self.tracks[k].branches, self.rules.thorough
+        if is_new:
+            often = min(often, 1 + track.misses // coasting)
+        is_due = (is_new or track.misses >= coasting) and (track.misses + k) % often == 0
         if self.claimed and (self.looked or (not is_due and track.misses > coasting)):
             data = replace(data, options=replace(data.options, search="live"))
         if not self.looked or is_due:
