@@ -30,10 +30,12 @@ def test_a_seed_without_any_pose_is_the_worst_and_not_left_out() -> None:
 
 
 def test_a_seed_gives_the_same_figures_again_and_another_one_others() -> None:
-    first, again, other = (
-        figures_of("range_profiles", seed) for seed in (FIRST_SEED, FIRST_SEED, FIRST_SEED + 1)
+    (first, smoothed), (again,), (other,) = (
+        figures_of("range_profiles", FIRST_SEED + k, smooth)
+        for k, smooth in [(0, True), (0, False), (1, False)]
     )
     assert first == again
     assert first.rotation_deg != other.rotation_deg
+    assert 0.1 < smoothed.rotation_deg < 1  # of what it was
     # the seeds of the recordings themselves would be measured twice
     assert all(each.options.seed < FIRST_SEED for each in RECORDINGS.values())

@@ -1,20 +1,23 @@
 """How accurate mixpose is on recordings like those of data/synthetic/, over many seeds.
 
-python tools/accuracy.py [RECORDING ...] [--seeds 16] [--workers 2] [--json FILE]
+python tools/accuracy.py [RECORDING ...] [--seeds 16] [--workers 2] [--smooth] [--json FILE]
 
 Each recording of tools/make_synthetic.py is made again with other motions, noise, clutter and
 hidden markers, estimated from its frames, and compared with its truth.  For each figure the median
-over the seeds is shown, and the worst: the largest error, the smallest share.
+over the seeds is shown, and the worst: the largest error, the smallest share.  With --smooth, a
+second line says the same of the smoothed poses, with errors by those of the same seed before.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import redirect_stderr
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +27,9 @@ import numpy as np
 from make_synthetic import RECORDINGS
 
 import mixpose
+from mixpose.cli.app_after import SmoothRequest
 from mixpose.cli.run import header_of
+from mixpose.cli.smooth import smooth_poses
 from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import JsonlWriter
 from mixpose.simulation import simulate
@@ -58,20 +63,31 @@ class Figures:
 SHARES = ("ok", "inside_95")  # what is worse where it is smaller
 
 
-def figures_of(name: str, seed: int) -> Figures:
-    """Make a recording with a seed, estimate it and compare it with its truth."""
+def figures_of(name: str, seed: int, smooth: bool = False) -> list[Figures]:
+    """Make a recording with a seed, estimate it and compare it with its truth; smoothed as well."""
     with tempfile.TemporaryDirectory() as scratch:
         folder, draft = Path(scratch) / name, Path(scratch) / "session.toml"
         draft.write_text(RECORDINGS[name].session, encoding="utf-8", newline="\n")
         simulate(mixpose.load_session(draft), folder, replace(RECORDINGS[name].options, seed=seed))
         session = mixpose.load_session(folder / "session.toml")
-        poses = folder / "poses.jsonl"
+        poses, smoothed = folder / "poses.jsonl", folder / "smooth.jsonl"
         with poses.open("w", encoding="utf-8") as stream:
             writer = JsonlWriter(stream, header_of(session))
             for estimate in mixpose.run(session):
                 writer.write(estimate)
-        found = evaluate_files(poses, folder / "truth.jsonl")
-    nan = float("nan")
+        before = compared(poses, folder / "truth.jsonl")
+        if not smooth:
+            return [before]
+        with redirect_stderr(io.StringIO()):
+            smooth_poses(SmoothRequest(poses, smoothed))
+        after = compared(smoothed, folder / "truth.jsonl")
+    rotation, position = after.rotation_deg / before.rotation_deg, after.position / before.position
+    return [before, replace(after, rotation_deg=rotation, position=position)]
+
+
+def compared(poses: Path, truth: Path) -> Figures:
+    """What a file of poses comes to."""
+    found, nan = evaluate_files(poses, truth), float("nan")
     return Figures(
         rotation_deg=found.rotation_deg.rms if found.rotation_deg else nan,
         position=found.translation.rms if found.translation else nan,
@@ -100,7 +116,7 @@ def line_of(name: str, table: Mapping[str, Mapping[str, float]]) -> str:
         " ".join(format(table[key][kind], formats.get(key, "7.2g")) for kind in ("median", "worst"))
         for key in table
     ]
-    return f"{name:18} " + " ".join(f"{cell:>16}" for cell in cells)
+    return f"{name:28} " + " ".join(f"{cell:>16}" for cell in cells)
 
 
 def main() -> int:
@@ -108,6 +124,7 @@ def main() -> int:
     parser.add_argument("recordings", nargs="*", metavar="RECORDING", help=", ".join(RECORDINGS))
     parser.add_argument("--seeds", type=int, default=16, help="recordings of each kind")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time")
+    parser.add_argument("--smooth", action="store_true", help="smooth the poses as well")
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     unknown = set(options.recordings) - set(RECORDINGS)
@@ -119,14 +136,15 @@ def main() -> int:
     print(
         f"RMS errors, shares, squared error per dimension; median and worst, {options.seeds} seeds"
     )
-    print(f"{'recording':18} " + " ".join(f"{title:>16}" for title in titles))
+    print(f"{'recording':28} " + " ".join(f"{title:>16}" for title in titles))
     stored: dict[str, Any] = {}
     seeds = range(FIRST_SEED, FIRST_SEED + options.seeds)
     with ProcessPoolExecutor(options.workers) as pool:
         for name in options.recordings or RECORDINGS:
-            found = list(pool.map(partial(figures_of, name), seeds))
-            stored[name] = {**summary(found), "seeds": [asdict(each) for each in found]}
-            print(line_of(name, summary(found)), flush=True)
+            of_seeds = list(pool.map(partial(figures_of, name, smooth=options.smooth), seeds))
+            for label, found in zip((name, f"{name}, smoothed"), zip(*of_seeds)):
+                stored[label] = {**summary(found), "seeds": [asdict(each) for each in found]}
+                print(line_of(label, summary(found)), flush=True)
     if options.json:
         options.json.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
     return 0
