@@ -191,6 +191,15 @@ def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> N
     assert np.mean(errors[blind][20:]) > 2 * np.mean(errors[ALONE][20:])
 
 
+@pytest.mark.parametrize("size", [0.016, 0.25])
+def test_fields_that_no_residual_shows_are_as_large_as_those_that_last(size: float) -> None:
+    fields, lasting = np.diag([300.0] * 4 + [0.0]), [size] * 4 + [0.0]  # a pose takes the last
+    _, mean, second = noise._lasting({}, ("0",), fields, fields @ lasting, MODEL)
+    assert mean == pytest.approx(lasting, rel=0.05)
+    # four of one size leave odds of 10^4 that the calibration is of the other kind
+    assert second[4, 4] == pytest.approx(size**2, rel=0.05)
+
+
 def test_sensors_that_were_seen_together_before_are_remembered_apart() -> None:
     rng, residuals = np.random.default_rng(4), RememberedNoise()
     for names in ("01", "0", "01", "1", "01"):

@@ -68,6 +68,7 @@ class NoiseModel:
     )
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
+    exact: float = constant(0.016, "σ_ε: the same of an exact calibration, 0.02 px")
     turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
     shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
     lens: float = constant(0.2, "k1 of a lens that is another than told: lenses have 0.05 to 0.4")
@@ -332,8 +333,26 @@ def _lasting(
         if v @ mean > chdtri(1.0, 1 - model.by_chance):
             S = inverted(known)
             if v @ mean > chdtri(max(float((S * A).sum()), 1.0), 1 - model.by_chance):
-                return biases, mean, S + np.outer(mean, mean)
+                return biases, *_of_either_size(A, v, model)
     return biases, np.zeros(len(v)), np.zeros(A.shape)
+
+
+def _of_either_size(A: Floats, v: Floats, model: NoiseModel) -> tuple[Floats, Floats]:
+    """Sizes (q,) of fields that last and their second moments, by sums A and v of what shows.
+
+    Of a calibration that is off and of an exact one, as likely as they make it: those that do not
+    show are as large as those that do.
+    """
+    values, axes = np.linalg.eigh(A)
+    values, along = np.maximum(values, 0.0), v @ axes
+    variances = np.square([[model.bias], [model.exact]])
+    shrunk = variances / (1 + variances * values)  # S along the axes
+    logs = 0.5 * (along**2 * shrunk - np.log1p(variances * values)).sum(axis=1)
+    chances = np.exp(logs - logs.max())
+    chances /= chances.sum()
+    means = shrunk * along @ axes.T
+    second = (axes * (chances @ shrunk)) @ axes.T
+    return chances @ means, second + (means.T * chances) @ means
 
 
 def expected_squares(
