@@ -63,6 +63,7 @@ def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
         ("http://there", "allowed: udp://, tcp://, ws://, osc://, lsl://, mqtt://, ros2://"),
         ("9870", "no address of a receiver; allowed: udp://"),
         ("udp://there", "found no host and port; allowed: udp://127.0.0.1:9870"),
+        ("udp://a:9870/tool", "found 'tool' behind host and port; allowed: udp://127.0.0.1:9870"),
         ("tcp://there:99999", "is no address: Port out of range"),
         ("udp://a..b:90", "host: found 'a..b'; allowed: a number, or words with a dot between"),
         ("mqtt://.there", "host: found '.there'; allowed"),

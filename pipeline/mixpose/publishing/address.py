@@ -29,9 +29,16 @@ class Address:
         """An error about this address."""
         return SessionError(f"--publish {self.text}: {reason}")
 
-    def place(self, example: str, port: int | None = None) -> tuple[str, int]:
-        """Host and port, this port where none is written, or an error that shows an example."""
+    def place(
+        self, example: str, port: int | None = None, *, bare: bool = False
+    ) -> tuple[str, int]:
+        """Host and port, this port where none is written, or an error that shows an example.
+
+        `bare` allows nothing behind them.
+        """
         found = self.port or port
+        if bare and self.path:
+            raise self.error(f"found {self.path!r} behind host and port; allowed: {example}")
         if not self.host or found is None:
             raise self.error(f"found no host and port; allowed: {example}")
         self.require_host(self.host)

@@ -77,7 +77,7 @@ class TcpSender(Sender):
 
     def __init__(self, address: Address, header: Header) -> None:
         address.allow()
-        self._place = address.place("tcp://127.0.0.1:9870")
+        self._place = address.place("tcp://127.0.0.1:9870", bare=True)
         self._header = f"{header_text(header)}\n".encode()
         self._socket: socket.socket | None = None
 
@@ -104,7 +104,7 @@ class UdpSender(Datagrams):
 
     def __init__(self, address: Address, header: Header) -> None:
         address.allow()
-        super().__init__(address.place("udp://127.0.0.1:9870"))
+        super().__init__(address.place("udp://127.0.0.1:9870", bare=True))
         self._header = header_text(header).encode()
         self._told = float("-inf")
 
