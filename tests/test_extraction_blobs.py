@@ -268,6 +268,17 @@ def test_areas_limit_what_counts_as_a_blob() -> None:
     assert len(blobs(image, min_area=2000)) == 0
 
 
+def test_dots_on_a_plate_in_shadow_are_found_where_the_plate_is_too_large() -> None:
+    truth = np.array([(150.3, 100.6), (210.7, 120.2), (180.1, 170.4), (240.5, 190.8)])
+    plate = np.zeros((300, 400))
+    plate[70:230, 110:290] = 70  # a shape of its own, half as bright as the dots on it
+    image = photograph(plate + spots((300, 400), truth, 3.0, 90), 20)
+    assert len(blobs(image)) == 1
+    found = blobs(image, max_area=400)
+    assert len(found) == 4
+    assert np.max(distances(found, truth)) < 0.1
+
+
 def test_light_from_a_lamp_on_the_floor_is_no_blob_but_a_spot_on_it_is() -> None:
     u, v = np.meshgrid(np.arange(400.0), np.arange(300.0))
     pool = 60 * np.exp(-((u - 200) ** 2 + (v - 150) ** 2) / 2 / 25**2)

@@ -160,7 +160,7 @@ class Part:
     contour: Contour
     area: float  # number of pixels that it encloses
     level: float
-    min_area: float  # of what is looked for in it
+    limits: tuple[float, float]  # of areas; what is larger is no feature, but may carry some
     is_apart: bool = False
     # the disk that it is, or the spots where it is small
     found: list[Blob] = field(default_factory=list)
@@ -178,8 +178,10 @@ def find_blobs(
     What has no shape is taken apart at all higher levels first: then all rims are looked at
     together, and all spots.  Few are found to have none only then, with a second look.
     """
+    most = [math.inf if own.max_area is None else own.max_area for _, own in scenes]
     found = [
-        _parts(scene, outlines(scene), scene.level, options.min_area) for scene, options in scenes
+        _parts(scene, outlines(scene), scene.level, (options.min_area, largest))
+        for (scene, options), largest in zip(scenes, most, strict=True)
     ]
     parts = list(chain(*found))
     large = [part for part in parts if part.area > rules.small_area]
@@ -192,23 +194,22 @@ def find_blobs(
         parts, are_oval = [], none(0)
         shapeless = [part for part in rest if not part.is_apart]
     blobs = []
-    for (scene, options), parts in zip(scenes, found, strict=True):
+    for (scene, _), parts, largest in zip(scenes, found, most, strict=True):
         _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
-        largest = math.inf if options.max_area is None else options.max_area
         all_of_it = _outside_disks(_blobs_of(parts, rules))
         blobs.append([blob for blob in all_of_it if blob.area <= largest])
     return blobs
 
 
 def _parts(
-    scene: Foreground, contours: Sequence[Contour], level: float, min_area: float
+    scene: Foreground, contours: Sequence[Contour], level: float, limits: tuple[float, float]
 ) -> list[Part]:
     """Those of the contours that are large enough."""
     # A contour of n pixels encloses less than n² of them: noise is soon done with.
-    some = [contour for contour in contours if len(contour) ** 2 >= min_area]
+    some = [contour for contour in contours if len(contour) ** 2 >= limits[0]]
     areas = [filled_area(contour) for contour in some]
     both = zip(some, areas, strict=True)
-    return [Part(scene, one, area, level, min_area) for one, area in both if area >= min_area]
+    return [Part(scene, one, area, level, limits) for one, area in both if area >= limits[0]]
 
 
 def _below(parts: Sequence[Part]) -> Iterator[Part]:
@@ -339,13 +340,14 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
     cv2.floodFill(inside, None, first.tolist(), 2, flags=8)
     if islands:
         found = pieces((inside == 1).view(np.uint8), corner)
-        part.beside = _parts(scene, found, level, part.min_area)
+        part.beside = _parts(scene, found, level, part.limits)
     inside >>= 1
     peak, typical = cv2.minMaxLoc(patch, inside)[1], 0.0
     if scene.judged and is_solid(contour, rules.solidity):
         typical = _brightness(scene, patch, inside)
     stands_out = (
-        0 < typical >= scene.least_peak
+        part.area <= part.limits[1]
+        and 0 < typical >= scene.least_peak
         and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
     )
     if (stands_out or not scene.judged) and not on_border(scene, box):
@@ -359,9 +361,7 @@ def _take_apart(part: Part, rules: BlobRules, *, islands: bool = False) -> None:
         clear = stands_out and not has_core
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]
-        part.inner = [
-            _parts(scene, pieces(mask, corner), lvl, part.min_area) for mask, lvl in apart
-        ]
+        part.inner = [_parts(scene, pieces(mask, corner), lvl, part.limits) for mask, lvl in apart]
     for one in [one for layer in (part.beside, *part.inner) for one in layer]:
         if one.area > rules.small_area:
             _take_apart(one, rules)
