@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.extraction.blobs import extract_blobs
+from mixpose.extraction.blobs import Blob, BlobRules, extract_blobs, longer_than_others
 from mixpose.extraction.options import ExtractOptions
 from mixpose.records import PointPattern
 
@@ -52,6 +52,30 @@ def test_whole_disks_err_by_no_more_than_others(radius: float) -> None:
 def test_oblique_disks_that_are_all_alike_are_whole(axes: tuple[float, float]) -> None:
     _, deviations = found(drawn(axes))
     assert not deviations.any()
+
+
+def test_of_three_the_roundest_is_whole() -> None:
+    blobs = [Blob(0.0, 0.0, 50.0, length) for length in (1.5, 1.5, 3.0)]
+    assert longer_than_others(blobs, BlobRules()) == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("like", [1, 2, 4])
+def test_streaks_beside_round_things_are_whole_where_several_are_alike(like: int) -> None:
+    big = np.full((200 * 8, 260 * 8), 20, dtype=np.uint8)
+    streaks = np.array([(40.0, 40.0), (110.0, 60.0), (180.0, 50.0), (60.0, 150.0)])[:like]
+    for u, v in streaks:
+        ends = [(round((u + k * 7) * 8), round((v + k * 3) * 8)) for k in (-1, 1)]
+        cv2.line(big, *ends, 220, 9 * 8)
+    for u, v in [(120, 150), (150, 110), (200, 160), (230, 100), (30, 100)]:
+        cv2.circle(big, (u * 8, v * 8), 6 * 8, 220, -1)
+    image = cv2.resize(big, (260, 200), interpolation=cv2.INTER_AREA)
+    options = ExtractOptions(method="blobs", polarity="bright")
+    pattern = extract_blobs(image, options, (0, 0, 260, 200))
+    away = np.linalg.norm(pattern.points[:, None] - (streaks - 0.4375), axis=2)
+    assert away.min(axis=0).max() < 0.3
+    own = pattern.deviations[away.argmin(axis=0)]
+    assert own.max() < 0.3 if like == 4 else own.min() > 5.0
+    assert not np.delete(pattern.deviations, away.argmin(axis=0)).any()
 
 
 @pytest.mark.parametrize("radius", [3.5, 5.0, 7.0])

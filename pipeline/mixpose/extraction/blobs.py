@@ -76,6 +76,7 @@ class BlobRules:
     exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
     rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
     off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
+    alike: int = constant(3, "others of one size, length and direction: by chance hardly so many")
     by_rim: float = constant(0.3, "of what grey values show, that what is seen of a rim is off by")
     beside: float = constant(2.0, "px outside of a rim that its grey values reach: optics blur it")
     usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 4 %")
@@ -89,6 +90,7 @@ class Blob(NamedTuple):
     v: float
     area: float
     length: float = 1.0  # by width
+    turn: float = 0.0  # of its length from the rows, radians
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
     carries: bool = False  # whether it has something far brighter on it: features, or a highlight
@@ -132,24 +134,42 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
     """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
 
     A disk of which something is hidden, or that is merged with something, is longer than wide by as
-    much as its centre is off, in radii.  So are oblique ones, but all alike, and with all of a rim.
-    What little is hidden shows in grey values, beyond what noise makes.
+    much as its centre is off, in radii.  So are oblique ones and streaks, but several alike, and
+    with all of a rim.  What little is hidden shows in grey values, beyond what noise makes.
     """
     deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
-    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
+    lengths = longer_than_others(blobs, rules)
     for k, blob in enumerate(blobs):
         radius, rim, longer, share = math.sqrt(blob.area / math.pi), blob.rim, 0.0, 1.0
         if rim is None:
-            longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5
+            longer = lengths[k] - rules.rough / radius**1.5
         elif radius < rules.large and (
             rim.coverage < rules.whole or rim.residual > rules.exact * residual
         ):
-            longer, share = blob.length / typical[0] - 1, rules.by_rim
+            longer, share = lengths[k], rules.by_rim
         off = blob.off or 0.0
         shown = share * off if off > rules.usual * usual else 0.0
         deviations[k] = max(rules.off_centre * radius * longer, shown)
     return deviations
+
+
+def longer_than_others(blobs: Sequence[Blob], rules: BlobRules) -> list[float]:
+    """By how much blobs are longer by width than the roundest quarter, or than those alike.
+
+    Alike are logarithms of their radius and of their length by width along its direction.
+    """
+    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
+    longer = [blob.length / typical[0] - 1 for blob in blobs]
+    if len(blobs) <= rules.alike or max(longer) <= 0:
+        return longer
+    long = np.log([max(blob.length, 1.0) for blob in blobs])
+    turns = 2 * np.array([blob.turn for blob in blobs])
+    sizes = np.log([blob.area for blob in blobs]) / 2
+    shapes = np.stack([sizes, long * np.cos(turns), long * np.sin(turns)], axis=1)
+    # the nearest is the blob itself
+    apart = cKDTree(shapes).query(shapes, k=[rules.alike + 1])[0][:, 0]
+    return [min(pair) for pair in zip(longer, np.expm1(apart).tolist())]
 
 
 @dataclass(eq=False)
@@ -244,8 +264,8 @@ def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> N
     areas, levels = np.array([(part.area, part.level) for part in small]).reshape(-1, 2).T
     found = all_spots(scene, contours, areas, levels, rules.spots)
     for part, spots in zip(small, found, strict=True):
-        length = length_by_width(part.contour) if len(spots) == 1 else 1.0
-        part.found = [Blob(u, v, part.area / len(spots), length, off=off) for u, v, off in spots]
+        shape = length_by_width(part.contour) if len(spots) == 1 else (1.0, 0.0)
+        part.found = [Blob(u, v, part.area / len(spots), *shape, off=off) for u, v, off in spots]
 
 
 def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
@@ -299,9 +319,9 @@ def _disks(
     by_number = dict(zip(told.tolist(), off.tolist(), strict=True))
     areas, lengths = (part.tolist() for part in (ellipses.area, ellipses.length))
     for k, (place, rim) in enumerate(zip(some.tolist(), rims.each(some), strict=True)):
-        disks[place] = Blob(
-            rim.u, rim.v, areas[k], lengths[k], rim, by_number.get(k), bool(carry[k])
-        )
+        turn = rim.angle + (0.0 if rim.half_axis > rim.other else math.pi / 2)
+        shown = by_number.get(k), bool(carry[k])
+        disks[place] = Blob(rim.u, rim.v, areas[k], lengths[k], turn, rim, *shown)
     return disks
 
 
@@ -371,7 +391,7 @@ def _hull_blob(contour: Contour) -> Blob:
     """The blob of an outline, its centre that of the hull: holes may have broken the outline."""
     moments = cv2.moments(cv2.convexHull(contour))
     centre = (moments["m10"] / moments["m00"], moments["m01"] / moments["m00"])
-    return Blob(*centre, filled_area(contour), length_by_width(contour))
+    return Blob(*centre, filled_area(contour), *length_by_width(contour))
 
 
 def _brightness(scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]) -> float:

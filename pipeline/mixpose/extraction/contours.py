@@ -87,16 +87,18 @@ def filled_area(contour: Contour) -> float:
     return float(cv2.contourArea(contour)) + len(contour) / 2 + 1
 
 
-def length_by_width(contour: Contour) -> float:
-    """Of the ellipse that has the moments of a contour."""
+def length_by_width(contour: Contour) -> tuple[float, float]:
+    """Of the ellipse that has the moments of a contour, and in which direction it is long."""
     # The contour runs through the centres of the outermost pixels: it is half a pixel inside.
     m = cv2.moments(contour)
     if m["m00"] <= 0:  # a line
-        return float(len(contour))
-    middle, half = (m["mu20"] + m["mu02"]) / 2, math.hypot((m["mu20"] - m["mu02"]) / 2, m["mu11"])
+        return float(len(contour)), 0.0
+    middle, x, y = (m["mu20"] + m["mu02"]) / 2, (m["mu20"] - m["mu02"]) / 2, m["mu11"]
+    half = math.hypot(x, y)
     long, short = max(middle + half, 0.0), max(middle - half, 0.0)
     scale = 4 / m["m00"]
-    return (math.sqrt(scale * long) + 0.5) / (math.sqrt(scale * short) + 0.5)
+    length = (math.sqrt(scale * long) + 0.5) / (math.sqrt(scale * short) + 0.5)
+    return length, math.atan2(y, x) / 2
 
 
 def ovals(contours: Sequence[Contour]) -> Ellipses:
