@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.extraction.blobs import Blob, BlobRules, extract_blobs, longer_than_others
+from mixpose.extraction.blobs import extract_blobs
 from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.shape import longer_than_others
 from mixpose.records import PointPattern
 
 Floats = NDArray[np.float64]
@@ -55,8 +56,8 @@ def test_oblique_disks_that_are_all_alike_are_whole(axes: tuple[float, float]) -
 
 
 def test_of_three_the_roundest_is_whole() -> None:
-    blobs = [Blob(0.0, 0.0, 50.0, length) for length in (1.5, 1.5, 3.0)]
-    assert longer_than_others(blobs, BlobRules()) == [0.0, 0.0, 1.0]
+    shapes = np.array([(50.0, length, 0.0) for length in (1.5, 1.5, 3.0)])
+    assert longer_than_others(shapes, 3).tolist() == [0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("like", [1, 2, 4])

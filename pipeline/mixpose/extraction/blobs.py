@@ -43,7 +43,7 @@ from mixpose.extraction.contours import (
 )
 from mixpose.extraction.ellipse import EllipseRules, Rim, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.shape import off_centre
+from mixpose.extraction.shape import longer_than_others, off_centre
 from mixpose.extraction.single_spots import all_spots
 from mixpose.extraction.spots import SpotRules, come_apart
 from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
@@ -139,7 +139,8 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
     """
     deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
-    lengths = longer_than_others(blobs, rules)
+    shapes = np.array([(one.area, one.length, one.turn) for one in blobs]).reshape(-1, 3)
+    lengths = longer_than_others(shapes, rules.alike).tolist()
     for k, blob in enumerate(blobs):
         radius, rim, longer, share = math.sqrt(blob.area / math.pi), blob.rim, 0.0, 1.0
         if rim is None:
@@ -152,24 +153,6 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
         shown = share * off if off > rules.usual * usual else 0.0
         deviations[k] = max(rules.off_centre * radius * longer, shown)
     return deviations
-
-
-def longer_than_others(blobs: Sequence[Blob], rules: BlobRules) -> list[float]:
-    """By how much blobs are longer by width than the roundest quarter, or than those alike.
-
-    Alike are logarithms of their radius and of their length by width along its direction.
-    """
-    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
-    longer = [blob.length / typical[0] - 1 for blob in blobs]
-    if len(blobs) <= rules.alike or max(longer) <= 0:
-        return longer
-    long = np.log([max(blob.length, 1.0) for blob in blobs])
-    turns = 2 * np.array([blob.turn for blob in blobs])
-    sizes = np.log([blob.area for blob in blobs]) / 2
-    shapes = np.stack([sizes, long * np.cos(turns), long * np.sin(turns)], axis=1)
-    # the nearest is the blob itself
-    apart = cKDTree(shapes).query(shapes, k=[rules.alike + 1])[0][:, 0]
-    return [min(pair) for pair in zip(longer, np.expm1(apart).tolist())]
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""Whether what is seen is all of a spot, by its grey values.
+"""Whether what is seen is all of a spot, by its grey values, and by other spots.
 
 With z = u + iv from the centroid, what a disk of radius R has lost at its rim, a share s of it at
 an angle φ, moved the centroid by −s R exp(iφ) and makes ⟨z³⟩ = −s R³ exp(3iφ).  This is 0 for what
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mixpose.extraction.conics import Ellipses, turns
 from mixpose.extraction.sampling import parts_of
@@ -25,6 +26,23 @@ SHAPES = 256
 
 # Boxes whose longer sides differ by less, px, are looked at together.
 ALIKE = 8
+
+
+def longer_than_others(shapes: Floats, alike: int) -> Floats:
+    """By how much spots (M,) are longer by width than the roundest quarter, or than those alike.
+
+    Of areas, lengths by width and directions (M, 3).  Alike are so many others, by logarithms of
+    their radius and of their length along its direction.
+    """
+    areas, lengths, turns = shapes.T
+    longer = lengths / np.sort(lengths)[(len(lengths) - 1) // 4 :][:1] - 1
+    if len(lengths) <= alike or longer.max() <= 0:
+        return np.asarray(longer)
+    long, sizes = np.log(np.maximum(lengths, 1.0)), np.log(areas) / 2
+    points = np.stack([sizes, long * np.cos(2 * turns), long * np.sin(2 * turns)], axis=1)
+    # the nearest is the spot itself
+    apart = cKDTree(points).query(points, k=[alike + 1])[0][:, 0]
+    return np.minimum(longer, np.expm1(apart))
 
 
 def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats, Floats]:
