@@ -65,11 +65,11 @@ def test_streaks_beside_round_things_are_whole_where_several_are_alike(like: int
     big = np.full((200 * 8, 260 * 8), 20, dtype=np.uint8)
     streaks = np.array([(40.0, 40.0), (110.0, 60.0), (180.0, 50.0), (60.0, 150.0)])[:like]
     for u, v in streaks:
-        ends = [(round((u + k * 7) * 8), round((v + k * 3) * 8)) for k in (-1, 1)]
-        cv2.line(big, *ends, 220, 9 * 8)
+        first, last = ((round((u + k * 7) * 8), round((v + k * 3) * 8)) for k in (-1, 1))
+        cv2.line(big, first, last, 220, 9 * 8)
     for u, v in [(120, 150), (150, 110), (200, 160), (230, 100), (30, 100)]:
         cv2.circle(big, (u * 8, v * 8), 6 * 8, 220, -1)
-    image = cv2.resize(big, (260, 200), interpolation=cv2.INTER_AREA)
+    image = np.asarray(cv2.resize(big, (260, 200), interpolation=cv2.INTER_AREA), dtype=np.uint8)
     options = ExtractOptions(method="blobs", polarity="bright")
     pattern = extract_blobs(image, options, (0, 0, 260, 200))
     away = np.linalg.norm(pattern.points[:, None] - (streaks - 0.4375), axis=2)

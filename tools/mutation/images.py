@@ -28,7 +28,7 @@ _LEVELS = (
     Mutant(
         "extraction-streaks-are-cut",
         "extraction/shape.py",
-        "return np.minimum(longer, np.expm1(apart))",
+        "return np.asarray(np.minimum(longer, np.expm1(apart)))",
         "return np.asarray(longer)",
         "spots that are long alike count little beside round things",
         ("test_extraction_deviations.py",),

@@ -42,7 +42,7 @@ def longer_than_others(shapes: Floats, alike: int) -> Floats:
     points = np.stack([sizes, long * np.cos(2 * turns), long * np.sin(2 * turns)], axis=1)
     # the nearest is the spot itself
     apart = cKDTree(points).query(points, k=[alike + 1])[0][:, 0]
-    return np.minimum(longer, np.expm1(apart))
+    return np.asarray(np.minimum(longer, np.expm1(apart)))
 
 
 def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats, Floats]:
