@@ -34,12 +34,12 @@ def longer_than_others(shapes: Floats, alike: int) -> Floats:
     Of areas, lengths by width and directions (M, 3).  Alike are so many others, by logarithms of
     their radius and of their length along its direction.
     """
-    areas, lengths, turns = shapes.T
+    areas, lengths, angles = shapes.T
     longer = lengths / np.sort(lengths)[(len(lengths) - 1) // 4 :][:1] - 1
     if len(lengths) <= alike or longer.max() <= 0:
         return np.asarray(longer)
     long, sizes = np.log(np.maximum(lengths, 1.0)), np.log(areas) / 2
-    points = np.stack([sizes, long * np.cos(2 * turns), long * np.sin(2 * turns)], axis=1)
+    points = np.stack([sizes, long * np.cos(2 * angles), long * np.sin(2 * angles)], axis=1)
     # the nearest is the spot itself
     apart = cKDTree(points).query(points, k=[alike + 1])[0][:, 0]
     return np.asarray(np.minimum(longer, np.expm1(apart)))
