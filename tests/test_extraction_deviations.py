@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.extraction.blobs import extract_blobs
+from mixpose.extraction.blobs import Blob, BlobRules, deviations_of, extract_blobs
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.shape import longer_than_others
 from mixpose.records import PointPattern
 
 Floats = NDArray[np.float64]
@@ -56,8 +57,9 @@ def test_oblique_disks_that_are_all_alike_are_whole(axes: tuple[float, float]) -
 
 
 def test_of_three_the_roundest_is_whole() -> None:
-    shapes = np.array([(50.0, length, 0.0) for length in (1.5, 1.5, 3.0)])
-    assert longer_than_others(shapes, 3).tolist() == [0.0, 0.0, 1.0]
+    rules = BlobRules(rough=0.0, off_centre=1.0)
+    blobs = [Blob(0.0, 0.0, math.pi, length) for length in (1.5, 1.5, 3.0)]
+    assert deviations_of(blobs, 1.0, rules).tolist() == [0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("like", [1, 2, 4])

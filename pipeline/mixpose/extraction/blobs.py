@@ -43,7 +43,7 @@ from mixpose.extraction.contours import (
 )
 from mixpose.extraction.ellipse import EllipseRules, Rim, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.shape import longer_than_others, off_centre
+from mixpose.extraction.shape import longer_than_alike, off_centre
 from mixpose.extraction.single_spots import all_spots
 from mixpose.extraction.spots import SpotRules, come_apart
 from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
@@ -139,20 +139,28 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
     """
     deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
-    shapes = np.array([(one.area, one.length, one.turn) for one in blobs]).reshape(-1, 3)
-    lengths = longer_than_others(shapes, rules.alike).tolist()
-    for k, blob in enumerate(blobs):
-        radius, rim, longer, share = math.sqrt(blob.area / math.pi), blob.rim, 0.0, 1.0
-        if rim is None:
-            longer = lengths[k] - rules.rough / radius**1.5
-        elif radius < rules.large and (
-            rim.coverage < rules.whole or rim.residual > rules.exact * residual
-        ):
-            longer, share = lengths[k], rules.by_rim
-        off = blob.off or 0.0
+    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
+    longer = [blob.length / typical[0] - 1 for blob in blobs]
+    margins = [_roughness(blob, residual, rules) for blob in blobs]
+    if any(one > margin for one, margin in zip(longer, margins)):  # as a rule all are round
+        shapes = np.array([(blob.area, blob.length, blob.turn) for blob in blobs])
+        longer = np.minimum(longer, longer_than_alike(shapes, rules.alike)).tolist()
+    for k, (blob, margin) in enumerate(zip(blobs, margins)):
+        is_cut_rim = blob.rim is not None and margin < math.inf
+        off, share = blob.off or 0.0, rules.by_rim if is_cut_rim else 1.0
         shown = share * off if off > rules.usual * usual else 0.0
-        deviations[k] = max(rules.off_centre * radius * longer, shown)
+        radius = math.sqrt(blob.area / math.pi)
+        deviations[k] = max(rules.off_centre * radius * (longer[k] - margin), shown)
     return deviations
+
+
+def _roughness(blob: Blob, residual: float, rules: BlobRules) -> float:
+    """By how much a whole blob may be longer than others; all of a rim tells by itself."""
+    radius, rim = math.sqrt(blob.area / math.pi), blob.rim
+    if rim is None:
+        return rules.rough / math.pow(radius, 1.5)
+    is_cut = rim.coverage < rules.whole or rim.residual > rules.exact * residual
+    return 0.0 if radius < rules.large and is_cut else math.inf
 
 
 @dataclass(eq=False)

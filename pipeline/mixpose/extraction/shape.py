@@ -28,21 +28,19 @@ SHAPES = 256
 ALIKE = 8
 
 
-def longer_than_others(shapes: Floats, alike: int) -> Floats:
-    """By how much spots (M,) are longer by width than the roundest quarter, or than those alike.
+def longer_than_alike(shapes: Floats, alike: int) -> Floats:
+    """By how much spots (M,) are longer by width than those alike; inf where there are too few.
 
     Of areas, lengths by width and directions (M, 3).  Alike are so many others, by logarithms of
     their radius and of their length along its direction.
     """
+    if len(shapes) <= alike:
+        return np.full(len(shapes), np.inf)
     areas, lengths, angles = shapes.T
-    longer = lengths / np.sort(lengths)[(len(lengths) - 1) // 4 :][:1] - 1
-    if len(lengths) <= alike or longer.max() <= 0:
-        return np.asarray(longer)
     long, sizes = np.log(np.maximum(lengths, 1.0)), np.log(areas) / 2
     points = np.stack([sizes, long * np.cos(2 * angles), long * np.sin(2 * angles)], axis=1)
     # the nearest is the spot itself
-    apart = cKDTree(points).query(points, k=[alike + 1])[0][:, 0]
-    return np.asarray(np.minimum(longer, np.expm1(apart)))
+    return np.asarray(np.expm1(cKDTree(points).query(points, k=[alike + 1])[0][:, 0]))
 
 
 def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats, Floats]:

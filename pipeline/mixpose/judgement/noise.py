@@ -331,20 +331,22 @@ def _lasting(
         mean = dposv(known, v)[1]
         # seldom as large as chance makes it for the least degrees of freedom
         if v @ mean > chdtri(1.0, 1 - model.by_chance):
-            S = inverted(known)
-            if v @ mean > chdtri(max(float((S * A).sum()), 1.0), 1 - model.by_chance):
-                return biases, *_of_either_size(A, v, model)
+            values, axes = np.linalg.eigh(A)
+            values = np.maximum(values, 0.0)
+            degrees = float((values / (values + 1 / model.bias**2)).sum())
+            if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
+                return biases, *_of_either_size(values, axes, v @ axes, model)
     return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
-def _of_either_size(A: Floats, v: Floats, model: NoiseModel) -> tuple[Floats, Floats]:
-    """Sizes (q,) of fields that last and their second moments, by sums A and v of what shows.
+def _of_either_size(
+    values: Floats, axes: Floats, along: Floats, model: NoiseModel
+) -> tuple[Floats, Floats]:
+    """Sizes (q,) of fields that last and their second moments, by A and v along the axes of A.
 
     Of a calibration that is off and of an exact one, as likely as they make it: those that do not
     show are as large as those that do.
     """
-    values, axes = np.linalg.eigh(A)
-    values, along = np.maximum(values, 0.0), v @ axes
     variances = np.square([[model.bias], [model.exact]])
     shrunk = variances / (1 + variances * values)  # S along the axes
     logs = 0.5 * (along**2 * shrunk - np.log1p(variances * values)).sum(axis=1)
