@@ -83,7 +83,7 @@ def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
 
 def test_where_no_residuals_say_otherwise_detections_err_by_what_is_usual() -> None:
     three = sensor("0", np.random.default_rng(0), np.zeros((3, 2)))
-    covariance, _ = judged([three], model=ALONE)
+    covariance, _ = judged([three], model=replace(ALONE, bias=0.0))
     J = three.J.reshape(-1, 6) / 2.0
     np.testing.assert_allclose(covariance, 0.01 * np.linalg.inv(J.T @ J), rtol=1e-6)
 
@@ -92,7 +92,7 @@ def test_residuals_that_agree_by_chance_make_no_pose_exact() -> None:
     # two degrees of freedom, and a tenth of what is usual: of that variance 1 in 21, of which this
     # frame, whose errors may be smaller than those of others, takes a sixth
     four = sensor("0", np.random.default_rng(0), np.zeros((4, 2)))
-    covariance, _ = judged([four], model=ALONE)
+    covariance, _ = judged([four], model=replace(ALONE, bias=0.0))
     J = four.J.reshape(-1, 6) / 2.0
     least = 0.01 / 21 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(covariance, 5 / 6 * least, rtol=0.02)
@@ -191,13 +191,25 @@ def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> N
     assert np.mean(errors[blind][20:]) > 2 * np.mean(errors[ALONE][20:])
 
 
-@pytest.mark.parametrize("size", [0.016, 0.25])
-def test_fields_that_no_residual_shows_are_as_large_as_those_that_last(size: float) -> None:
-    fields, lasting = np.diag([300.0] * 4 + [0.0]), [size] * 4 + [0.0]  # a pose takes the last
-    _, mean, second = noise._lasting({}, ("0",), fields, fields @ lasting, MODEL)
-    assert mean == pytest.approx(lasting, rel=0.05)
-    # four of one size leave odds of 10^4 that the calibration is of the other kind
-    assert second[4, 4] == pytest.approx(size**2, rel=0.05)
+@pytest.mark.parametrize(
+    ("size", "moved"),
+    [(0.0004, 0.0), (0.04, MODEL.bias), (0.25, MODEL.bias)],
+    ids=["as small as chance", "as small as calibrating leaves it", "as large as before it"],
+)
+def test_fields_that_no_residual_shows_may_be_large_where_something_lasts(
+    size: float, moved: float
+) -> None:
+    fields = np.diag([2000.0] * 4 + [0.0])  # a pose takes the last
+    _, mean, second = noise._lasting({}, ("0",), fields, fields @ ([size] * 4 + [0.0]), MODEL)
+    # z of 0.8 in four directions where 32 is expected leaves odds of 10^-6, of 80 all
+    assert mean[:4] == pytest.approx(size if moved else 0.0, rel=0.01)
+    assert second[4, 4] == pytest.approx(moved**2, rel=0.01)
+
+
+def test_before_anything_is_seen_few_calibrations_are_off() -> None:
+    _, mean, second = noise._lasting({}, ("0",), np.zeros((1, 3)), np.zeros(1), MODEL)
+    np.testing.assert_allclose(mean, 0.0)
+    np.testing.assert_allclose(second, np.eye(3) * MODEL.off * MODEL.bias**2)
 
 
 def test_sensors_that_were_seen_together_before_are_remembered_apart() -> None:

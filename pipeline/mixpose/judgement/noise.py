@@ -12,8 +12,9 @@ that B. L. Welch and F. E. Satterthwaite give to a sum of variances of shares w_
 and by more where the tail of F needs it, see `mixpose.judgement.cut`.
 
 Fields of a sensor that last, of sizes γ in σ_ε, show in fading sums A of PᵀWRP and v of PᵀWr.  With
-γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance
-makes it, something lasts.
+γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹, and v is as likely by fields as by
+none times det(1 + d²A)^(−½) exp(½ vᵀγ̂).  Calibrating makes residuals small, not what is off: small
+fields tell that something lasts as well, and a pose is off by a larger one.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.linalg.lapack import dposv
 from scipy.optimize import nnls
-from scipy.special import chdtri
+from scipy.special import expit, logit
 
 from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
@@ -43,6 +44,8 @@ from mixpose.matching import (
 from mixpose.records import Floats, Mask
 
 Biases: TypeAlias = Mapping[tuple[str, ...], Floats]
+
+NEGLIGIBLE = 1e-4  # probabilities that widen nothing
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,9 @@ class NoiseModel:
         "of freedom that the noise so far counts as in a frame: it varies by 40 %, √(2/ν)",
     )
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
+    off: float = constant(0.03, "of calibrations are off, before anything is seen")
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
-    exact: float = constant(0.016, "σ_ε: the same of an exact calibration, 0.02 px")
+    shown: float = constant(0.016, "σ_ε: of them in residuals, which calibrating has made small")
     turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
     shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
     lens: float = constant(0.2, "k1 of a lens that is another than told: lenses have 0.05 to 0.4")
@@ -326,35 +330,26 @@ def _lasting(
     biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
     A, v = shown[:, :-1], shown[:, -1]
     if model.bias:
-        known = A.copy()
-        known.reshape(-1)[:: len(v) + 1] += 1 / model.bias**2
-        mean = dposv(known, v)[1]
-        # seldom as large as chance makes it for the least degrees of freedom
-        if v @ mean > chdtri(1.0, 1 - model.by_chance):
-            values, axes = np.linalg.eigh(A)
-            values = np.maximum(values, 0.0)
-            degrees = float((values / (values + 1 / model.bias**2)).sum())
-            if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
-                return biases, *_of_either_size(values, axes, v @ axes, model)
+        chance = _of_fields(A, v, model)
+        if chance > NEGLIGIBLE:
+            second = inverted(A + np.eye(len(v)) / model.bias**2)
+            mean = second @ v
+            return biases, chance * mean, chance * (second + np.outer(mean, mean))
     return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
-def _of_either_size(
-    values: Floats, axes: Floats, along: Floats, model: NoiseModel
-) -> tuple[Floats, Floats]:
-    """Sizes (q,) of fields that last and their second moments, by A and v along the axes of A.
+def _of_fields(A: Floats, v: Floats, model: NoiseModel) -> float:
+    """The probability of fields, which show as they are, or as small as calibrating makes them."""
+    logs = np.logaddexp(_log_density(A, v, model.bias), _log_density(A, v, model.shown))
+    return float(expit(logs - math.log(2) + logit(model.off)))
 
-    Of a calibration that is off and of an exact one, as likely as they make it: those that do not
-    show are as large as those that do.
-    """
-    variances = np.square([[model.bias], [model.exact]])
-    shrunk = variances / (1 + variances * values)  # S along the axes
-    logs = 0.5 * (along**2 * shrunk - np.log1p(variances * values)).sum(axis=1)
-    chances = np.exp(logs - logs.max())
-    chances /= chances.sum()
-    means = shrunk * along @ axes.T
-    second = (axes * (chances @ shrunk)) @ axes.T
-    return chances @ means, second + (means.T * chances) @ means
+
+def _log_density(A: Floats, v: Floats, d: float) -> float:
+    """The log of the density of v with fields of deviation d, over that without."""
+    known = A.copy()
+    known.reshape(-1)[:: len(v) + 1] += 1 / d**2
+    factor, mean, _ = dposv(known, v)
+    return 0.5 * float(v @ mean) - float(np.log(d * factor.diagonal()).sum())
 
 
 def expected_squares(
