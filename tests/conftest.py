@@ -81,3 +81,11 @@ def recordings() -> Path:
     if not folder:
         pytest.skip("MIXPOSE_RECORDINGS names no folder of real recordings")
     return Path(folder)
+
+
+@pytest.fixture
+def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No curves of the objective on the sheet, which take longer than all the other pictures."""
+    plain = np.zeros((4, 4, 3), np.uint8)
+    monkeypatch.setattr("mixpose.pictures.sheet.objective_around", lambda *_: ((), ()))
+    monkeypatch.setattr("mixpose.pictures.sheet.objective_picture", lambda *_: plain)
