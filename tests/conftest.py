@@ -85,7 +85,8 @@ def recordings() -> Path:
 
 @pytest.fixture
 def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No curves of the objective on the sheet, which take longer than all the other pictures."""
+    """No charts in reports and on the sheet of `inspect`, which take longer than all the rest."""
     plain = np.zeros((4, 4, 3), np.uint8)
     monkeypatch.setattr("mixpose.pictures.sheet.objective_around", lambda *_: ((), ()))
     monkeypatch.setattr("mixpose.pictures.sheet.objective_picture", lambda *_: plain)
+    monkeypatch.setattr("mixpose.report.figures.drawn", lambda _: "<svg></svg>")

@@ -40,6 +40,7 @@ def test_smoothed_poses_are_those_of_the_file(poses: Path, tmp_path: Path) -> No
     assert told == (tmp_path / "smooth.jsonl").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_a_report_is_a_page(poses: Path, tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     told = printed(tmp_path, "report", poses, TRUTH, "-o", "-")

@@ -248,6 +248,7 @@ def test_check_tells_a_cloud_and_what_it_would_give(seven: Recording) -> None:
     assert 0.57 <= x < 0.9
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_inspect_tells_what_a_pose_meets_of_a_cloud(seven: Recording, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     said = run("inspect", seven.session, "--frame", "3", "-o", tmp_path / "seen")
@@ -257,6 +258,7 @@ def test_inspect_tells_what_a_pose_meets_of_a_cloud(seven: Recording, tmp_path: 
     assert 0.2 < float(said.partition(" within ")[2].split()[0]) < 0.8
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_a_report_tells_how_far_off_a_cloud_is_in_lengths(seven: Recording, tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     run("run", seven.session, "--stop", "3", "-o", tmp_path / "poses.jsonl")

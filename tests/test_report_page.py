@@ -351,10 +351,11 @@ def test_output_never_takes_the_place_of_something_else(tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_frames_of_several_bodies_are_counted_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    both = [estimate(k, np.eye(4), "lost", object=n) for k in range(3) for n in ("tool", "cup")]
+    both = [estimate(k, np.eye(4), object=name) for k in range(3) for name in ("tool", "cup")]
     report(tmp_path, write(tmp_path / "p.jsonl", both, None))
     assert "3 frames -> " in capsys.readouterr().err
 
