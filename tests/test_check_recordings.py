@@ -39,7 +39,7 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def frames_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No frame is estimated for what may be wrong with the geometry, which takes most of a check."""
+    """No frame is estimated for what may be wrong with the geometry: most of what a check takes."""
     monkeypatch.setattr("mixpose.checking.geometry.geometry_doubts", lambda *_: Doubts())
 
 

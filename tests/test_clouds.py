@@ -130,8 +130,8 @@ def test_the_covariance_of_a_first_frame_holds(seven: Recording) -> None:
         assert estimate.covariance is not None
         off = twist_between(T, estimate.T_world_object)
         squared.append(off @ np.linalg.solve(estimate.covariance, off))
-    # 120 numbers: 1 +- 0.13; that 99.9 % are inside by a noise of 15 residuals makes it 0.6 times as
-    # large, and fields, not known yet, smaller; six coordinates give 1.0
+    # 120 numbers: 1 +- 0.13; that 99.9 % are inside by a noise of 15 residuals makes it 0.6 times
+    # as large, and fields, not known yet, smaller; six coordinates give 1.0
     assert 0.4 < np.mean(squared) / 6 < 0.85
 
 

@@ -95,7 +95,10 @@ def test_a_page_that_dies_takes_no_run_with_it() -> None:
 
 @needs_proc
 def test_the_page_stays_after_the_last_frame_but_not_longer_than_the_run() -> None:
-    with viewed(RANGES, "--pause", "--stop", "3") as (process, address), open_page(address) as connection:
+    with (
+        viewed(RANGES, "--pause", "--stop", "3") as (process, address),
+        open_page(address) as connection,
+    ):
         client = PageClient(connection)
         until(client, "<b>frame 0</b>")
         client.click("Go on")
