@@ -1,4 +1,4 @@
-"""Recordings that take far longer than a test looks at them, so that what happens to a run happens midway."""
+"""Recordings longer than a test waits for, so that what happens to a run happens midway."""
 
 from __future__ import annotations
 
