@@ -81,3 +81,12 @@ def recordings() -> Path:
     if not folder:
         pytest.skip("MIXPOSE_RECORDINGS names no folder of real recordings")
     return Path(folder)
+
+
+@pytest.fixture
+def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No charts in reports and on the sheet of `inspect`, which take longer than all the rest."""
+    plain = np.zeros((4, 4, 3), np.uint8)
+    monkeypatch.setattr("mixpose.pictures.sheet.objective_around", lambda *_: ((), ()))
+    monkeypatch.setattr("mixpose.pictures.sheet.objective_picture", lambda *_: plain)
+    monkeypatch.setattr("mixpose.report.figures.drawn", lambda _: "<svg></svg>")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, command, mixpose
+from command_line import assert_one_line, command
 
 from mixpose.cli.notices import watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
@@ -37,7 +37,7 @@ def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_camera_that_was_bumped_is_put_back_where_it_stands(bumped: Path) -> None:
     output = bumped.with_name("calibrated.toml")
-    done = mixpose("calibrate", bumped, "-o", output)
+    done = command("calibrate", bumped, "-o", output)
     assert done.returncode == 0, done.stderr
     truth = load_session(RECORDING / "session.toml").sensors[1].sensor.T_sensor_world  # type: ignore[attr-defined]
     found = load_session(output).sensors[1].sensor.T_sensor_world  # type: ignore[attr-defined]

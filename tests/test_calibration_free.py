@@ -54,7 +54,7 @@ def test_free_is_what_words_name_and_the_body_only_where_they_do() -> None:
 def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
     true = cameras(2)
     matrix = true[1].camera_matrix + np.array([[8.0, 0, 5], [0, 8, -4], [0, 0, 0]])
-    frames = recording(true, 40, 0.02)
+    frames = recording(true, 24, 0.02)
     free = {1: ("pose", "focal", "principal_point")}
     believed = [true[0], replace(true[1], camera_matrix=matrix)]
     found = calibrate(
@@ -74,7 +74,7 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
 
 def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> None:
     true = [replace(camera, distortion=LENS) for camera in cameras(2)]
-    frames = recording(true, 40, 0.02)
+    frames = recording(true, 24, 0.02)
     believed = [true[0], replace(true[1], distortion=np.zeros(4))]
     free = {1: ("pose", "distortion")}
     found = calibrate(task_of(believed, frames, free=free), found=alone(true, frames))
@@ -98,7 +98,7 @@ def test_cameras_that_read_row_after_row_are_no_worse() -> None:
             after = readout * (y[:, 1] - 255.5) / 511
         return y, visible
 
-    frames = recording(sensors, 40, 0.02, look=look)
+    frames = recording(sensors, 24, 0.02, look=look)
     task = task_of(sensors, frames)
     task = replace(task, rig=replace(task.rig, readouts=np.full(2, readout)))
     found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
@@ -116,7 +116,7 @@ def test_images_of_large_spheres_move_no_camera() -> None:
         shown = BodyProjection((sensor,), (large,)).project(motion(time)[None])
         return shown.y[0, 0], shown.seen[0, 0]
 
-    frames = recording(true, 40, 0.02, look=look)
+    frames = recording(true, 24, 0.02, look=look)
     task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large), body=large)
     found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(true, frames))
     off = centre_of(found.after.sensors[1]) - centre_of(true[1])

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,13 +100,13 @@ def test_lines_have_the_keys_of_the_contract_in_their_order(recording: Path) -> 
 
 
 def test_the_same_seed_writes_the_same_bytes_but_for_latency(recording: Path) -> None:
-    def without_latency() -> list[dict[str, Any]]:
-        poses = lines_of(mixpose("run", recording / "session.toml").stdout)
+    def without_latency(run: Callable[..., Any]) -> list[dict[str, Any]]:
+        poses = lines_of(run("run", recording / "session.toml").stdout)
         for pose in poses:
             pose.pop("latency_ms", None)
         return poses
 
-    assert without_latency() == without_latency()
+    assert without_latency(mixpose) == without_latency(command)  # in another process, too
 
 
 @pytest.mark.parametrize("objective", ["paper", "independent"])
@@ -251,7 +252,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(recording: Path) -> None:
 
 
 def test_check_says_what_the_session_holds() -> None:
-    result = mixpose("check", SYNTHETIC / "two_cameras" / "session.toml")
+    result = command("check", SYNTHETIC / "two_cameras" / "session.toml")
     assert result.returncode == 0, result.stderr
     for words in ("40 images 640x512", "symmetry  none", "left 7/7", "accuracy"):
         assert words in result.stdout
@@ -308,7 +309,7 @@ def test_help_lists_the_commands() -> None:
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_help_of_a_command_has_two_examples_whose_options_exist_and_no_types(name: str) -> None:
-    text = mixpose(name, "--help").stdout
+    text = command(name, "--help").stdout
     for example in EXAMPLES[name]:
         assert f"  {example}\n" in text
         for option in re.findall(r"--[a-z-]+", example):
@@ -323,6 +324,6 @@ def test_every_command_is_in_one_group_and_has_examples() -> None:
 
 
 def test_help_of_simulate_has_its_options_in_groups() -> None:
-    text = mixpose("simulate", "--help").stdout
+    text = command("simulate", "--help").stdout
     found = [len(part.split("\n  -")) - 1 for part in re.split(r"^\w[\w ,]+:$", text, flags=re.M)]
     assert max(found) < 10

@@ -40,6 +40,7 @@ def test_smoothed_poses_are_those_of_the_file(poses: Path, tmp_path: Path) -> No
     assert told == (tmp_path / "smooth.jsonl").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_a_report_is_a_page(poses: Path, tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     told = printed(tmp_path, "report", poses, TRUTH, "-o", "-")
@@ -83,7 +84,7 @@ def test_an_imported_session_is_printed_and_was_read_before(tmp_path: Path) -> N
 
 
 def test_a_table_of_markers_is_printed_and_several_need_names(tmp_path: Path) -> None:
-    scene, cameras = Scene(frames=24), [camera(20.0), camera(85.0)]
+    scene, cameras = Scene(frames=16), [camera(20.0), camera(85.0)]
     bodies = []
     for markers in (5, 4):
         rng = np.random.default_rng(markers)

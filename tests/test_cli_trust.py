@@ -43,6 +43,7 @@ def with_code(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("what", ["run", "check", "inspect"])
+@pytest.mark.usefixtures("without_plots")
 def test_a_session_runs_no_code_unless_that_is_allowed(
     what: str, with_code: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -65,6 +66,7 @@ def test_python_runs_code_of_a_session_only_where_that_is_allowed(with_code: Pat
     assert next(run(load_session(with_code, allow_code=True))).status == "ok"
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_a_report_on_poses_runs_no_code_of_their_session(with_code: Path, tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     poses = tmp_path / "poses.jsonl"

@@ -18,7 +18,7 @@ from command_line import LONGEST_S, command, has_written, started, wait_until
 from long_recordings import RANGE_FRAMES, long_ranges
 
 from mixpose.cli.lines import LineFile
-from mixpose.cli.recording_job import Job, finished, run_job
+from mixpose.cli.recording_job import Job, Running, finished, run_job
 from mixpose.cli.request import RunRequest
 from mixpose.cli.several import names_of, run_sessions, sessions_of
 from mixpose.errors import SessionError
@@ -31,7 +31,7 @@ from kills import without_latency
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 RANGES = SYNTHETIC / "range_profiles" / "session.toml"
-BEAMS = SYNTHETIC / "parallel_beams" / "session.toml"
+CAMERAS = SYNTHETIC / "two_cameras" / "session.toml"
 BODIES = SYNTHETIC / "several_bodies" / "session.toml"
 
 
@@ -46,6 +46,17 @@ def refusal(*sessions: Path, output: Path | None, sources: tuple[str, ...] = ())
     with pytest.raises(SessionError) as caught:
         run_sessions(sessions, request, workers=2)
     return str(caught.value)
+
+
+@pytest.fixture
+def done_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of the process of a recording, for what becomes of folders: poses without a line."""
+
+    def run(_: Running, command: list[str], folder: Path, *more: object) -> int:
+        (folder / "poses.jsonl").write_text("", encoding="utf-8")
+        return 0
+
+    monkeypatch.setattr(Running, "run", run)
 
 
 def killed_parent(
@@ -64,41 +75,50 @@ def status_of(folder: Path) -> dict[str, Any]:
     return status
 
 
-def test_several_sessions_give_the_poses_that_each_gives_alone(tmp_path: Path) -> None:
-    folder = tmp_path / "poses"
-    result = command("run", RANGES, BEAMS, "--workers", "2", "-o", folder, "--stop", "3")
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of two sessions that ran side by side, and what was said."""
+    folder = tmp_path_factory.mktemp("both") / "poses"
+    result = command("run", BODIES, CAMERAS, "--workers", "2", "-o", folder, "--stop", "2")
     assert result.returncode == 0, result.stderr
     assert result.stdout == ""
-    names = ["parallel_beams", "range_profiles", "summary.csv", "summary.json"]
+    return folder, result.stderr
+
+
+def test_several_sessions_give_the_poses_that_each_gives_alone(
+    both: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder, said = both
+    names = ["several_bodies", "summary.csv", "summary.json", "two_cameras"]
     assert sorted(path.name for path in folder.iterdir()) == names
-    for name in names[:2]:
+    for name in names[::3]:
         files = sorted(path.name for path in (folder / name).iterdir())
         assert files == ["log.txt", "poses.jsonl", "status.json"]
-    assert f"mixpose: {RANGES}: 3 frames: 3 ok" in result.stderr
-    assert result.stderr.endswith(f"2 recordings: 2 done -> {folder / 'summary.csv'}\n")
+    assert f"mixpose: {CAMERAS}: 2 frames: 2 ok" in said
+    assert said.endswith(f"2 recordings: 2 done -> {folder / 'summary.csv'}\n")
     alone = tmp_path / "alone.jsonl"
-    assert command("run", BEAMS, "-o", alone, "--stop", "3").returncode == 0
-    assert poses_of(folder / "parallel_beams" / "poses.jsonl") == poses_of(alone)
-    status = status_of(folder / "parallel_beams")
-    assert (status["state"], status["frames"]) == ("done", {"ok": 3})
+    assert command("run", CAMERAS, "-o", alone, "--stop", "2").returncode == 0
+    assert poses_of(folder / "two_cameras" / "poses.jsonl") == poses_of(alone)
+    status = status_of(folder / "two_cameras")
+    assert (status["state"], status["frames"]) == ("done", {"ok": 2})
 
-    before = (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns
-    again = command("run", RANGES, BEAMS, "-o", folder, "--stop", "3")
+    before = (folder / "two_cameras" / "poses.jsonl").stat().st_mtime_ns
+    again = command("run", BODIES, CAMERAS, "-o", folder, "--stop", "2")
     assert "2 of 2 recordings are done already" in again.stderr
-    assert (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns == before
+    assert (folder / "two_cameras" / "poses.jsonl").stat().st_mtime_ns == before
 
 
-def test_poses_of_several_bodies_are_counted_beside_those_of_one(tmp_path: Path) -> None:
-    folder = tmp_path / "poses"
-    result = command("run", BODIES, BEAMS, "-o", folder, "--stop", "2")
-    assert result.returncode == 0, result.stderr
+def test_poses_of_several_bodies_are_counted_beside_those_of_one(
+    both: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder, said = both
     alone = command("run", BODIES, "-o", tmp_path / "alone.jsonl", "--stop", "2")
     told = "mixpose: 2 frames of 4 bodies: 8 ok"
     assert alone.stderr.splitlines()[-1].startswith(told)
-    assert told.replace("mixpose:", f"mixpose: {BODIES}:") in result.stderr.splitlines()
+    assert told.replace("mixpose:", f"mixpose: {BODIES}:") in said.splitlines()
     rows = (folder / "summary.csv").read_text(encoding="utf-8").splitlines()[1:]
     assert [row.split(",")[:5] for row in rows] == [
-        ["several_bodies", "done", "8", "0", "0"], ["parallel_beams", "done", "2", "0", "0"],
+        ["several_bodies", "done", "8", "0", "0"], ["two_cameras", "done", "2", "0", "0"],
     ]  # fmt: skip
     status = status_of(folder / "several_bodies")
     assert (status["frames"], status["bodies"]) == ({"ok": 8}, 4)
@@ -159,8 +179,9 @@ def test_a_pattern_names_sessions_and_one_that_matches_none_is_told(tmp_path: Pa
         sessions_of([str(tmp_path / "empty.txt")])
 
 
+@pytest.mark.usefixtures("done_at_once")
 def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
-    job = Job(str(BEAMS), "ab", str(tmp_path), "beams", "poses.jsonl", ("--stop=1",), "0", True)
+    job = Job(str(CAMERAS), "ab", str(tmp_path), "beams", "poses.jsonl", ("--stop=1",), "0", True)
     first, second = run_job(job), run_job(replace(job, mixpose="1"))
     assert first.state == second.state == "done"
     assert finished(job) is None  # of another version: done again
@@ -200,7 +221,7 @@ def test_the_children_of_a_killed_parent_end(
 def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_once(
     tmp_path: Path,
 ) -> None:
-    sessions, folder = make_recordings(tmp_path, 2, 60), tmp_path / "poses"
+    sessions, folder = make_recordings(tmp_path, 2, 20), tmp_path / "poses"
     begun = killed_parent(sessions, folder, any)
     assert any(path.exists() for path in begun)  # it was killed midway
     again = command("run", *sessions, "-o", folder, "--workers", "2")
@@ -209,7 +230,7 @@ def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_onc
     for session in sessions:
         assert command("run", session, "-o", alone).returncode == 0
         poses = folder / session.parent.name / "poses.jsonl"
-        assert len(poses_of(poses)) == 61  # with the header
+        assert len(poses_of(poses)) == 21  # with the header
         assert without_latency(poses) == without_latency(alone)
 
 
@@ -231,6 +252,7 @@ def test_a_second_run_into_the_folder_leaves_alone_what_the_first_one_does(
     assert f"-o {folder / 'a'}: another run is writing there" in summary["results"][0]["reason"]
 
 
+@pytest.mark.usefixtures("done_at_once")
 def test_an_unfinished_recording_stays_when_one_whose_name_begins_its_own_is_done(
     tmp_path: Path,
 ) -> None:
@@ -245,6 +267,7 @@ def test_an_unfinished_recording_stays_when_one_whose_name_begins_its_own_is_don
     assert not left.exists()
 
 
+@pytest.mark.usefixtures("done_at_once")
 def test_recordings_of_another_place_and_the_same_name_are_neither_taken_nor_replaced(
     tmp_path: Path,
 ) -> None:
@@ -265,13 +288,13 @@ def test_recordings_of_another_place_and_the_same_name_are_neither_taken_nor_rep
 
 
 def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None:
-    assert "-o DIR: missing" in refusal(RANGES, BEAMS, output=None)
+    assert "-o DIR: missing" in refusal(RANGES, CAMERAS, output=None)
     file = tmp_path / "poses.jsonl"
     file.touch()
-    assert f"{file}: is a file" in refusal(RANGES, BEAMS, output=file)
+    assert f"{file}: is a file" in refusal(RANGES, CAMERAS, output=file)
     nowhere = tmp_path / "no" / "poses"
-    assert f"{nowhere}: cannot be made: No such file" in refusal(RANGES, BEAMS, output=nowhere)
-    named = refusal(RANGES, BEAMS, output=tmp_path, sources=("front=x.npy",))
+    assert f"{nowhere}: cannot be made: No such file" in refusal(RANGES, CAMERAS, output=nowhere)
+    named = refusal(RANGES, CAMERAS, output=tmp_path, sources=("front=x.npy",))
     assert "--source front=x.npy" in named
     assert "2 sessions" in named
 
@@ -279,7 +302,7 @@ def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None
 def test_several_sessions_cannot_be_paused(tmp_path: Path) -> None:
     request = RunRequest(tmp_path, "jsonl", (), Selection(), resume=False, pause=True)
     with pytest.raises(SessionError, match=r"^--pause: found 2 sessions, allowed with one only$"):
-        run_sessions((RANGES, BEAMS), request, workers=2)
+        run_sessions((RANGES, CAMERAS), request, workers=2)
 
 
 def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:

@@ -96,12 +96,12 @@ def test_the_error_of_a_target_is_that_of_point_set_registration(
     assert found == pytest.approx(registration_error(POINTS, tip, fle), rel=1e-6)
 
 
-def registered(points: Floats, measured: Floats, target: Floats) -> Floats:
-    """Where least squares puts a target that moves with points (Kabsch)."""
+def registered(points: Floats, measured: Floats, targets: Floats) -> Floats:
+    """Where least squares puts targets (n, 3) that move with points (Kabsch)."""
     at, to = points.mean(axis=0), measured.mean(axis=0)
     U, _, Vt = np.linalg.svd((measured - to).T @ (points - at))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return np.asarray(R @ (target - at) + to)
+    return np.asarray((targets - at) @ R.T + to)
 
 
 def test_the_tip_of_a_real_tool_errs_as_registrations_of_it_do(recordings: Path) -> None:
@@ -111,10 +111,10 @@ def test_the_tip_of_a_real_tool_errs_as_registrations_of_it_do(recordings: Path)
     plan = point_sets(points, 1e-6, per_axis)
     rng = np.random.default_rng(0)
     noise = rng.normal(0, per_axis, (4000, *points.shape))
-    for tip in np.array([[0, 0, -100.0], [0, 0, -200], [0, -100, 0], [0, -200, 0]]):
+    tips = np.array([[0, 0, -100.0], [0, 0, -200], [0, -100, 0], [0, -200, 0]])
+    errors = np.array([registered(points, points + each, tips) - tips for each in noise])
+    for tip, found in zip(tips, np.sqrt((errors**2).sum(axis=2).mean(axis=0)), strict=True):
         predicted = np.sqrt(np.trace(at_tip(predict(plan, np.eye(4)[None]), tip)[0]))
-        errors = [registered(points, points + each, tip) - tip for each in noise]
-        found = np.sqrt((np.array(errors) ** 2).sum(axis=1).mean())
         # 4000 draws of about three directions: 1 %; second order of 1/100 rad: 1e-4
         assert found == pytest.approx(predicted, rel=0.03)
 
@@ -224,7 +224,7 @@ def test_simulated_frames_of_two_cameras_with_unlike_noise_err_as_predicted() ->
     session = load_session(TWO_CAMERAS)
     plan = replace(plan_of(session), noises=(0.1, 0.4))
     poses = spread_poses(session, 2)
-    found = confirm(session, plan, poses, 200, tip=np.array([0, 0, -150.0]))
+    found = confirm(session, plan, poses, 120, tip=np.array([0, 0, -150.0]))
     assert abs(found.overall - 1) < 0.05 + found.chance
     # RMS of a vector with about two directions that count
     assert found.found[2] == pytest.approx(found.predicted[2], rel=0.1)
@@ -243,7 +243,7 @@ def test_ranges_are_as_good_as_cameras_with_the_noise_that_is_printed() -> None:
     assert factor is not None
     equal = scaled(ranges, factor)
     assert error_of(equal) == pytest.approx(error_of(cameras), rel=1e-8)
-    found = confirm(planned(third, 0.25), equal, poses, 100, tip=ORIGIN)
+    found = confirm(planned(third, 0.25), equal, poses, 60, tip=ORIGIN)
     assert found.found[0] == pytest.approx(error_of(cameras), rel=0.12)
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
-import sys
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import command
 
 from mixpose.body import Body, PointFeature
 from mixpose.cli import main, session_formats
@@ -374,8 +373,7 @@ def test_lines_with_labels_are_valid_and_convert_to_themselves(poses: Path, tmp_
 
 
 def test_labels_change_no_pose(poses: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mixpose", "run", str(FOLDER / "session.toml"), "--stop", "9"]
-    plain = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    plain = command("run", FOLDER / "session.toml", "--stop", "9").stdout
     for without, with_labels in zip(plain.splitlines()[1:], poses.read_text().splitlines()[1:]):
         expected, found = json.loads(without), json.loads(with_labels)
         assert "points" not in expected

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -37,10 +38,17 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path / "tree"
 
 
+@cache
+def read_of(file: str) -> tuple[str, str]:
+    """The text of a file of the package, and its syntax tree."""
+    text = (ROOT / tool.PACKAGE / file).read_text(encoding="utf-8")
+    return text, ast.dump(ast.parse(text))
+
+
 @pytest.mark.parametrize("one", MUTANTS, ids=lambda one: one.name)
 def test_every_mutant_fits_the_code_and_can_be_compiled(one: Mutant) -> None:
-    text = (ROOT / tool.PACKAGE / one.file).read_text(encoding="utf-8")
-    assert ast.dump(ast.parse(one.mutated(text))) != ast.dump(ast.parse(text))
+    text, tree = read_of(one.file)
+    assert ast.dump(ast.parse(one.mutated(text))) != tree
     assert one.name.startswith(f"{one.room}-")
     assert one.why
     for pattern in (*one.tests, *tool.TESTS[one.room]):

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from argparse import Namespace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -264,5 +265,10 @@ def test_lists_of_one_length_need_not_be_told_to_be(tree: Path) -> None:
 @pytest.mark.parametrize("one", HARMLESS, ids=lambda one: one.new)
 def test_every_harmless_mutant_is_one_of_the_code_as_it_is(one: Harmless) -> None:
     room = one.file.partition("/")[0].removesuffix(".py")
-    those = [each for each in candidates(ROOT / tool.PACKAGE, room) if each.file == one.file]
-    assert one.reason in {reason_why_harmless(each) for each in those}
+    assert one.reason in {reason for file, reason in reasons_in(room) if file == one.file}
+
+
+@cache
+def reasons_in(room: str) -> list[tuple[str, str | None]]:
+    """Files of the mutants of a room, and why these are harmless."""
+    return [(one.file, reason_why_harmless(one)) for one in candidates(ROOT / tool.PACKAGE, room)]

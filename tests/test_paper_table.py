@@ -48,7 +48,7 @@ BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 @pytest.fixture(scope="module")
 def one_run() -> Errors:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs, "SAMPLES", 100)  # a tenth, as only the matched estimate is judged
+        patch.setattr(runs, "SAMPLES", 30)  # few, as only the matched estimate is judged
         return runs.run(0, 0)
 
 

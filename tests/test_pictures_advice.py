@@ -39,6 +39,7 @@ def pose() -> NDArray[np.float64]:
     return estimated_pose()
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_clutter_beside_several_bodies_is_told_of_what_the_others_leave(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -70,6 +70,7 @@ def test_cameras_get_a_picture_per_stage_and_a_sheet(
     assert "right: 7 features found; the pose has 7 of 7 in view, 7 of them met" in out
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_without_a_number_the_first_frame_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,6 +82,7 @@ def test_without_a_number_the_first_frame_is_shown(
     assert "session.toml, frame 4: ok (estimated on its own)" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_grey_values_have_pictures_too(tmp_path: Path) -> None:
     session = SYNTHETIC / "parallel_beams" / "session.toml"
     assert command("inspect", session, "--frame", 3, "-o", tmp_path) == 0
@@ -108,6 +110,7 @@ def test_ranges_have_plots_and_the_pose_may_come_from_a_run(
     assert "has no pose of it, found frames 0 to 1" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_the_frame_is_of_the_recording_that_the_poses_are_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -142,6 +145,7 @@ def test_a_frame_that_is_not_there_names_those_that_are(
     assert not (tmp_path / "seen").exists()
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_frames_before_that_of_number_0_are_shown_as_they_are_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -179,6 +183,7 @@ def test_other_peoples_files_are_not_overwritten(
     assert (tmp_path / "sheet.png").read_bytes() == b"holiday"
 
 
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(("source", "place"), [("left*.png", "."), ("left", "left")])
 def test_pictures_do_not_go_among_the_frames_of_the_recording(
     source: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -314,6 +319,7 @@ def test_unsharp_spots_are_told_by_their_height(
     assert words in advice_for(with_options(recording, lines), 6, pose_of_frame_6)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_unsharp_spots_have_a_picture_of_the_response(recording: Path, tmp_path: Path) -> None:
     session = with_options(recording, 'method = "log"\nspot_sigma = 1.5')
     assert command("inspect", session, "--frame", 6, "-o", tmp_path / "seen") == 0
@@ -438,6 +444,7 @@ def test_a_small_spot_is_seen_between_the_arms_of_its_cross() -> None:
     assert not picture[20, 27:30].any()
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_real_frames_have_every_marker_met(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -448,6 +455,7 @@ def test_real_frames_have_every_marker_met(
     assert len(tracker.body) == 54
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_each_of_several_bodies_is_shown_on_what_the_others_leave(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,11 +89,10 @@ def test_a_run_of_one_frame_is_told_as_one(tmp_path: Path) -> None:
     truth = read_poses(RECORDING / "truth.jsonl").poses[10]
     assert truth.T_world_object is not None
     poses = [estimate(10, truth.T_world_object, time_s=0.4)]
-    page = report(tmp_path, write(tmp_path / "poses.jsonl", poses, None))
+    true = write(tmp_path / "truth.jsonl", poses, None)
+    page = report(tmp_path, write(tmp_path / "poses.jsonl", poses, None), true)
     assert "frames 1 10 " in page.text
     assert "10 to 10" not in page.text
-    true = write(tmp_path / "truth.jsonl", poses, None)
-    page = report(tmp_path, tmp_path / "poses.jsonl", true)
     assert "1 frame of the truth: 1 ok" in page.text
     assert "Covariance, 1 frame that is ok" in page.text
 
@@ -352,6 +351,7 @@ def test_output_never_takes_the_place_of_something_else(tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_frames_of_several_bodies_are_counted_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

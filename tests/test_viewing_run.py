@@ -84,7 +84,7 @@ def test_a_run_steps_as_the_page_says_and_goes_on_when_nobody_looks(tmp_path: Pa
 
 @needs_proc
 def test_a_page_that_dies_takes_no_run_with_it() -> None:
-    with viewed(RANGES, "--pause") as (process, address):
+    with viewed(RANGES, "--pause", "--stop", "3") as (process, address):
         with open_page(address) as connection:
             until(PageClient(connection), "<b>frame 0</b>")
             os.kill(page_of(process), signal.SIGKILL)
@@ -95,11 +95,14 @@ def test_a_page_that_dies_takes_no_run_with_it() -> None:
 
 @needs_proc
 def test_the_page_stays_after_the_last_frame_but_not_longer_than_the_run() -> None:
-    with viewed(RANGES, "--pause") as (process, address), open_page(address) as connection:
+    with (
+        viewed(RANGES, "--pause", "--stop", "3") as (process, address),
+        open_page(address) as connection,
+    ):
         client = PageClient(connection)
         until(client, "<b>frame 0</b>")
         client.click("Go on")
-        assert "<b>frame 19</b>" in until(client, "done")
+        assert "<b>frame 2</b>" in until(client, "done")
         assert process.poll() is None
         page = Path(f"/proc/{page_of(process)}")
         process.kill()
@@ -107,7 +110,7 @@ def test_the_page_stays_after_the_last_frame_but_not_longer_than_the_run() -> No
 
 
 def test_a_run_that_is_done_ends_as_soon_as_nobody_looks() -> None:
-    with viewed(RANGES) as (process, address):
+    with viewed(RANGES, "--stop", "3") as (process, address):
         with open_page(address) as connection:
             until(PageClient(connection), "done")
             assert process.poll() is None
@@ -118,7 +121,7 @@ def test_a_run_that_is_done_ends_as_soon_as_nobody_looks() -> None:
 
 
 def test_an_interrupt_ends_a_run_that_waits_for_its_page() -> None:
-    with viewed(RANGES, "--pause") as (process, _):
+    with viewed(RANGES, "--pause", "--stop", "3") as (process, _):
         process.send_signal(signal.SIGINT)
         assert process.wait() == 130
         assert process.stderr is not None

@@ -70,13 +70,13 @@ def drawn(package: Path, number: int, seed: int, rooms: Sequence[str] = ()) -> l
         if room not in ROOMS:
             raise MutationError(f"no such room: {room}; allowed: {', '.join(ROOMS)}")
     rng = random.Random(seed)
-    heaps = [list(candidates(package, room)) for room in ROOMS if not rooms or room in rooms]
+    heaps = [list(_possible(package, room)) for room in ROOMS if not rooms or room in rooms]
     for heap in heaps:
         rng.shuffle(heap)
-    found: list[Drawn] = []
+    found: list[tuple[str, str, Change]] = []
     while len(found) < number and any(heaps):
         found.extend(heap.pop() for heap in heaps if heap)
-    return found[:number]
+    return [_mutant(*each) for each in found[:number]]
 
 
 def chosen_tests(mutant: Drawn, executed: Executed, seconds: float) -> list[str]:
@@ -136,12 +136,17 @@ def shares(outcomes: Sequence[Verdict]) -> list[str]:
 
 def candidates(package: Path, room: str) -> Iterator[Drawn]:
     """All mutants by rule of a room, a module or a folder of them."""
+    return (_mutant(*each) for each in _possible(package, room))
+
+
+def _possible(package: Path, room: str) -> Iterator[tuple[str, str, Change]]:
+    """What they are made of: the file and its text, and the change."""
     for path in sorted([*package.glob(f"{room}.py"), *(package / room).rglob("*.py")]):
         file = path.relative_to(package).as_posix()
         text = path.read_text(encoding="utf-8")
         numbers = not any(PurePosixPath(file).match(pattern) for pattern in LAYOUT)
         for change in changes(text, numbers=numbers):
-            yield _mutant(file, text, change)
+            yield file, text, change
 
 
 def _mutant(file: str, text: str, change: Change) -> Drawn:

@@ -59,6 +59,11 @@ class LookAlike:
         return float(rotation_angle_deg(self.T_body_other, np.eye(4)))
 
     @cached_property
+    def pairs(self) -> set[tuple[int, int]]:
+        """Features, each with its partner."""
+        return set(zip(self.features, self.partners, strict=True))
+
+    @cached_property
     def is_step(self) -> bool:
         """Whether features are shifted, by far the most of the way the same for all of them."""
         points = self.body.means[list(self.features)]
@@ -135,9 +140,9 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
         while len(images):
             part = _grown(body, other, base, images[0], tolerance)
             images = images[1:]
-            if part is None or any(_pairs(part) <= _pairs(known) for known in found):
+            if part is None or any(part.pairs <= known.pairs for known in found):
                 continue
-            found = [known for known in found if not _pairs(known) <= _pairs(part)]
+            found = [known for known in found if not known.pairs <= part.pairs]
             found.append(part)
             images = images[~_within(images, base, part)]
     return tuple(sorted(found, key=lambda part: (-len(part.features), part.off)))
@@ -311,12 +316,8 @@ def _grown(
 
 def _within(images: NDArray[np.intp], base: list[int], part: LookAlike) -> NDArray[np.bool_]:
     """Whether a part pairs a triple of the body with images (K, 3) of it."""
-    partners = dict(zip(part.features, part.partners, strict=True))
+    partners = dict(part.pairs)
     return np.asarray((images == [partners.get(own, -1) for own in base]).all(axis=1))
-
-
-def _pairs(part: LookAlike) -> set[tuple[int, int]]:
-    return set(zip(part.features, part.partners, strict=True))
 
 
 def _modulo_symmetry(other: Body, part: LookAlike) -> Pairs:

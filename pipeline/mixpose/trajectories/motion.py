@@ -61,7 +61,7 @@ class States(NamedTuple):
 
     def moved(self, errors: Floats, covariances: Floats) -> States:
         """These states moved by errors (G, 6 p), with other covariances."""
-        poses = _perturbed(self.poses, errors[:, :3], _turn(_across(errors[:, 3:6])))
+        poses = _perturbed(self.poses, errors[:, :3], _turn(across_by(errors[:, 3:6])))
         return States(poses, self.rates + errors[:, 6:].reshape(self.rates.shape), covariances)
 
     def mixed(self, others: States, is_other: Mask) -> States:
@@ -84,8 +84,8 @@ def foretold(states: States, elapsed: float, noise: Floats) -> tuple[States, Flo
     moved = powers[1:p] @ states.rates
     if p > 2:  # Magnus: a turn that changes its axis
         changing = (powers[3:5] * [0.5, 1.0])[: p - 2] @ states.rates[:, 1:3, 3:]
-        moved[:, 3:] += (_across(changing) @ states.rates[:, 0, 3:, None])[..., 0]
-    across = _across(moved[:, 3:])
+        moved[:, 3:] += (across_by(changing) @ states.rates[:, 0, 3:, None])[..., 0]
+    across = across_by(moved[:, 3:])
     turn = _turn(across)
     F = by_taylor[None].repeat(len(turn), axis=0)
     # what a turn does to errors of rates is told to first order in it
@@ -159,7 +159,7 @@ def smoothed(
 # For a few poses at a time the functions of `mixpose.rigid` take five times as long.
 
 
-def _across(vectors: Floats) -> Floats:
+def across_by(vectors: Floats) -> Floats:
     """[ω] (G, 3, 3) of vectors (G, 3): x -> ω × x."""
     return np.asarray((vectors @ _ACROSS).reshape(-1, 3, 3))
 

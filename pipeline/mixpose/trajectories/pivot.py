@@ -23,6 +23,7 @@ from mixpose import rigid
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
 from mixpose.records import Floats, Mask
+from mixpose.trajectories.motion import across_by
 
 
 @dataclass(frozen=True)
@@ -202,8 +203,7 @@ def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Float
         arms = moved[:, :3, :3] @ place
         rest += sign * (arms + moved[:, :3, 3])
         # a turn moves an arm across both; on top of another one, by the left Jacobian of SO(3)
-        by_turn = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)
-        by_turn = by_turn @ rigid.rotation_matrix(twists[:, 3:] / 2)  # which this is to 2nd order
+        by_turn = -across_by(arms) @ rigid.rotation_matrix(twists[:, 3:] / 2)  # to 2nd order
         J = np.concatenate([np.broadcast_to(np.eye(3), by_turn.shape), by_turn], axis=2)
         by_poses.append(sign * J)
         by_x.append(sign * moved[:, :3, :3])
