@@ -14,7 +14,6 @@ import pytest
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.checking import judge
-from mixpose.checking.geometry import Doubts
 from mixpose.checking.keys import told_apart
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey, some_of
@@ -35,12 +34,6 @@ def recording(tmp_path: Path) -> Path:
         for side in ("left", "right"):
             shutil.copy(source / f"{side}{n:04d}.png", tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def frames_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No frame is estimated for what may be wrong with the geometry: most of what a check takes."""
-    monkeypatch.setattr("mixpose.checking.geometry.geometry_doubts", lambda *_: Doubts())
 
 
 def report_on(session: Path, capsys: pytest.CaptureFixture[str], *, quick: bool = False) -> str:
@@ -102,7 +95,6 @@ def test_corners_have_no_polarity(recording: Path, capsys: pytest.CaptureFixture
     assert "left: pinhole 640x512, corners, sigma" in report_on(session, capsys, quick=True)
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_features_are_counted_beside_what_the_body_has(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -142,7 +134,6 @@ def test_images_to_count_in_are_the_same_of_all_sensors(recording: Path) -> None
     assert some_of(open_sources(session, {})) == {0, 1}  # none pairs: those of each
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -157,14 +148,12 @@ def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
     assert report.count("features per frame") == 2
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_an_image_of_another_size_is_damaged(recording: Path) -> None:
     cv2.imwrite(str(recording / "right0004.png"), np.zeros((100, 120), dtype=np.uint8))
     with pytest.raises(RecordingError, match=r"right0004\.png: found 120x100"):
         check_session(CheckRequest(recording / "session.toml"))
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_a_video_that_ends_early_is_told_with_the_frames_before(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -177,7 +166,6 @@ def test_a_video_that_ends_early_is_told_with_the_frames_before(
     assert "features per frame: " in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_frames_without_features_are_named(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -197,7 +185,6 @@ def test_frames_that_other_sensors_have_are_missing(
     assert "warnings  none" in report
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 @pytest.mark.parametrize(
     ("later", "said"),
     [
@@ -216,7 +203,6 @@ def test_sensors_whose_numbers_do_not_pair_are_told(
     assert said in report_on(recording / "session.toml", capsys)
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 @pytest.mark.parametrize(
     ("line", "hint"),
     [
@@ -232,7 +218,6 @@ def test_too_few_features_name_the_key_that_mends_it(
     assert hint in report
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_markers_out_of_focus_and_faint_name_the_method_that_finds_them(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -249,7 +234,6 @@ def test_markers_out_of_focus_and_faint_name_the_method_that_finds_them(
     assert 'with method = "log" in [extract] it would be' in report
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_far_too_many_features_name_the_key_that_mends_it(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -286,7 +270,6 @@ def statuses(session: Path) -> list[str]:
     return [estimate.status for estimate in mixpose.run(mixpose.load_session(session))]
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -308,7 +291,6 @@ def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
     assert statuses(followed) == ["ok"] * 6
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_no_value_is_advised_that_leaves_as_many_features_but_not_the_body(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -350,7 +332,6 @@ def test_a_side_of_the_body_with_few_features_is_not_too_few(tmp_path: Path) -> 
     assert judge(2, 12, 4) == "too few"
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_a_look_at_a_few_frames_passes_over_the_others(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -370,7 +351,6 @@ def test_clutter_is_no_mistake_but_a_flood_is(
     assert judge(count, expected) == verdict
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_of_a_stream_only_its_beginning_is_looked_at(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -455,7 +435,6 @@ def test_a_key_is_shared_only_where_all_sensors_want_one_value() -> None:
     assert told_apart([one], 1) == [one]
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 @pytest.mark.parametrize("late", [False, True])
 def test_a_number_that_finds_nothing_gives_way_to_the_rule_for_all_cameras(
     recording: Path, capsys: pytest.CaptureFixture[str], late: bool
@@ -470,7 +449,6 @@ def test_a_number_that_finds_nothing_gives_way_to_the_rule_for_all_cameras(
     assert report.count('with threshold = "auto" in [extract] it would be') == 2
 
 
-@pytest.mark.usefixtures("frames_as_they_are")
 def test_lines_of_several_bodies_have_their_names(capsys: pytest.CaptureFixture[str]) -> None:
     report = report_on(SYNTHETIC / "several_bodies" / "session.toml", capsys, quick=True)
     for title in ("symmetry", "in view", "accuracy"):

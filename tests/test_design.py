@@ -224,7 +224,7 @@ def test_simulated_frames_of_two_cameras_with_unlike_noise_err_as_predicted() ->
     session = load_session(TWO_CAMERAS)
     plan = replace(plan_of(session), noises=(0.1, 0.4))
     poses = spread_poses(session, 2)
-    found = confirm(session, plan, poses, 120, tip=np.array([0, 0, -150.0]))
+    found = confirm(session, plan, poses, 200, tip=np.array([0, 0, -150.0]))
     assert abs(found.overall - 1) < 0.05 + found.chance
     # RMS of a vector with about two directions that count
     assert found.found[2] == pytest.approx(found.predicted[2], rel=0.1)
@@ -243,7 +243,7 @@ def test_ranges_are_as_good_as_cameras_with_the_noise_that_is_printed() -> None:
     assert factor is not None
     equal = scaled(ranges, factor)
     assert error_of(equal) == pytest.approx(error_of(cameras), rel=1e-8)
-    found = confirm(planned(third, 0.25), equal, poses, 60, tip=ORIGIN)
+    found = confirm(planned(third, 0.25), equal, poses, 100, tip=ORIGIN)
     assert found.found[0] == pytest.approx(error_of(cameras), rel=0.12)
 
 

@@ -258,8 +258,7 @@ def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_board_before_web_cams_is_learnt_from_tables_without_identities(
     recordings: Path,
 ) -> None:
-    session = load_scene(recordings / "webcams4_a" / "session_reference.toml")
-    (found,) = learn(session, rules=replace(FEWER, most_frames=40)).bodies
+    (found,) = learn(load_scene(recordings / "webcams4_a" / "session_reference.toml")).bodies
     grid = np.array([[x, y, 0.0] for x in range(3) for y in range(4)]) * 0.054
     likeness = like(found, grid, [])
     assert likeness is not None

@@ -27,6 +27,20 @@ _NOISE = (
         "a frame of large residuals is as sure as those before it",
     ),
     Mutant(
+        "judgement-what-lasts-hides-as-little-as-it-shows",
+        "judgement/noise.py",
+        "np.eye(len(v)) / model.bias**2",
+        "np.eye(len(v)) / model.shown**2",
+        "covariances are ten times too narrow where all cameras have another lens than told",
+    ),
+    Mutant(
+        "judgement-fields-of-any-number-are-as-likely-as-none",
+        "judgement/noise.py",
+        "return 0.5 * float(v @ mean) - float(np.log(d * factor.diagonal()).sum())",
+        "return 0.5 * float(v @ mean)",
+        "exact calibrations are taken for ones that are off",
+    ),
+    Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
         "_level(found, before, count, model, estimate)",
