@@ -341,6 +341,14 @@ def test_a_broker_is_looked_for_at_the_port_of_its_protocol(broker: MagicMock) -
         sender.send(Message(ESTIMATE))
 
 
+def test_a_body_that_is_called_header_does_not_replace_that_of_the_run(broker: MagicMock) -> None:
+    sender = MqttSender(parse("mqtt://there/rig", SENDERS), replace(HEADER, objects={"header": 1}))
+    sender.connect()
+    assert sender.send(Message(replace(ESTIMATE, object="header")))
+    topics = [call.args[0] for call in broker.publish.call_args_list]
+    assert topics == ["rig/header", "rig/header_2"]
+
+
 def test_a_broker_that_refuses_or_is_silent_is_away(
     broker: MagicMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:

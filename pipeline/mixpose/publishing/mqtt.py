@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 _PORT = 1883
+_HEADER = "header"  # its topic, which no body has
 _LOOK_S = 0.2  # how often to see, while a message waits, that the broker is still there
 
 
@@ -33,7 +34,7 @@ class MqttSender(Sender):
         self._topic = address.path or "mixpose"
         if set("+#") & set(self._topic):
             raise address.error("topic: found + or #, which name many; allowed: a topic without")
-        self._words = path_words(header.labels)
+        self._words = path_words((_HEADER, *header.labels))
         self._header = header_text(header)
         self._client: Client | None = None
         self._is_sending = False
@@ -65,7 +66,7 @@ class MqttSender(Sender):
             raise TimeoutError("the broker does not answer")
         if refused:
             raise ConnectionError(refused[0])
-        self._publish("header", self._header, retain=True)
+        self._publish(_HEADER, self._header, retain=True)
 
     def send(self, message: Message) -> bool:
         """Publish the line of one body, and wait until it is on its way."""
