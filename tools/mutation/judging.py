@@ -29,8 +29,8 @@ _NOISE = (
     Mutant(
         "judgement-what-lasts-hides-as-little-as-it-shows",
         "judgement/noise.py",
-        "np.eye(len(v)) / model.bias**2",
-        "np.eye(len(v)) / model.shown**2",
+        "unit(len(v)) / model.bias**2",
+        "unit(len(v)) / model.shown**2",
         "covariances are ten times too narrow where all cameras have another lens than told",
     ),
     Mutant(

@@ -32,7 +32,7 @@ from scipy.special import expit, logit
 
 from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
-from mixpose.judgement.information import inverted
+from mixpose.judgement.information import inverted, unit
 from mixpose.matching import (
     ErrorRules,
     Matches,
@@ -332,7 +332,7 @@ def _lasting(
     if model.bias:
         chance = _of_fields(A, v, model)
         if chance > NEGLIGIBLE:
-            second = inverted(A + np.eye(len(v)) / model.bias**2)
+            second = inverted(A + unit(len(v)) / model.bias**2)
             mean = second @ v
             return biases, chance * mean, chance * (second + np.outer(mean, mean))
     return biases, np.zeros(len(v)), np.zeros(A.shape)
@@ -346,9 +346,7 @@ def _of_fields(A: Floats, v: Floats, model: NoiseModel) -> float:
 
 def _log_density(A: Floats, v: Floats, d: float) -> float:
     """The log of the density of v with fields of deviation d, over that without."""
-    known = A.copy()
-    known.reshape(-1)[:: len(v) + 1] += 1 / d**2
-    factor, mean, _ = dposv(known, v)
+    factor, mean, _ = dposv(A + unit(len(v)) / d**2, v)
     return 0.5 * float(v @ mean) - float(np.log(d * factor.diagonal()).sum())
 
 
