@@ -11,15 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from published_pose import ESTIMATE, HEADER
 
 from mixpose.poses.header import Header
 from mixpose.publishing import Publishing
 from mixpose.records import Estimate, FrameSet
-from mixpose.rigid import from_rotation_vector
-
-HEADER = Header("mm", None, None, "0", 0, objects={"tool": 1})
-POSE = from_rotation_vector([0.1, 0.2, 0.3], [10.0, 20.0, 30.0])
-ESTIMATE = Estimate(7, 0.25, "tool", "ok", POSE, np.diag(np.arange(1.0, 7.0)), 0.9, {})
 
 
 def published(

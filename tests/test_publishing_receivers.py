@@ -20,8 +20,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from command_line import lines_of, started, wait_until
+from published_pose import HEADER
 
-from mixpose.poses.header import Header
 from mixpose.publishing import Publishing
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.ws import _Client
@@ -30,7 +30,6 @@ from mixpose.records import Estimate, FrameSet, Moment, RawFrame, SensorReport
 CLIP = Path(__file__).parents[1] / "data" / "synthetic" / "one_camera_video" / "camera.avi"
 PROTOCOLS = ["udp", "tcp", "ws", "osc", "lsl", "mqtt", "ros2"]
 LISTENERS = ("ws", "lsl")  # of which mixpose is the one that is connected to
-HEADER = Header("mm", None, None, "0", 0, objects={"tool": 1})
 
 
 @dataclass
