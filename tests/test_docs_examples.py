@@ -111,7 +111,6 @@ def follow(page: str, capfd: pytest.CaptureFixture[str]) -> None:
             assert_shown(text, printed)
 
 
-@pytest.mark.usefixtures("without_plots")
 def test_the_tutorial_can_be_followed_in_an_empty_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,7 +162,6 @@ def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(
     assert (tmp_path / written).stat().st_size > 0
 
 
-@pytest.mark.usefixtures("without_plots")
 def test_the_first_two_minutes_print_what_the_readme_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

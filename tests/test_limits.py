@@ -102,9 +102,9 @@ def test_a_file_that_no_session_needs_is_not_read(tmp_path: Path) -> None:
 
 
 def test_lists_that_are_nested_without_end_are_told(tmp_path: Path) -> None:
-    message = calibrated(tmp_path, "a: " + 1000 * "[" + 1000 * "]")
+    message = calibrated(tmp_path, "a: " + 5000 * "[" + 5000 * "]")
     assert message.endswith("cam.yml: lists or tables in it are nested too deeply")
-    lines = with_lines(points="points = " + 2000 * "[" + 2000 * "]")
+    lines = with_lines(points="points = " + 5000 * "[" + 5000 * "]")
     path = tmp_path / "session.toml"
     path.write_text(lines, encoding="utf-8")
     with pytest.raises(SessionError, match="nested too deeply"):

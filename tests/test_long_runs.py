@@ -21,14 +21,14 @@ from cluster_trial import make_recordings
 
 
 def test_what_a_run_remembers_does_not_grow_with_its_frames(tmp_path: Path) -> None:
-    (path,) = make_recordings(tmp_path, 1, 75)
+    (path,) = make_recordings(tmp_path, 1, 150)
     session = load_session(path)
     summary = Summary(session)
     estimates = run(session, watch=summary.findings.watch)
     tracemalloc.start()
     try:
         remembered = []
-        for frames in (25, 25, 24):
+        for frames in (50, 50, 49):
             for estimate in islice(estimates, frames):
                 summary.add(estimate)
             gc.collect()
@@ -37,7 +37,7 @@ def test_what_a_run_remembers_does_not_grow_with_its_frames(tmp_path: Path) -> N
         tracemalloc.stop()
     # residuals of two cameras, which are kept of the last 10,000 frames, take 100 bytes a frame;
     # one image of such a camera would take a million
-    assert remembered[2] - remembered[1] < 25 * 1000
+    assert remembered[2] - remembered[1] < 50 * 1000
 
 
 def test_frames_that_come_and_go_all_night_take_no_memory() -> None:

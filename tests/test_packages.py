@@ -122,14 +122,14 @@ def test_a_wheel_made_from_the_source_distribution_runs_by_itself(tmp_path: Path
     files = {path.name for path in (tmp_path / "installed" / "mixpose").rglob("*")}
     assert {"py.typed", "pose-lines.schema.json", "body.html.j2"} <= files
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
-    # the schema is a file of the package
-    code = "import mixpose.cli as cli; print(cli.__file__); cli.main(['schema'])"
-    run = ["-m", "mixpose", "run", str(SESSION), "--stop", "1"]
-    where, _ = (
-        subprocess.run(
-            [sys.executable, *arguments],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, check=True,
-        )
-        for arguments in (["-c", code], run)
+    for arguments in (["--version"], ["schema"], ["run", str(SESSION), "--stop", "1"]):
+        result = subprocess.run(
+            [sys.executable, "-m", "mixpose", *arguments],
+            cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert result.returncode == 0, result.stderr
+    where = subprocess.run(
+        [sys.executable, "-c", "import mixpose; print(mixpose.__file__)"],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert where.stdout.startswith(str(tmp_path / "installed"))

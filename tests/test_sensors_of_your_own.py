@@ -171,7 +171,7 @@ def test_toys_obey_the_laws_of_sensors(rig: str) -> None:
 def test_a_body_is_followed_by_sensors_that_the_package_does_not_know(rig: str) -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), perturb(TRUTH, np.repeat([2.0, 0.02], 3)))
     track = tracker.begin()
-    for frame in range(3):
+    for frame in range(5):
         T = perturb(TRUTH, frame * np.array([4.0, -3.0, 2.0, 0.03, -0.02, 0.04]))
         views = detect(RIGS[rig], EIGHT, T, noise=0.1, hidden=1, seed=frame)
         track, estimate = tracker.advance(track, frame, frame / 25, views)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
-from math import log
+from math import log, sqrt
 
 import numpy as np
 import pytest
@@ -36,12 +36,19 @@ def drawn(seed: int, bodies: int = 5, poses: int = 5, *, hidden: int = 0) -> Ass
 
 def log_likelihood(one: Assignment, given: Indices) -> float:
     """Written out: of each body its pose, of each pair of them the change of its distance."""
-    before, squares, count, missed = one.before
-    i, j = np.tril_indices(len(given), -1)
-    now, scale = one.now[given[i], given[j]], np.sqrt(squares[i, j] / count[i, j])
-    told = student.logpdf(now, DEGREES, before[i, j], scale * (1 + missed[i, j]))
-    told = np.where(np.isnan(before[i, j]), -log(ROOM), told)[~np.isnan(now)]
-    return float(one.likely[np.arange(len(given)), given].sum() + told.sum())
+    total, (before, squares, count, missed) = 0.0, one.before
+    for i, p in enumerate(given):
+        total += one.likely[i, p]
+        for j in range(i):
+            now, scale = one.now[p, given[j]], sqrt(squares[i, j] / count[i, j])
+            if np.isnan(now):
+                continue
+            if np.isnan(before[i, j]):
+                total -= log(ROOM)
+            else:
+                scale *= 1 + missed[i, j]
+                total += student.logpdf(now, DEGREES, before[i, j], scale)
+    return total
 
 
 @pytest.mark.parametrize("seed", range(4))
