@@ -57,6 +57,16 @@ def test_where_nothing_is_cut_a_pose_is_as_the_noise_has_it() -> None:
     assert factor == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_pose_beside_the_least_squares_is_as_wide_as_that_and_as_far_off() -> None:
+    rng = np.random.default_rng(0)
+    found, _ = met(4, rng, rng.normal(0, NOISE, (4, 2)))
+    C, spread, _ = widened(found)
+    away = 0.3 * np.linalg.cholesky(C)[:, 0]
+    _, aside, _ = widened(replace(found, offsets=found.offsets + found.J @ away))
+    # what is known before, 10 deviations, takes a part in 1e4 of it
+    np.testing.assert_allclose(aside, spread + np.outer(away, away), atol=1e-3 * np.trace(C))
+
+
 def test_of_few_features_thirteen_in_a_thousand_cut_the_truth_is_in_the_ellipsoid() -> None:
     rng, outside, plain = np.random.default_rng(1), 0, 0
     limit, trials = chdtri(6, 0.001), 4000

@@ -259,6 +259,25 @@ def test_others_are_asked_where_spots_that_are_off_can_carry_them(
         assert _carry(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
 
 
+def test_what_a_prediction_meets_as_the_pose_does_shows_no_other_mode(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # one of sixteen spots is 1 px off, the body 2 mm beside where it is expected, and turned by 1°
+    tracker, track = followed(pinhole_cameras, EIGHT)
+    moved = perturb(TRUTH, np.array([1.5, -1.0, 0.5, 0.01, -0.01, 0.01]))
+    views = []
+    for k, camera in enumerate(pinhole_cameras):
+        y = camera.project(transform(moved, EIGHT.means))[0]
+        y[2] += [1.0 * (k == 0), 0.0]
+        views.append(view_of(str(k), camera, y))
+    data = tracker.data(track, 6, 6 / 30, views)
+    likelihood, here = likelihood_of(data), Start(moved, data.close)
+    judged = likelihood.judge(likelihood.fit(here), here)
+    noise = data.variances[:, None]
+    assert data.rules.judgement.noise.errors.are_off(judged.used, noise)[0, 2]
+    assert list(agreed(data, likelihood, replace(judged, proposer="predicted"))) == []
+
+
 def test_a_fit_that_is_pulled_far_away_is_sought_again_from_where_it_was_expected() -> None:
     # four of seven features, and spots beside the others: by all of these the body is turned by 7°
     flat = np.array(

@@ -6,10 +6,11 @@ of these, the others expect e with the covariance P = M + v − 1, and the pose 
 
     Σ = C + (v − 1) C J_iᵀ M P⁻¹ J_i C,    moved by μ = −(v − 1) C J_iᵀ P⁻¹ e.
 
-The covariance of all cases together, as probable as each is, is that of the pose; and it is larger
-by as much as it takes to have all but few truths inside its ellipsoid.  By an inverse covariance B
-squared distances of one case have the mean tr BΣ + μᵀBμ and the variance 2 tr (BΣ)² + 4 μᵀBΣBμ,
-and are taken for a multiple of χ² with as much.
+The covariance of all cases together, as probable as each is, is that of the pose, with δδᵀ where it
+is δ = C Jᵀ r beside the least squares, whose residuals these are; and it is larger by as much as it
+takes to have all but few truths inside its ellipsoid.  By an inverse covariance B squared distances
+of one case have the mean tr BΣ + μᵀBμ and the variance 2 tr (BΣ)² + 4 μᵀBΣBμ, and are taken for a
+multiple of χ² with as much.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ def with_cut_spots(
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = inverted(information + np.diag(1 / known**2))
     G = (J.reshape(-1, k) @ C).reshape(J.shape)
+    # what a pose is beside the least squares, it would seem to be pulled by
+    r = r - J @ (beside := r.ravel() @ G.reshape(-1, k))
     values, axes = _axes(G @ J.swapaxes(1, 2))
     M = 1 / np.maximum(1 - values, 1e-9)
     G, r = axes @ G, np.vecdot(axes, r[:, None])
@@ -77,6 +80,7 @@ def with_cut_spots(
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
     by_case = (along @ G).reshape(-1, k)
     spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
+    spread += np.outer(beside, beside)
     return spread, _larger(C, spread, G, along, wider, chances, outside, degrees)
 
 

@@ -146,11 +146,20 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
         J, r = used.J[..., frame.free] / noise[..., None], used.offsets / noise
         if not _carry(J[used.shares > 0], J[off], r[off], frame.rules.fit):
             return
-    yield from _modes(frame, likelihood, judged.T_world_object, used, variances)
+    T = judged.T_world_object
+    yield from _modes(frame, likelihood, T, used, variances)
     # what pulls a fit together may have pulled it away from where the pose was expected
     for one in frame.predictions[:1]:
-        T, seen = met_at(frame, Fit(one.T_world_object))
-        yield from _modes(frame, likelihood, T, seen, variances)
+        seen = met_at(frame, Fit(one.T_world_object))[1]
+        if np.count_nonzero(seen.detections != used.detections):
+            yield from _modes(frame, likelihood, T, _moved_to(used, seen), variances)
+
+
+def _moved_to(used: Matches, seen: Matches) -> Matches:
+    """What a pose meets of what another one is seen to meet by the same sensors."""
+    shift = (seen.places - used.places) / used.sigmas[:, None, None]
+    shares = np.where(used.weights > 0, seen.shares, 0.0)
+    return replace(seen, shares=shares, places=used.places, offsets=seen.offsets + shift, J=used.J)
 
 
 def _modes(
