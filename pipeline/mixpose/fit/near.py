@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.distance import pdist
 
 from mixpose.body import Body
 from mixpose.fit.probable import FitRules, believed
@@ -312,8 +311,9 @@ def _pulls_of_missed(matches: Matches, blurs: Floats) -> Floats:
     pulls = np.zeros(len(blurs))
     for k in np.flatnonzero(matches.missed > 1.5):
         is_missed = (matches.weights[k] > 0) & (matches.shares[k] == 0)
-        squared = pdist(matches.places[k, is_missed] / matches.sigmas[k], "sqeuclidean")
-        pulls[k] = 2 * float((squared * np.exp(squared / (-2 * blurs[k] ** 2))).sum())
+        y = matches.places[k, is_missed] / matches.sigmas[k]
+        squared = np.vecdot(away := y[:, None] - y, away)
+        pulls[k] = np.vdot(squared, np.exp(squared / (-2 * blurs[k] ** 2)))
     return pulls
 
 

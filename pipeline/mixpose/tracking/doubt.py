@@ -198,7 +198,8 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool, before: float) -> f
         value = float(data.finest.weights[:, 0] @ seen.explained)
         if asked or there.finest.value(T) > value / 16:
             # fitted, which may end at clutter, and where it is asked for as it stands
-            starts = [data.rival(judged, T, data.close), *([Start(T)] if asked else [])]
+            rival = data.rival(judged, T, data.close, ahead=likely)
+            starts = [rival, *([Start(T)] if asked else [])]
             near = max([_evidence(there, one) for one in starts]) - own
             if near > likely:
                 return near

@@ -177,11 +177,25 @@ class Frame(Setup):
         there = self._prior(T_world_object, self.predictions[:1], self.track.misses)
         return there[0] > self.anywhere[0]
 
-    def rival(self, best: ScoredPose, T_world_object: Floats, wide: Floats, **rest: Any) -> Start:
-        """A start of what there may be instead of a pose, as far as that leaves room for it."""
+    def rival(
+        self,
+        best: ScoredPose,
+        T_world_object: Floats,
+        wide: Floats,
+        *,
+        ahead: float | None = None,
+        **rest: Any,
+    ) -> Start:
+        """A start of what there may be instead of a pose, as far as that leaves room for it.
+
+        It has to be `ahead` by so many nats to matter; else as far behind as makes no odds.
+        """
         errors, count = self.rules.judgement.noise.errors, int(np.count_nonzero(self.free))
         own = log_likelihood(errors.blur * np.sqrt(best.variances), best.used, count, errors)
-        return Start(T_world_object, wide, least=float(own) - self.rules.look_alikes.behind, **rest)
+        # half of it is what narrow blurs gain
+        gained = self.rules.look_alikes.behind / 2
+        least = float(own) - gained + (-gained if ahead is None else ahead)
+        return Start(T_world_object, wide, least=least, **rest)
 
     def expectation(self, poses: Sequence[Floats]) -> Floats:
         """Log densities (K,) of poses (4, 4) by the body's own track, or that it is elsewhere."""
