@@ -67,7 +67,7 @@ def test_processes_drop_what_has_not_begun_too(tmp_path: Path) -> None:
 
 
 def test_a_cluster_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executing, "find_spec", lambda _: None)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: None)
     with pytest.raises(SessionError, match=r"--scheduler there: needs .* 'mixpose\[dask\]'"):
         executing.on_cluster("there").__enter__()
 
@@ -110,7 +110,7 @@ def distributed(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     """Stands for the package."""
     package = MagicMock(Client=Client, as_completed=reversed)
     monkeypatch.setitem(sys.modules, "distributed", package)
-    monkeypatch.setattr(executing, "find_spec", lambda _: True)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: True)
     return package
 
 

@@ -343,7 +343,7 @@ def test_the_extra_to_install_is_named(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(session_formats, "find_spec", lambda name: None)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda name: None)
     assert convert(poses, "-o", tmp_path / "a.c3d") == 2
     assert "python -m pip install 'mixpose[c3d]'" in last_error(capfd)
     assert not (tmp_path / "a.c3d").exists()

@@ -16,7 +16,7 @@ from published_pose import ESTIMATE, HEADER, POSE
 
 from mixpose.cli import main
 from mixpose.errors import SessionError
-from mixpose.publishing import SENDERS, Publishing, address
+from mixpose.publishing import SENDERS, Publishing
 from mixpose.publishing.address import parse
 from mixpose.publishing.channel import Backlog
 from mixpose.publishing.message import Message
@@ -77,7 +77,7 @@ def test_address_that_nothing_can_be_sent_to_is_refused_before_the_run(
 def test_protocol_whose_package_is_not_there_names_its_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(address, "find_spec", lambda _: None)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: None)
     needed = {"ws": "ws", "osc": "osc", "lsl": "lsl", "mqtt": "mqtt", "ros2": "ros2"}
     for scheme, extra in needed.items():
         with pytest.raises(SessionError, match=rf"pip install 'mixpose\[{extra}\]'"):

@@ -15,7 +15,7 @@ import pytest
 from command_line import wait_until
 from published_pose import ESTIMATE, HEADER
 
-from mixpose.publishing import SENDERS, address
+from mixpose.publishing import SENDERS
 from mixpose.publishing.address import parse
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.lsl import LslSender
@@ -89,7 +89,7 @@ def broker(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     module = MagicMock()
     monkeypatch.setitem(sys.modules, "paho.mqtt.client", module)
     monkeypatch.setitem(sys.modules, "paho.mqtt.enums", MagicMock())
-    monkeypatch.setattr(address, "find_spec", lambda _: True)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: True)
     client: MagicMock = module.Client.return_value
     client.publish.return_value = MagicMock(rc=0)
     client.loop_start.side_effect = lambda: client.on_connect(
@@ -151,7 +151,7 @@ def test_the_stream_of_a_lost_frame_has_no_numbers_for_a_pose(
     pylsl = MagicMock()
     pylsl.local_clock.return_value = 50.0
     monkeypatch.setitem(sys.modules, "pylsl", pylsl)
-    monkeypatch.setattr(address, "find_spec", lambda _: True)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: True)
     sender = LslSender(parse("lsl://rig", SENDERS), HEADER)
     _, _, channels, *_ = pylsl.StreamInfo.call_args.args
     lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)

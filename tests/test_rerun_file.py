@@ -174,7 +174,7 @@ def test_the_recording_is_the_one_that_the_run_read(poses: Path, tmp_path: Path)
 def test_missing_package_is_told_with_what_to_install(
     poses: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("mixpose.cli.session_formats.find_spec", lambda _: None)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda _: None)
     assert convert(poses, "-o", tmp_path / "x.rrd") == 2
     assert "python -m pip install 'mixpose[rerun]'" in capfd.readouterr().err
 

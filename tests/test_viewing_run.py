@@ -167,7 +167,7 @@ def test_frames_that_nobody_asks_for_are_left_out() -> None:
 
 
 def test_without_its_package_the_page_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mixpose.viewing.viewer.find_spec", lambda name: None)
+    monkeypatch.setattr("mixpose.errors.find_spec", lambda name: None)
     with pytest.raises(SessionError, match=r"needs the package viser; .*'mixpose\[view\]'"):
         Viewer(load_session(TWO), "0", print, on_files=True)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 
 class MixposeError(Exception):
@@ -18,8 +19,6 @@ class MixposeError(Exception):
 
 class SessionError(MixposeError):
     """The session file, an option or an argument is wrong."""
-
-    exit_status = 2
 
 
 class RecordingError(MixposeError):
@@ -35,3 +34,12 @@ def reporting(kind: type[MixposeError], what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise kind(f"{what}: {error.strerror}") from error
+
+
+def require_package(what: str, package: str, extra: str, more: str = "") -> None:
+    """Refuse, by a SessionError, what needs a package that is not installed; an extra has it."""
+    if find_spec(package.removesuffix("-sdk")) is None:
+        raise SessionError(
+            f"{what}: needs the package {package}; install it with: "
+            f"python -m pip install 'mixpose[{extra}]'{more}"
+        )

@@ -12,10 +12,9 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
 from contextlib import AbstractContextManager, contextmanager
-from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_package
 from mixpose.threads import keep_one_blas_thread
 
 Task = TypeVar("Task")
@@ -105,11 +104,7 @@ def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]
 
     Raises SessionError if ``dask.distributed`` is not installed, or no scheduler answers.
     """
-    if find_spec("distributed") is None:
-        raise SessionError(
-            f"--scheduler {scheduler}: needs the package distributed; install it with: "
-            "python -m pip install 'mixpose[dask]'"
-        )
+    require_package(f"--scheduler {scheduler}", "distributed", "dask")
     from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra
 
     if scheduler == LOCAL:

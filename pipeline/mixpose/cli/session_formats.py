@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from mixpose.body import Body
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_package
 from mixpose.frames import Source
 from mixpose.poses import trajectories
 from mixpose.poses.jsonl import PoseFile
@@ -169,11 +168,7 @@ def _place(output: Path | None, name: str, suffix: str, package: str, more: str 
     """Where a format goes that is no text, and takes a package."""
     if output is None:
         raise SessionError(f"--format {name}: needs -o FILE.{suffix}, it is no text")
-    if find_spec(package.removesuffix("-sdk")) is None:
-        raise SessionError(
-            f"--format {name}: needs the package {package}; install it with: "
-            f"python -m pip install 'mixpose[{name}]'{more}"
-        )
+    require_package(f"--format {name}", package, name, more)
     return output
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_package
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,7 @@ class Address:
 
     def needs(self, package: str, extra: str) -> None:
         """Raise an error that names the extra where a package is not installed."""
-        if find_spec(package) is None:
-            raise self.error(
-                f"needs the package {package}; install it with: "
-                f"python -m pip install 'mixpose[{extra}]'"
-            )
+        require_package(f"--publish {self.text}", package, extra)
 
 
 def parse(url: str, schemes: Collection[str]) -> Address:

@@ -10,10 +10,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import TypeAlias
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_package
 from mixpose.objective import View
 from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
@@ -52,11 +51,7 @@ class Viewer:
         on_files: bool,
         paused: bool = False,
     ) -> None:
-        if find_spec("viser") is None:
-            raise SessionError(
-                "--view: needs the package viser; install it with: "
-                "python -m pip install 'mixpose[view]'"
-            )
+        require_package("--view", "viser", "view")
         if paused and not on_files:
             raise SessionError("--pause: a live source does not wait; leave it out")
         self._session = session
