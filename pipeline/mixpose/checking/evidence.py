@@ -19,7 +19,7 @@ from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
 from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Floats, Indices, Mask, PointPattern
+from mixpose.records import Estimate, Floats, Indices, Mask, PointPattern
 from mixpose.runner import begin
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.sensors.moving import moments
@@ -111,6 +111,12 @@ def is_well_explained(pose: ScoredPose | None, rules: DiagnosisRules) -> bool:
 def anywhere(session: Session) -> Session:
     """The session without a start, where none is needed: it may be what is wrong."""
     return replace(session, start=None) if free_mask(session.estimator).all() else session
+
+
+def estimate_of(session: Session, number: int, views: Views) -> Estimate:
+    """What a run tells of a frame that is its first."""
+    tracker, track = begin(session)
+    return tracker.advance(track, number, None, views)[1]
 
 
 def best_pose(

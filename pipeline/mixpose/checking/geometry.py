@@ -12,7 +12,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.checking.changes import Change, called, of_units
-from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
+from mixpose.checking.evidence import Frames, Views, estimate_of, evidence_of, pose_near
 from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
@@ -24,7 +24,7 @@ from mixpose.frames.video import Video
 from mixpose.judgement import APART
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
-from mixpose.runner import begin, observe
+from mixpose.runner import observe
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import Session
 
@@ -179,8 +179,7 @@ def _nothing_explained(session: Session, frames: Frames, doubts: Doubts) -> Doub
     """Why no frame is explained: sensors that contradict each other, few markers, or unknown."""
     doubt, shown, frames = "", list[Estimate](), frames[:2]
     for number, views in frames:
-        tracker, track = begin(session)
-        _, estimate = tracker.advance(track, number, None, views)
+        estimate = estimate_of(session, number, views)
         doubt = estimate.doubt or doubt
         weights = sum(rival.weight for rival in estimate.hypotheses) or estimate.confidence or 0.0
         if estimate.status == "ok" or (estimate.status == "ambiguous" and weights > _LIKELY):

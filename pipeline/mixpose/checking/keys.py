@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.body import LookAlike, congruent_parts, of_size
+from mixpose.checking.evidence import anywhere, estimate_of
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.placement import typical_poses
 from mixpose.errors import MixposeError
 from mixpose.extraction import METHODS, ExtractOptions
-from mixpose.fit import free_mask
 from mixpose.frames import files_of
 from mixpose.objective import View
 from mixpose.records import FrameSet, Image, RawFrame
-from mixpose.runner import begin, observe, source_spec
+from mixpose.runner import observe, source_spec
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 
@@ -116,12 +116,8 @@ class _Trial(NamedTuple):
 
 def _with_the_body(session: Session, number: int, trials: Sequence[_Trial]) -> _Trial | None:
     """The first trial in which the body is found for sure; clutter may be ambiguous, too."""
-    # where all directions are free, the body may be anywhere in the frame
-    start = None if free_mask(session.estimator).all() else session.start
     for trial in trials:
-        tracker, track = begin(replace(session, start=start))
-        _, estimate = tracker.advance(track, number, None, trial.views)
-        if estimate.status == "ok":
+        if estimate_of(anywhere(session), number, trial.views).status == "ok":
             return trial
     return None
 

@@ -23,7 +23,6 @@ from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
-from mixpose.runner import begin
 from mixpose.session import Session
 
 _FRAMES = 3  # in a row
@@ -344,8 +343,7 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
 
 
 def _is_ok(session: Session, number: int, views: Views) -> bool:
-    tracker, track = begin(evidence.anywhere(session))
     with np.errstate(all="ignore"):
-        _, estimate = tracker.advance(track, number, None, views)
+        estimate = evidence.estimate_of(evidence.anywhere(session), number, views)
     shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]
     return estimate.status == "ok" and min(shares, default=0.0) > 0.1
