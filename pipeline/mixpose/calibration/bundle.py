@@ -182,7 +182,10 @@ def solved(
     basis = _complement(bundle.gauge(state.rig), len(scales))
     inner = basis.T @ S @ basis
     pulls = scales[:, None] * held  # of held parameters that are a standard deviation off
-    told = _told(inner, basis.T @ pulls)
+    # where held parameters are off, a solution x = I⁻¹ b has the covariance I⁻¹ (I + P Pᵀ) I⁻¹
+    told, off = inner, basis.T @ pulls
+    if off.any():
+        told = inner @ np.linalg.pinv(inner + off @ off.T) @ inner
     values, vectors = np.linalg.eigh(told)
     known = values > 1.0 / bundle.rules.undetermined**2
     V = basis @ vectors[:, known]
@@ -198,14 +201,6 @@ def solved(
         by_held @ by_held.T,
         basis @ vectors[:, ~known],
     )
-
-
-def _told(information: Floats, pulls: Floats) -> Floats:
-    """Information (g, g) that is left where held parameters are off."""
-    # a solution x = I⁻¹ b then has the covariance I⁻¹ (I + P Pᵀ) I⁻¹
-    if not pulls.any():
-        return information
-    return np.asarray(information @ np.linalg.pinv(information + pulls @ pulls.T) @ information)
 
 
 def _complement(gauge: Floats, count: int) -> Floats:

@@ -15,12 +15,8 @@ import time
 _GRACE_S = 5.0  # to finish what is open, as after an interrupt
 
 
-def end_with_parent() -> None:
-    """Watch standard input in a thread, and ask this process to end when it does."""
-    threading.Thread(target=_watch, daemon=True).start()
-
-
-def _watch() -> None:
+def _end_with_parent() -> None:
+    """Wait for the end of standard input, and ask this process to end then."""
     while os.read(sys.stdin.fileno(), 1):
         pass
     # taken like an interrupt, which is ignored by what a script starts in the background
@@ -30,7 +26,7 @@ def _watch() -> None:
 
 
 if __name__ == "__main__":
-    end_with_parent()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     from mixpose.cli import main
 
     main()

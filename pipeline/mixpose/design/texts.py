@@ -31,17 +31,14 @@ def study_text(study: Study) -> str:
     point = "the origin" if tip is None else f"the tip {_vector(tip)} {study.unit}"
     lines = [f"{count} pose{'s' * (count != 1)}; errors of {point} are root mean squares"]
     for system in study.systems:
-        lines += ["", *_system_lines(system, study)]
+        errors = _errs_text(system.plan, system.plan.noises, study.unit)
+        lines += ["", f"{system.name}: {errors}"]
+        lines += [f"  {title:<10}{text}" for title, text in _told(system, study)]
     if len(study.systems) > 1:
         lines += ["", *_comparison(study)]
     for alike in study.congruences:
         lines += ["", _congruence_text(alike, study.unit)]
     return "\n".join(lines) + "\n"
-
-
-def _system_lines(system: System, study: Study) -> list[str]:
-    head = f"{system.name}: {_errs_text(system.plan, system.plan.noises, study.unit)}"
-    return [head, *(f"  {title:<10}{text}" for title, text in _told(system, study))]
 
 
 def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:

@@ -13,7 +13,6 @@ from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import Message, Sender, TooLargeError, header_text, path_words
-from mixpose.records import Estimate
 
 HEADER_S = 1.0
 """The header, which says the unit, is repeated so often: nobody knows who listens since when."""
@@ -118,13 +117,10 @@ class UdpSender(Datagrams):
             self._told = now
         estimate = message.estimate
         what = f"the pose of {estimate.label} in frame {estimate.frame}"
-        advice = f"leave out --labels, or {_BY_TCP}" if _is_labelled(estimate) else _BY_TCP
+        is_labelled = any(report.labels for report in estimate.sensors.values())
+        advice = f"leave out --labels, or {_BY_TCP}" if is_labelled else _BY_TCP
         self.put(message.text.encode(), what, advice)
         return True
-
-
-def _is_labelled(estimate: Estimate) -> bool:
-    return any(report.labels for report in estimate.sensors.values())
 
 
 class OscSender(Datagrams):

@@ -88,7 +88,7 @@ def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
 
 
 def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float]:
-    """Normal of the plane with the least squares of distances (n, 3), and their root mean square.
+    """Upward normal of the plane of least squared distances (n, 3), and their root mean square.
 
     Raises a RecordingError where the points, with a covariance (3, 3) each, span none.
     """
@@ -101,7 +101,10 @@ def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats
             f"{sizes[1]:.3g}, of which {errors:.2g} may be errors, and {sizes[2]:.3g}; allowed: "
             "points all over the floor, or the corners of a triangle, and nothing but these"
         )
-    return _upwards(directions[2], middle, sensors), float(sizes[2] / np.sqrt(len(points)))
+    normal = directions[2] / np.linalg.norm(directions[2])
+    if (sensors.mean(axis=0) - middle) @ normal < 0:  # up is where the sensors are
+        normal = -normal
+    return normal, float(sizes[2] / np.sqrt(len(points)))
 
 
 def _plane(middle: Floats, normal: Floats, up: Axis) -> Floats:
@@ -111,12 +114,6 @@ def _plane(middle: Floats, normal: Floats, up: Axis) -> Floats:
     if abs(normal @ first) > 0.99:  # it stands on the floor
         first = np.eye(3)["xyz".index(up)]
     return _axes(origin, first, normal, up)
-
-
-def _upwards(normal: Floats, point: Floats, sensors: Floats) -> Floats:
-    """A normal of the floor that points to the side where the sensors are."""
-    normal = normal / np.linalg.norm(normal)
-    return np.asarray(-normal if (sensors.mean(axis=0) - point) @ normal < 0 else normal)
 
 
 def _axes(origin: Floats, along: Floats, normal: Floats, up: Axis) -> Floats:

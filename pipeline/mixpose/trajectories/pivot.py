@@ -81,12 +81,12 @@ class Tip:
     directions: Floats  # (3, 3): of the body, a row each
 
 
-def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
+def find_tip(pivoting: Pivoting) -> Tip:
     """Find the tip of a body that turns about it.
 
     Raises a RecordingError if there are too few poses, or says which turns are missing.
     """
-    rules = rules or PivotRules()
+    rules = PivotRules()
     if len(pivoting.poses) < rules.fewest:
         raise RecordingError(
             f"found {len(pivoting.poses)} poses that are ok; allowed: at least {rules.fewest}, in "
@@ -224,11 +224,6 @@ def _covariances(pivoting: Pivoting, by_poses: Floats) -> Floats:
     return np.asarray(both + least * np.eye(3))
 
 
-def _residuals(some: Pivoting, x: Floats) -> Floats:
-    """From the point to the tip, (N, 3)."""
-    return _at_tip(some, x, np.zeros((len(some.poses), 12)))[0]
-
-
 def _held_out(
     some: Pivoting, tip: Floats, information: Floats, scale: float, rules: PivotRules
 ) -> tuple[float, float, float]:
@@ -243,7 +238,7 @@ def _held_out(
         others = np.ones(len(some.poses), bool)
         others[part] = False
         x, *_ = _solved(some, others, rules)
-        rest.append(_residuals(some, x)[part])
+        rest.append(_at_tip(some, x, np.zeros((len(some.poses), 12)))[0][part])
         away = x[:3] - tip
         # of nested least squares the covariance of a difference is that of covariances
         differing = scale * (_of_tip(information[others]) - _of_tip(information))

@@ -69,7 +69,7 @@ def smooth_body(
     *,
     fill_s: float = 0.0,
     motion: str | None = None,
-    rules: SmoothingRules | None = None,
+    rules: SmoothingRules = SmoothingRules(),
 ) -> SmoothedBody:
     """Smooth the poses of one body, a line per frame.
 
@@ -78,7 +78,6 @@ def smooth_body(
     `mixpose.trajectories.motion.ORDERS`; else the likeliest. Raises RecordingError if a frame
     stands twice, a pose has no covariance, or gaps are to be filled and there are no times.
     """
-    rules = rules or SmoothingRules()
     ordered = sorted(lines, key=lambda line: line.frame)
     times = _times(ordered)
     if fill_s and times is None:
