@@ -12,6 +12,7 @@ from mixpose.rigid import (
     from_rotation_vector,
     inverse,
     is_rigid,
+    mean_motion,
     nearest_rigid,
     perturb,
     quaternion_xyzw,
@@ -65,6 +66,12 @@ def test_the_angle_between_poses_is_that_of_the_turn() -> None:
     twists[:, 4] = np.linspace(0, 3.1, 50)
     angles = rotation_angle_deg(POSES, perturb(POSES, twists))
     np.testing.assert_allclose(angles, np.degrees(twists[:, 4]), atol=1e-6)
+
+
+def test_the_mean_motion_of_turns_either_way_is_the_middle_one() -> None:
+    middle = from_rotation_vector([0.3, -0.2, 0.1], [1, 2, 3])
+    twists = np.array([[0.5, 0, 0, 0, 0, 0.2], [-0.5, 0, 0, 0, 0, -0.2]])
+    assert mean_motion(perturb(middle, twists)) == pytest.approx(middle, abs=1e-12)
 
 
 def test_the_papers_rigid_affine_transformation_is_a_pose() -> None:

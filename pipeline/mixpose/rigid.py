@@ -129,6 +129,12 @@ def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
     return np.asarray(np.degrees(angle), dtype=np.float64)
 
 
+def mean_motion(T: Floats) -> Floats:
+    """The motion (4, 4) with the mean rotation and the mean translation of motions (n, 4, 4)."""
+    R = Rotation.from_matrix(T[:, :3, :3]).mean().as_matrix()
+    return from_parts(R, T[:, :3, 3].mean(axis=0))
+
+
 def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
     """The ellipsoid that holds the position with 95 %, of a pose's covariance (6, 6).
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from mixpose.calibration.adjust import adjust
 from mixpose.calibration.bundle import Bundle
@@ -18,7 +17,7 @@ from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.start import agreement
 from mixpose.calibration.task import SeenFrame, Task
 from mixpose.records import Floats, Indices
-from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.rigid import from_parts, inverse, mean_motion, rotation_angle_deg, transform
 from mixpose.search import SIDES, align_triples, depths
 
 _TRIED = 6  # starts that are adjusted
@@ -70,7 +69,7 @@ def _starts(
 ) -> Floats:
     """Where to begin (H, 4, 4): near the mean of what linked sensors tell of it (A, 4, 4)."""
     centre = np.median(np.array([inverse(T)[:3, 3] for T in told]), axis=0)
-    R = Rotation.from_matrix(told[:, :3, :3]).mean().as_matrix()
+    R = mean_motion(told)[:3, :3]
     T_mean = from_parts(R, -R @ centre)
     rig = state.rig.placed(sensor, T_mean)
     seen = [

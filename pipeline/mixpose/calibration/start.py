@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import joint_poses
 from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
 from mixpose.records import Floats, Mask
-from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.rigid import inverse, mean_motion, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
 _LINK_BLUR = 6.0  # σ_ε by which a linked sensor may be off before all are adjusted together
@@ -220,9 +219,8 @@ def _agreed(told: Sequence[_Votes], T_expected: Floats, rules: CalibrationRules)
         order = np.flatnonzero(inside)
         order = order[np.argsort(distance[order], kind="stable")]
         chosen = order[np.unique(frame[order], return_index=True)[1]]  # the nearest of each frame
-        # the mean rotation and the median shift
-        R = Rotation.from_matrix(votes[chosen, :3, :3]).mean().as_matrix()
-        T = from_parts(R, np.median(votes[chosen, :3, 3], axis=0))
+        T = mean_motion(votes[chosen])
+        T[:3, 3] = np.median(votes[chosen, :3, 3], axis=0)
     return _Link(T, len(chosen))
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from mixpose import rigid
@@ -105,8 +104,8 @@ def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | 
     moving = _rms(np.broadcast_to(truth[:1], truth.shape), truth)
     if (moving < before).all():
         return None
-    of_object = _mean(rigid.inverse(poses) @ truth)
-    of_world = _mean(truth @ rigid.inverse(poses))
+    of_object = rigid.mean_motion(rigid.inverse(poses) @ truth)
+    of_world = rigid.mean_motion(truth @ rigid.inverse(poses))
     found = [
         ConstantOffset("object", of_object, *_rms(poses @ of_object, truth).tolist()),
         ConstantOffset("world", of_world, *_rms(of_world @ poses, truth).tolist()),
@@ -117,11 +116,6 @@ def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | 
         if (after < _LEFT * before).any() and (after < 1.1 * before).all():
             good.append(each)
     return min(good, key=lambda each: each.translation_rms) if good else None
-
-
-def _mean(motions: Floats) -> Floats:
-    R = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
-    return rigid.from_parts(R, motions[:, :3, 3].mean(axis=0))
 
 
 def _rms(one: Floats, other: Floats) -> Floats:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
@@ -81,10 +80,7 @@ def _rests(estimates: Sequence[Estimate]) -> bool:
 
 def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
     poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
-    if len(poses) == 1:
-        return np.asarray(poses[0])
-    R = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
-    return rigid.from_parts(R, poses[:, :3, 3].mean(axis=0))
+    return np.asarray(poses[0]) if len(poses) == 1 else rigid.mean_motion(poses)
 
 
 def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float]:
