@@ -217,7 +217,6 @@ class _Reader:
                 return
 
     def _read_on(self) -> None:
-        """Read frames until there are no more."""
         address, clock = self._source.address, self._source.clock
         times = CaptureTimes(address)
         with opened(address) as capture:

@@ -135,7 +135,6 @@ class DetectionTable(Source):
                 yield self._frame(number, group)
 
     def _frame(self, number: int, rows: Iterator[_Row]) -> RawFrame:
-        """Convert the rows of one frame."""
         group = list(islice(rows, MOST_DETECTIONS + 1))
         if len(group) > MOST_DETECTIONS:
             raise RecordingError(
@@ -233,7 +232,6 @@ def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTa
 
 
 def _header_fault(columns: Sequence[str], coordinates: Sequence[str]) -> str | None:
-    """What is wrong with a header."""
     if not columns:
         return "the file is empty"
     allowed = {"frame", "time_s", *coordinates, "weight"}

@@ -110,7 +110,6 @@ class Video(Source):
     def _frame(
         self, capture: cv2.VideoCapture, number: int, time_s: float | None, room: ColourRoom
     ) -> RawFrame:
-        """Convert the grabbed frame."""
         moment = Moment(time.monotonic(), "arrival") if self.size is None else None
         image = retrieve(capture, self.address, number, self.resolution or self.size, room)
         if self.clock is not None:
