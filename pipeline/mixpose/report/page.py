@@ -39,6 +39,18 @@ class Figure:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class SensorRow:
+    """How one sensor took part in the run."""
+
+    name: str
+    model: str
+    used: int
+    explained: str
+    rms: str
+    unit: str
+
+
 def page_templates() -> Environment:
     """The templates of pages, or a `SessionError` that names the extra with what makes them."""
     try:
@@ -226,18 +238,17 @@ def _span(series: Series) -> str:
 
 def _sensor_rows(
     poses: PoseFile, series: Series, origin: Origin, unit_of: Callable[[str], str]
-) -> list[dict[str, object]]:
-    """How each sensor took part in the run."""
+) -> list[SensorRow]:
     setups = {} if origin.session is None else {s.name: s for s in origin.session.sensors}
     return [
-        {
-            "name": name,
-            "model": setups[name].model if name in setups else "",
-            "used": sum(name in line.sensors and line.sensors[name].used for line in poses.poses),
-            "explained": _median(series.explained[name]),
-            "rms": _median(series.rms[name]),
-            "unit": unit_of(name),
-        }
+        SensorRow(
+            name=name,
+            model=setups[name].model if name in setups else "",
+            used=sum(name in line.sensors and line.sensors[name].used for line in poses.poses),
+            explained=_median(series.explained[name]),
+            rms=_median(series.rms[name]),
+            unit=unit_of(name),
+        )
         for name in series.rms
     ]
 
