@@ -105,7 +105,7 @@ def test_markers_that_are_not_met_any_more_are_told_in_one_line(since: int, said
     for frame in range(20):
         label, T = session.labels[0], np.eye(4)
         is_met = np.isin(features, [0, 1, 5]) | (frame < since)
-        seen = Offsets(features, is_met, nothing, *views, np.zeros(7, np.bool_))
+        seen = Offsets(features, is_met, nothing, *views, np.zeros(7, np.bool_), np.ones(7))
         measured = Estimate(
             *(frame, None, label, "ok", T, np.eye(6), 1.0, sensors),
             measured=lambda seen=seen: {"left": seen},  # type: ignore[misc]
@@ -117,16 +117,17 @@ def test_markers_that_are_not_met_any_more_are_told_in_one_line(since: int, said
 
 
 @pytest.mark.parametrize(
-    ("frames", "noise", "is_told"),
+    ("frames", "noise", "weight", "is_told"),
     [
-        (20, 0.1, True),
-        (20, 0.8, False),  # 20 (1 / 0.8)^2 = 31 is under 100: that may be chance
-        (80, 0.8, True),  # 125
-        (9, 0.1, False),  # too few frames to speak of any marker
+        (20, 0.1, 1.0, True),
+        (20, 0.8, 1.0, False),  # 20 (1 / 0.8)^2 = 31 is under 100: that may be chance
+        (80, 0.8, 1.0, True),  # 125
+        (9, 0.1, 1.0, False),  # too few frames to speak of any marker
+        (20, 0.1, 1e-3, False),  # its spots are known to be cut
     ],
 )
 def test_a_marker_is_measured_wrong_where_its_offsets_are_no_chance(
-    frames: int, noise: float, is_told: bool
+    frames: int, noise: float, weight: float, is_told: bool
 ) -> None:
     session = load_session(SESSION)
     findings, features = Findings(session), np.arange(7)
@@ -137,7 +138,8 @@ def test_a_marker_is_measured_wrong_where_its_offsets_are_no_chance(
         # marker 3 is 1 off along x, and by chance once above and once below
         residuals = residuals.copy()
         residuals[3] = [1.0, noise * (-1) ** frame]
-        seen = Offsets(features, is_met, residuals, jacobians, residuals, np.zeros(7, np.bool_))
+        each = np.zeros(7, np.bool_), np.where(features == 3, weight, 1.0)
+        seen = Offsets(features, is_met, residuals, jacobians, residuals, *each)
         measured = Estimate(
             frame,
             None,

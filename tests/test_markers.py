@@ -139,7 +139,9 @@ def seen_aside(angle_deg: float, *, shared: bool = False) -> Estimate:
         y, _ = sensor.project(points)
         seen[name] = Observation(PointPattern(y, np.ones(3)), 1.5)
         pair = np.array([shared, shared, False])
-        offsets[name] = Offsets(np.arange(3), np.ones(3, dtype=bool), y - at[0], at[1], y, pair)
+        offsets[name] = Offsets(
+            np.arange(3), np.ones(3, dtype=bool), y - at[0], at[1], y, pair, np.ones(3)
+        )
     reports = {name: SensorReport(True) for name in offsets}
     pose = Estimate(0, None, "cube", "ok", np.eye(4), None, 1.0, reports, measured=lambda: offsets)
     return labelled(pose, seen, BODY)

@@ -271,3 +271,25 @@ def test_a_body_on_one_line_is_never_sure_as_its_turn_about_it_is_open(
     # everything else of the pose is right: detections are exact
     moved = transform(estimate.T_world_object, wand.means) - transform(TRUTH, wand.means)
     assert (np.abs(moved) < interpolation_bound_of_features(views, wand, TRUTH)).all()
+
+
+def test_a_spot_that_is_cut_tells_little_of_how_far_off_a_sensor_is_met(
+    body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    views = []
+    for view in detect(pinhole_cameras, body, TRUTH, noise=0.05):
+        pattern = view.observation.pattern
+        points, deviations = pattern.points.copy(), np.zeros(len(pattern.points))
+        points[0], deviations[0] = points[0] + [2.0, 0.0], 2.0
+        cut = PointPattern(points, pattern.weights, deviations)
+        views.append(replace(view, observation=Observation(cut, view.observation.sigma)))
+    found = estimate_pose(views, body, TRUTH)
+    for name, one in found.offsets.items():
+        # 2 px against a noise of some hundredths
+        assert sorted(one.weights)[0] < 0.01
+        assert sorted(one.weights)[1] == 1.0
+        rms = found.sensors[name].rms
+        assert rms is not None
+        assert rms > 0.5
+        assert found.whole_rms[name] == pytest.approx(one.rms)
+        assert one.rms < 0.2

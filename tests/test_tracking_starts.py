@@ -242,12 +242,14 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     track = replace(tracker.begin(), met_before={"0": 5}, believed=3, frame=0)
 
-    def doubted(track: Track, met: int, log_evidence: float = 20.0) -> bool:
+    def doubted(track: Track, met: int, log_evidence: float = 20.0, ratio: float = 0.5) -> bool:
         seen = replace(sensor("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
-        judged = replace(scored(TRUTH, seen), log_evidence=log_evidence)
+        judged = replace(scored(TRUTH, seen), log_evidence=log_evidence, residual_ratio=ratio)
         return is_doubtful(data_of(tracker, [], track), [judged])
 
     assert not doubted(track, 5)
+    # as much of it, farther off than chance makes it: it may have turned away all at once
+    assert doubted(track, 5, ratio=1.1)
     # as much of it, and yet not sure: a thing that shines alike came near
     assert doubted(track, 5, log_evidence=5.0)
     assert not doubted(track, 4)

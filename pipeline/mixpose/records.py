@@ -8,6 +8,7 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -256,6 +257,15 @@ class Offsets:
     # (n, m) place of what met each, sensor units; the prediction where it was not met
     observed: Floats
     shared: Mask  # (n,) whether another feature was met by the same detection
+    # (n,) how much each tells, as its noise goes: 1, or less where what met it is cut or shared
+    weights: Floats
+
+    @property
+    def rms(self) -> float:
+        """Root mean square, sensor units, of those that were met by what each tells."""
+        weights = self.weights * self.met
+        squares = float(weights @ np.vecdot(self.offsets, self.offsets))
+        return math.sqrt(squares / max(float(weights.sum()), 1e-12))
 
 
 @dataclass(frozen=True)
@@ -318,10 +328,19 @@ class Estimate:
     tip_object: Floats | None = field(default=None, compare=False)
     filled: bool = False  # whether nothing was measured: the pose is what frames around it say
 
-    @property
+    @cached_property
     def offsets(self) -> Mapping[str, Offsets]:
         """By how much each sensor met the features of the best pose."""
         return self.measured()
+
+    @property
+    def whole_rms(self) -> Mapping[str, float | None]:
+        """As `SensorReport.rms` by sensor; what is known to be cut or shared counts less."""
+        offsets = self.offsets
+        return {
+            name: offsets[name].rms if name in offsets and one.rms is not None else one.rms
+            for name, one in self.sensors.items()
+        }
 
     @property
     def tip(self) -> Floats | None:

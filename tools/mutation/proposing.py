@@ -29,7 +29,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-rivals-followed-however-far-behind",
         "tracking/frame.py",
-        "least=float(own) - self.rules.look_alikes.behind, ",
+        "least=least, ",
         "",
         "the other tilt of a flat body costs more than the body itself",
         (_PROPOSERS,),

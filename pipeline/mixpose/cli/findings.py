@@ -79,7 +79,7 @@ class _Marker:
         self.since: int | None = None  # first frame since which it was not met
         self.missed_since = 0
         self.normal, self.pull = np.zeros((3, 3)), np.zeros(3)
-        self.squares, self.views = 0.0, 0
+        self.squares, self.views = 0.0, 0.0  # of whole spots, each by what it tells
 
     def shift(self) -> Floats:
         """Displacement in the body's axes that explains its offsets best (3,)."""
@@ -89,7 +89,7 @@ class _Marker:
 
     def systematic(self) -> float:
         """Mean squared offset that this displacement takes away."""
-        return float(self.pull @ self.shift()) / max(self.views, 1)
+        return float(self.pull @ self.shift()) / max(self.views, 1e-12)
 
 
 class Findings:
@@ -181,8 +181,9 @@ class Findings:
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
             return
+        found = estimate.whole_rms
         for name, one in estimate.sensors.items():
-            usual, off = self._usual[name], one.rms
+            usual, off = self._usual[name], found[name]
             if off is None or not one.used:
                 continue
             counts = off >= _AT_LEAST * self._sigmas[name] and len(usual) >= _FEWEST
@@ -204,11 +205,11 @@ class Findings:
                 marker = markers.setdefault(i, _Marker())
                 met[i] = met.get(i, False) or bool(one.met[k])
                 if one.met[k]:
-                    J = one.by_shift[k] @ T[:3, :3]
-                    marker.normal += J.T @ J
-                    marker.pull += J.T @ one.offsets[k]
-                    marker.squares += float(one.offsets[k] @ one.offsets[k])
-                    marker.views += 1
+                    J, weight = one.by_shift[k] @ T[:3, :3], float(one.weights[k])
+                    marker.normal += weight * J.T @ J
+                    marker.pull += weight * J.T @ one.offsets[k]
+                    marker.squares += weight * float(one.offsets[k] @ one.offsets[k])
+                    marker.views += weight
         for i, is_met in met.items():
             marker = markers[i]
             marker.expected += 1

@@ -146,9 +146,9 @@ class Summary:
             self.split_frames += 1
             self.split.update(idle)
         if estimate.status == "ok":
+            found = estimate.whole_rms
             for name, residuals in self.residuals.items():
-                rms = estimate.sensors[name].rms
-                if rms is not None:
+                if (rms := found[name]) is not None:
                     residuals.append(rms)
 
     def say(self, where: str) -> None:

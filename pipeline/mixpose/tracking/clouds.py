@@ -99,4 +99,5 @@ def _in_space(planes: Sequence[Offsets], sensor: CloudSensor) -> Offsets:
     by_shift: Floats = np.broadcast_to(sensor.T_sensor_world[:3, :3], (n, 3, 3))
     met = np.logical_and.reduce([one.met for one in planes])
     shared = np.logical_or.reduce([one.shared for one in planes])
-    return Offsets(planes[0].features, met, away, by_shift, observed, shared)
+    weights = np.minimum.reduce([one.weights for one in planes])
+    return Offsets(planes[0].features, met, away, by_shift, observed, shared, weights)

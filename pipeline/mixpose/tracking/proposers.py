@@ -53,7 +53,8 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
     before = sum(track.met_before.values())
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
-    return bool(is_new or track.misses or track.doubted or misses_more)
+    is_off = ranked[0].residual_ratio > 1  # more than chance makes it
+    return bool(is_new or track.misses or track.doubted or misses_more or is_off)
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:

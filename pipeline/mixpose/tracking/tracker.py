@@ -198,7 +198,7 @@ class Tracker(Setup):
             guesses=data.searches[-1][0] if data.searches else None,
             delays=after.delays.seconds,
             doubt=verdict.doubt,
-            measured=partial(_offsets, used) if used else dict,
+            measured=partial(_offsets, used, shown.variances) if shown and used else dict,
         )
 
 
@@ -307,8 +307,11 @@ def _residuals(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
     }
 
 
-def _offsets(used: Matches) -> dict[str, Offsets]:
-    """By how much each sensor met the features of a body whose features are points."""
+def _offsets(used: Matches, variances: Floats) -> dict[str, Offsets]:
+    """By how much each sensor met the features of a body whose features are points.
+
+    Noise has variances (L,), σ_ε².
+    """
     offsets = {}
     for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
         i = np.flatnonzero(used.weights[k])
@@ -320,5 +323,6 @@ def _offsets(used: Matches) -> dict[str, Offsets]:
         middle = alike @ places / np.maximum(alike.sum(axis=1), 1)[:, None]
         observed = np.where(shared[:, None], middle, places) + y
         met = used.shares[k, i] > 0
-        offsets[name] = Offsets(i, met, y, sigma * by_shift, observed, shared)
+        weights = variances[k] / (variances[k] + used.extra[k, i])
+        offsets[name] = Offsets(i, met, y, sigma * by_shift, observed, shared, weights)
     return offsets
