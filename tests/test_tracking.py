@@ -278,10 +278,10 @@ def test_a_spot_that_is_cut_tells_little_of_how_far_off_a_sensor_is_met(
 ) -> None:
     views = []
     for view in detect(pinhole_cameras, body, TRUTH, noise=0.05):
-        pattern = view.observation.pattern
-        points, deviations = pattern.points.copy(), np.zeros(len(pattern.points))
-        points[0], deviations[0] = points[0] + [2.0, 0.0], 2.0
-        cut = PointPattern(points, pattern.weights, deviations)
+        assert view.observation.points is not None
+        points = view.observation.points.copy()
+        points[0, 0] += 2.0
+        cut = PointPattern(points, np.ones(len(points)), 2.0 * (np.arange(len(points)) == 0))
         views.append(replace(view, observation=Observation(cut, view.observation.sigma)))
     found = estimate_pose(views, body, TRUTH)
     for name, one in found.offsets.items():
