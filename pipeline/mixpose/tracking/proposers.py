@@ -43,7 +43,8 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
-    Once it was followed for some frames, a pose convinces that misses no more all at once.
+    Once it was followed for some frames, a pose convinces that misses no more all at once and is no
+    farther off than chance makes it.
     """
     track, rules = frame.track, frame.rules
     if frame.first_is(frame.trusted, ranked):
@@ -53,7 +54,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
     before = sum(track.met_before.values())
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
-    is_off = ranked[0].residual_ratio > 1  # more than chance makes it
+    is_off = ranked[0].residual_ratio > 1
     return bool(is_new or track.misses or track.doubted or misses_more or is_off)
 
 
