@@ -16,13 +16,14 @@ from mixpose.tracking.twin import IN_A_MIRROR, TWICE
 
 FLAT = body("flat", TOOL * [1.0, 1.0, 0.0])
 SOLID = body("solid", TOOL)
+OPTIONS = EstimatorOptions()
 HERE, THERE = at(-120.0), at(130.0, 60.0, turn=0.4)
 
 
 def estimates_of(
     tracked: Body,
     shown: list[list[np.ndarray]],
-    options: EstimatorOptions = EstimatorOptions(),
+    options: EstimatorOptions = OPTIONS,
     **there: Body,
 ) -> list[Estimate]:
     """Of frames that show the body at some poses each, or what stands `there` instead."""
@@ -45,6 +46,21 @@ def test_a_second_body_makes_every_frame_ambiguous_from_its_first_on(tracked: Bo
         places = np.array([each.T_world_object[:3, 3] for each in one.hypotheses])
         for T in (HERE, THERE):  # both are told
             assert np.linalg.norm(places - T[:3, 3], axis=1).min() < 2.0
+
+
+def test_a_second_body_that_passes_right_beside_the_first_is_not_forgotten() -> None:
+    points = np.random.default_rng(0).uniform(-50, 50, (7, 3))
+    seven, six, four = (body(str(count), points[:count]) for count in (7, 6, 4))
+    scene = Scene((Tracker.create(seven, OPTIONS),))
+    tracks = scene.begin()
+    for frame, x in enumerate(np.linspace(190.0, -370.0, 29)):
+        there = at(x, 25.0, turn=0.4)
+        is_near = np.linalg.norm(there[:3, 3] - HERE[:3, 3]) < seven.radius
+        # four before one camera are sure to be it only where it was
+        shown = [seven, four if is_near else six][: 1 + (frame > 2)]
+        views = views_of(shown, [HERE, there][: len(shown)], frame)[:1]
+        tracks, (found,) = scene.advance(tracks, frame, None, views)
+        assert found.status == ("ok" if frame < 3 else "ambiguous"), frame
 
 
 def test_the_frame_is_ok_again_once_the_other_one_is_gone() -> None:

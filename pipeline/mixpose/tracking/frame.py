@@ -230,13 +230,18 @@ class Frame(Setup):
     def other_at(self, T_world_object: Floats) -> float | None:
         """Log odds that what is at a pose is not the body, by the prediction that it goes on from.
 
-        That is the nearest of those that it overlaps; None where nothing else was ever seen.
+        None where nothing else was ever seen.
         """
         if all(one.other is None for one in self.predictions):
             return None
+        before = self.before(T_world_object)
+        return before.other if before else None
+
+    def before(self, T_world_object: Floats) -> Branch | None:
+        """The prediction that a pose goes on from: the nearest of those that it overlaps."""
         away = self.away_from(T_world_object)
         near = [k for k, off in enumerate(away) if off.min() <= self.body.radius]
-        return self.predictions[min(near, key=lambda k: away[k].mean())].other if near else None
+        return self.predictions[min(near, key=lambda k: away[k].mean())] if near else None
 
     @property
     def was_lost(self) -> bool:

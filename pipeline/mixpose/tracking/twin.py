@@ -154,9 +154,10 @@ def _where_it_was(data: Frame, best: ScoredPose, views: Sequence[View]) -> Score
 
 
 def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
-    """Where else than at the best pose the body is expected."""
-    for branch, off in zip(data.predictions, data.away_from(best.T_world_object), strict=True):
-        if off.min() > data.body.radius:
+    """Where else than at the best pose the body is expected, be it right beside it."""
+    own = data.before(best.T_world_object)
+    for branch in data.predictions:
+        if branch is not own:
             yield Start(branch.T_world_object, branch.uncertainty)
 
 
