@@ -26,6 +26,8 @@ def test_a_sensor_whose_frames_belong_to_those_before_is_named() -> None:
     assert late_sensor(session, in_step) is None
     told = late_sensor(session, list(zip(numbers, late, strict=True)))
     assert told == "'right' is a frame late: with each of its frames given to the one before"
+    # of a body at rest frames of other moments are as good, and no better
+    assert late_sensor(session, [(number, seen[1]) for number in numbers]) is None
     # of frames with gaps nobody knows
     assert late_sensor(session, list(zip((5, 7, 8), late, strict=True))) is None
     assert late_sensor(session, list(zip(numbers, late, strict=True))[:2]) is None

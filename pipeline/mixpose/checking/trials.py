@@ -26,6 +26,7 @@ from mixpose.records import Floats
 from mixpose.session import Session
 
 _FRAMES = 3  # in a row
+_CLEARER = 0.5  # of what is met off: frames of other moments are met several times as far off
 
 
 @dataclass(frozen=True)
@@ -331,19 +332,26 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
     numbers = [number for number, _ in frames]
     if len(numbers) < _FRAMES or len({*np.diff(numbers).tolist()}) != 1:
         return None
+    as_they_are = [_met(session, *one)[1] for one in frames]
     for setup in session.sensors:
         name = setup.name
         given = [  # the views of a frame, that of one sensor from the frame after
             [view for view in now if view.name != name] + [v for v in after if v.name == name]
             for (_, now), (_, after) in pairwise(frames)
         ]
-        if all(_is_ok(session, n, views) for n, views in zip(numbers, given)):
+        are_ok, offs = zip(*[_met(session, *one) for one in zip(numbers, given)], strict=True)
+        if all(are_ok) and max(offs) < _CLEARER * min(as_they_are):
             return f"{name!r} is a frame late: with each of its frames given to the one before"
     return None
 
 
-def _is_ok(session: Session, number: int, views: Views) -> bool:
+def _met(session: Session, number: int, views: Views) -> tuple[bool, float]:
+    """Whether a frame is ok by all of its sensors, and how far off they meet it, in sigma."""
     with np.errstate(all="ignore"):
         estimate = evidence.estimate_of(evidence.anywhere(session), number, views)
-    shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]
-    return estimate.status == "ok" and min(shares, default=0.0) > 0.1
+    # a sensor that is left out agrees with none of them
+    shares = [(one.explained or 0.0) * one.used for one in estimate.sensors.values()]
+    is_ok = estimate.status == "ok" and min(shares, default=0.0) > 0.1
+    sigmas, rms = {view.name: view.observation.sigma for view in views}, estimate.whole_rms
+    offs = [math.inf if off is None else off / sigmas[name] for name, off in rms.items()]
+    return is_ok, max(offs, default=math.inf)

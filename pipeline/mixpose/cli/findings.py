@@ -265,7 +265,10 @@ class Findings:
 
     def _of_doubts(self) -> list[str]:
         if self.change is not None:
-            return [f"{self.change}, frames that are not ok would be ok"]
+            line = f"{self.change}, frames that are not ok would be ok"
+            if self._goes_on:
+                line += f"; before frame {self._doubted.found[-1][0]} it is not, or the body rests"
+            return [line]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         since = self._changed_since()
@@ -293,11 +296,21 @@ class Findings:
             APART: "was one of them bumped?",
             CHANGED: "was a sensor bumped, or is it out of focus?",
         }
-        goes_on = self._doubted.last_place == self._places and self._agreed_before >= _LONG
-        if most not in asked or not goes_on or self._doubted.found[-1][2] < _LONG:
+        if most not in asked or not self._goes_on:
             return None
         first = self._doubted.found[-1][0]
         return first, f"{most} from frame {first} on: {asked[most]}"
+
+    @property
+    def _late(self) -> bool:
+        """Whether frames were ok at first, as of a body at rest, which shows no delay."""
+        return self._agreed_before >= _LONG
+
+    @property
+    def _goes_on(self) -> bool:
+        """Whether frames were ok at first, and are in doubt up to the last one."""
+        lasts = self._doubted.last_place == self._places
+        return self._late and lasts and self._doubted.found[-1][2] >= _LONG
 
     @cached_property
     def change(self) -> str | None:
@@ -311,8 +324,7 @@ class Findings:
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
-        # a body that was at rest at first shows no delay; all else would have shown
-        asked = late_sensor if self._agreed_before >= _LONG else explanation
+        asked = late_sensor if self._late else explanation  # all else would have shown
         return asked(self._session, self._frames)
 
     def _of_markers(self) -> list[str]:

@@ -36,7 +36,7 @@ from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
-from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat
+from mixpose.tracking.twin import IN_A_MIRROR, is_flat, seen_beside
 
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
@@ -56,9 +56,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     if verdict.status != "ok":
         rivals = [one for one, _ in verdict.kept if one is not best]
         why = reason(data, best, rivals)
-        if not why and any(are_both(best, one) for one in rivals):
-            why = TWICE
-        if why:
+        if why := why or next(filter(None, (seen_beside(best, one) for one in rivals)), ""):
             clutter, *others = verdict.against
             named = [one._replace(what=why) for one in others]
             return replace(verdict, against=(clutter, *named))

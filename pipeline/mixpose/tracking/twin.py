@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mixpose.body import thickness
-from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
+from mixpose.judgement import APART, Alternative, ScoredPose, Second, Verdict, is_sure
 from mixpose.objective import View
 from mixpose.search import Candidate, Copy, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
@@ -78,13 +78,19 @@ def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
     return rest
 
 
-def are_both(a: ScoredPose, b: ScoredPose) -> bool:
-    """Whether two poses are sure, and meet detections of their own."""
+def seen_beside(a: ScoredPose, b: ScoredPose) -> str:
+    """In words, what two poses are that are likely, and meet detections of their own; else empty.
+
+    What is there twice some sensor sees twice; where each sees one of them, one stands elsewhere.
+    """
     if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
-        return False
+        return ""
     pairs = zip(a.matches.detections, b.matches.detections, strict=True)
     shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
-    return bool(shared < 0.5 * (a.matches.detections >= 0).sum())
+    met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
+    if shared >= 0.5 * met.sum():
+        return ""
+    return TWICE if np.minimum(met, other).sum() >= 0.5 * other.sum() else APART
 
 
 def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
