@@ -56,10 +56,10 @@ def test_whole_spots_teach_the_size_and_how_exact_it_is() -> None:
     for _ in range(40):
         logs = np.log(RADIUS) + rng.normal(0, 0.02, 8)
         logs[0] -= 0.7  # one in eight is cut to half its radius
-        sizes = sizes.followed(logs, RULES)
+        sizes = sizes.followed({"0": logs}, RULES)
     assert np.exp(sizes.mean) == pytest.approx(RADIUS, rel=0.01)
     assert 0.02 < sizes.scatter(RULES) < 0.035  # 0.02, drawn to what is believed before
-    whole, cut = sizes.cut(np.log(RADIUS) + np.array([0.02, -0.7]), RULES)
+    whole, cut = sizes.cut(np.array([0.02, -0.7]), RULES)
     assert whole < 0.05
     assert cut > 0.999
 
@@ -67,8 +67,8 @@ def test_whole_spots_teach_the_size_and_how_exact_it_is() -> None:
 def test_sizes_that_scatter_tell_nothing() -> None:
     rng, sizes = np.random.default_rng(0), Sizes()
     for _ in range(20):
-        sizes = sizes.followed(np.log(RADIUS) + rng.normal(0, 0.3, 8), RULES)
-    assert sizes.cut(np.log(RADIUS) + np.array([-0.4]), RULES)[0] < 0.5
+        sizes = sizes.followed({"0": np.log(RADIUS) + rng.normal(0, 0.3, 8)}, RULES)
+    assert sizes.cut(np.array([-0.4]), RULES)[0] < 0.5
 
 
 def test_a_spot_is_taken_to_be_off_by_as_much_as_its_area_says(
@@ -134,7 +134,7 @@ def test_a_frame_by_itself_learns_the_size_from_its_pose(
     best = tracker.explain(data)[0]
     assert np.isfinite(best.used.cut).all()
     deviation = np.sqrt(best.used.extra[0, 1]) * best.used.sigmas[0]
-    known = sizes_after(Sizes(), best, RULES)
+    known = sizes_after(Sizes(), best, BODY, RULES)
     assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)
     # off by half a radius
     assert deviation > 10 * NOISE

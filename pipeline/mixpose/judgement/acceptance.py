@@ -169,22 +169,25 @@ def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
 def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Whether what would fix some direction is hidden or cut.
 
-    The sum of variances is compared with that if all features in view were met, and whole, by this
-    noise and by what is usual.
+    The sum of variances is compared with that if all features in view were met, and whole, by all
+    sensors, by this noise and by what is usual.
     """
-    used = pose.used
-    if not (np.count_nonzero(used.shares < used.weights) or np.count_nonzero(used.extra)):
+    used, seen = pose.used, pose.matches
+    is_less = pose.left_out or np.count_nonzero(used.shares < used.weights)
+    if not (is_less or np.count_nonzero(used.extra)):
         return False
     if np.count_nonzero(used.merged):  # one of two that share a detection may be hidden instead
         by = used.detections
         is_shared = (by >= 0) & ((by[..., None] == by[:, None]).sum(axis=2) > 1)
         used = replace(used, shares=np.where(is_shared, 0.0, used.shares))
     inner = np.ix_(free, free)
-    whole = replace(used, shares=used.weights, extra=np.zeros(used.extra.shape))
-    C = inverted(information_of(used, pose.variances)[inner])
-    if np.vdot(C, information_of(whole, pose.variances)[inner]) <= rules.open:
+    whole = replace(seen, shares=seen.weights, extra=np.zeros(seen.extra.shape))
+    C, noise = inverted(information_of(used, pose.variances)[inner]), pose.variances
+    if pose.left_out:
+        noise = np.full(len(seen.names), noise.mean())
+    if np.vdot(C, information_of(whole, noise)[inner]) <= rules.open:
         return False
-    usual = np.full(len(used.names), model.usual**2)
+    usual = np.full(len(seen.names), model.usual**2)
     return bool(np.vdot(C, information_of(whole, usual)[inner]) > 2 * len(C))
 
 
@@ -257,7 +260,7 @@ def one_misses(
     `before` are squares and degrees of freedom (2,) of residuals of the frames before; where two
     sensors `agreed` in one of them, one may miss the body now.
     """
-    used = judged.used
+    used = judged.matches  # of a sensor that is left out as well
     if len(used.images) != 2 or (used.dimensions != 2).any():
         return False
     coverage, nearby, missed, count, met = (

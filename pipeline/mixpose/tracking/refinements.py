@@ -28,14 +28,31 @@ from mixpose.tracking.proposers import predicted
 Refinement: TypeAlias = Callable[[Frame, Likelihood, ScoredPose], Iterable[Start]]
 
 OUT_OF_STEP = "out of step or bumped"
+BY_CHANCE = "it meets little of the body, as by chance"
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """The pose fitted without the sensors that disagree with two others or more."""
-    if len(frame.views) < 3 or judged.left_out:
+    """The pose fitted without the sensors that disagree with others, or may meet it by chance."""
+    if len(frame.views) < 2 or judged.left_out:
         return
-    if apart := disagreeing(judged.matches, frame.rules.acceptance, frame.rules.judgement.noise):
+    rules, seen = frame.rules.acceptance, judged.matches
+    if apart := disagreeing(seen, rules, frame.rules.judgement.noise):
         yield Start(judged.T_world_object, frame.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
+    elif chance := by_chance(seen, rules):
+        left_out = dict.fromkeys(chance, BY_CHANCE)
+        yield Start(judged.T_world_object, frame.close, left_out=left_out)
+
+
+def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
+    """Sensors that meet little of a body that another one meets, beside detections of no feature.
+
+    They may be covered or out of step, and a pose that others leave open bends to what is there.
+    """
+    coverage = seen.summed(seen.coverage) / seen.images
+    spare = seen.summed(seen.count) > seen.summed(seen.met)
+    little = (coverage > 0) & (coverage < rules.agreeing) & spare
+    names = [seen.names[k] for k in np.flatnonzero(little[seen.owner])]
+    return names if np.count_nonzero(coverage >= rules.agreeing) else []
 
 
 def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:

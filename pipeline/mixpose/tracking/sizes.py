@@ -6,13 +6,15 @@ is lost of the whole disk's moment: by sR (1 − r²/s²R²) where what is lost 
 as far where only a part at the rim is left.  What is larger is merged, with the roles exchanged.
 
 Whole spots scatter about their size by a deviation τ of its logarithm; cut ones have any size.
-Both R and τ are learnt from the frames that are ok; before the first nothing is known.
+What glows has the size of the optics in each image: in logarithms a sensor's R is off the common
+one by a deviation ω, small where sensors see disks.  R, τ and ω are learnt from the frames that
+are ok; before the first nothing is known.  Of markers of told radii R is what they are times these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,6 +37,7 @@ class SizeRules:
     scatter: float = constant(0.1, "τ before it is seen: grey levels move outlines of small spots")
     scatter_counts: float = constant(6.0, "spots that this counts as: those of a frame")
     least: float = constant(0.01, "τ at least: disks of 6 px are as exact")
+    apart: float = constant(0.05, "ω before it is seen: thresholds move outlines by as much")
     memory: float = constant(0.95, "per frame, as of noise")
 
 
@@ -44,7 +47,8 @@ class Sizes:
 
     count: float = 0.0
     mean: float = 0.0
-    squares: float = 0.0  # about the mean
+    squares: float = 0.0  # about the centre of each sensor
+    sensors: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # count and mean
 
     def scatter(self, rules: SizeRules) -> float:
         """τ."""
@@ -52,25 +56,48 @@ class Sizes:
         variance = (self.squares + prior * rules.scatter**2) / (self.count + prior)
         return max(float(np.sqrt(variance)), rules.least)
 
-    def cut(self, logs: Floats, rules: SizeRules) -> Floats:
-        """Chances (n,) that spots are cut or merged, by ln r/s (n,)."""
-        tau, off = self.scatter(rules), logs - self.mean
+    def centre(self, sensor: str, rules: SizeRules) -> float:
+        """The logarithm of R in a sensor: its own mean, drawn to that of all by τ and ω."""
+        count, mean = self.sensors.get(sensor, (0.0, self.mean))
+        # sensors that saw few spots tell little of how far they are apart
+        told = [(n / (n + rules.scatter_counts), m - self.mean) for n, m in self.sensors.values()]
+        squares = sum([share * off * off for share, off in told])
+        apart = (rules.apart**2 + squares) / (1 + sum([share for share, _ in told]))
+        share = count / (count + self.scatter(rules) ** 2 / apart)
+        return self.mean + share * (mean - self.mean)
+
+    def cut(self, off: Floats, rules: SizeRules) -> Floats:
+        """Chances (n,) that spots are cut or merged, by ln r/s less the sensor's centre (n,)."""
+        tau = self.scatter(rules)
         whole = np.exp(-0.5 * (off / tau) ** 2) / (np.sqrt(2 * np.pi) * tau)
         cut = rules.cut * np.exp(-np.abs(off))
         return np.asarray(cut / (cut + (1 - rules.cut) * whole))
 
-    def followed(self, logs: Floats, rules: SizeRules) -> Sizes:
-        """With the spots (n,) of one more frame."""
-        if not logs.size:
+    def followed(self, logs: Mapping[str, Floats], rules: SizeRules) -> Sizes:
+        """With the spots (n,) of one more frame, by sensor."""
+        logs = {name: own for name, own in logs.items() if own.size}
+        if not logs:
             return self
-        known = self if self.count else Sizes(0.0, float(np.median(logs)))
-        weights = 1 - known.cut(logs, rules)
-        count = rules.memory * self.count + float(weights.sum())
+        known = (
+            self if self.count else Sizes(0.0, float(np.median(np.concatenate([*logs.values()]))))
+        )
+        # where a sensor was not seen before, most of its spots are whole
+        begun = {name: (float(own.size), float(np.median(own))) for name, own in logs.items()}
+        known = replace(known, sensors=begun | dict(known.sensors))
+        sensors = {name: (rules.memory * n, mean) for name, (n, mean) in self.sensors.items()}
+        count, squares = rules.memory * self.count, rules.memory * self.squares
+        for name, own in logs.items():
+            weights = 1 - known.cut(own - known.centre(name, rules), rules)
+            before, mean = sensors.get(name, (0.0, begun[name][1]))
+            after = before + float(weights.sum())
+            mean += float(weights @ (own - mean)) / max(after, 1e-12)
+            sensors[name] = after, mean
+            count += float(weights.sum())
+            squares += float(weights @ (own - mean) ** 2)
         if count <= 0:
             return self
-        mean = known.mean + float(weights @ (logs - known.mean)) / count
-        squares = rules.memory * self.squares + float(weights @ (logs - mean) ** 2)
-        return Sizes(count, mean, squares)
+        mean = sum([n * own for n, own in sensors.values()]) / count
+        return Sizes(count, mean, squares, sensors)
 
 
 def weighed_by_size(
@@ -80,20 +107,21 @@ def weighed_by_size(
     if not (sizes.count and rules.cut and views):
         return list(views)
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
-    seen_otherwise, every, scatter = list(views), _scales(at.J[:, 0]), sizes.scatter(rules)
+    seen_otherwise, scatter = list(views), sizes.scatter(rules)
+    every = _scales(at.J[:, 0]) * _by_radius(body.node_radii)
     for k, view in enumerate(views):
         pattern = view.observation.pattern
         if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
         scales = every[k, seen[_nearest(pattern.points, at.y[k, 0, seen])]]
-        logs = np.log(pattern.radii / scales)
-        whole = scales * np.exp(sizes.mean)
-        smaller = np.exp(-2 * np.hypot(logs - sizes.mean, scatter))
+        centre = sizes.centre(view.name, rules)
+        off, whole = np.log(pattern.radii / scales) - centre, scales * np.exp(centre)
+        smaller = np.exp(-2 * np.hypot(off, scatter))
         # of each of two coordinates
         moved = np.maximum(pattern.radii, whole) * (1 - smaller) / np.sqrt(2)
         # what is likely whole is not made less exact by a little
-        chances = sizes.cut(logs, rules)
+        chances = sizes.cut(off, rules)
         own = np.where(chances > 0.5, moved, 0.0)
         cut = np.array([chances, moved]).T
         known = pattern.erring(np.maximum(pattern.deviations, own), cut)
@@ -120,14 +148,27 @@ def are_less_exact(views: Sequence[View], known: Sequence[View]) -> bool:
     )
 
 
-def sizes_after(before: Sizes, best: ScoredPose, rules: SizeRules) -> Sizes:
+def sizes_after(before: Sizes, best: ScoredPose, body: Body, rules: SizeRules) -> Sizes:
     """What is known after a frame that is ok."""
     used = best.used
     met = (used.radii > 0) & (used.shares == used.weights) & (used.shares > 0)
     if not before.count:
         met &= used.extra < best.variances[:, None]  # of no shape that is odd
-    scales = _scales(used.J * used.sigmas[:, None, None, None])
-    return before.followed(np.log(used.radii[met] / scales[met]), rules)
+    if not np.count_nonzero(met):
+        return before
+    scales = _scales(used.J * used.sigmas[:, None, None, None]) * _by_radius(body.node_radii)
+    logs = {
+        name: np.log(radii[own] / scale[own])
+        for name, radii, scale, own in zip(used.names, used.radii, scales, met)
+    }
+    return before.followed(logs, rules)
+
+
+def _by_radius(radii: Floats | None) -> Floats | float:
+    """How large markers are told to be (N,), by their geometric mean."""
+    if radii is None or not radii.all():
+        return 1.0
+    return np.asarray(radii / np.exp(np.log(radii).mean()))
 
 
 def _scales(J: Floats) -> Floats:

@@ -164,7 +164,7 @@ class Tracker(Setup):
         if not ranked:
             return ranked
         best, rules = ranked[0], self.rules.sizes
-        sizes = sizes_after(Sizes(), best, rules)
+        sizes = sizes_after(Sizes(), best, self.body, rules)
         views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
         # where no spot is cut by its size, poses are what they are
         if not are_less_exact(data.views, views):
@@ -276,7 +276,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     sizes, rates = track.sizes, ClutterRates()
     if is_ok:
         rates = track.rates.followed(used, data.rules.judgement.noise.memory)
-        sizes = sizes_after(sizes, best, data.rules.sizes)
+        sizes = sizes_after(sizes, best, data.body, data.rules.sizes)
     return follow(
         data,
         found,
