@@ -35,6 +35,7 @@ from mixpose.extraction.contours import (
     filled_area,
     is_solid,
     length_by_width,
+    lobes,
     neighbours,
     on_border,
     outlines,
@@ -63,6 +64,9 @@ class BlobRules:
     )
     solidity: float = constant(
         0.9, "of its convex hull, that a blob without an elliptical rim fills"
+    )
+    waist: float = constant(
+        1.5, "px below the hull, at least, of an outline between two that touch"
     )
     step: int = constant(3, "px, width of the rings between which the step at an outline is taken")
     level_ratio: float = constant(
@@ -204,6 +208,7 @@ def find_blobs(
         rest = _without_disks([*parts, *_below(shapeless)], are_oval, rules)
         parts, are_oval = [], none(0)
         shapeless = [part for part in rest if not part.is_apart]
+    _part_lobes(list(chain(*found)), rules)
     blobs = []
     for (scene, _), parts, largest in zip(scenes, found, most, strict=True):
         _find_spots(scene, [*parts, *_below([part for part in parts if not part.found])], rules)
@@ -247,6 +252,21 @@ def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) 
         elif disk:
             part.found = [disk]
     return [part for part in large if not part.found]
+
+
+def _part_lobes(parts: Sequence[Part], rules: BlobRules) -> None:
+    """Give large parts without a shape, of which nothing came apart, disks that touch in them."""
+    several = [
+        (part, some)
+        for part in [*parts, *_below(parts)]
+        if part.area > rules.small_area and not part.found
+        if not any(one.found or one.area <= rules.small_area for one in _below([part]))
+        if len(some := lobes(part.contour, rules.waist, rules.spots.max_parts)) > 1
+    ]
+    outlined = [(part.scene, one) for part, some in several for one in some]
+    disks = iter(_disks(outlined, none(len(outlined)), rules))
+    for part, some in several:
+        part.found = [disk for _, disk in zip(some, disks) if disk]
 
 
 def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> None:

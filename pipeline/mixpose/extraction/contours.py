@@ -29,6 +29,10 @@ CONTOUR_SAMPLES = 64
 
 _AT_ONCE = 256  # contours that are held against all others in one piece
 
+# Across a waist by the way along the outline: of a disk beside it, cut off at half its radius or
+# less from its middle, 1.73 / 4.2 at the most.
+_WAIST = 0.45
+
 _MOMENTS = itemgetter("m00", "m10", "m01", "mu20", "mu02", "mu11")
 
 # Of an ellipse's area for its moments, from which it is taken for one until rims tell.
@@ -123,6 +127,36 @@ def ovals(contours: Sequence[Contour]) -> Ellipses:
 def is_solid(contour: Contour, least: float) -> bool:
     """Whether a contour fills so much of its convex hull."""
     return bool(cv2.contourArea(contour) >= least * cv2.contourArea(cv2.convexHull(contour)))
+
+
+def lobes(contour: Contour, depth: float, most: int) -> list[Contour]:
+    """The outlines of things that touch, as waists part their common one; one if it has none.
+
+    A waist lies between two places that are so much deeper, px, than the convex hull, nearer to
+    each other than along the outline; more of these than so many parts have are no waists.
+    """
+    if len(contour) < 4:
+        return [contour]
+    # OpenCV asks for corners in their order
+    corners = np.sort(cv2.convexHull(contour, returnPoints=False), axis=0)[::-1]
+    defects = cv2.convexityDefects(contour, corners) if len(corners) > 3 else None
+    if defects is None:
+        return [contour]
+    *_, places, depths = defects.reshape(-1, 4).T  # in 1/256 px
+    deep = np.sort(places[depths >= 256 * depth])
+    if not 2 <= len(deep) <= 2 * most:
+        return [contour]
+    first, second = np.triu_indices(len(deep), 1)
+    i, j = deep[first], deep[second]
+    away = np.linalg.norm(contour[i, 0] - contour[j, 0], axis=1)
+    along = np.minimum(j - i, len(contour) - (j - i))
+    ratio = away / along
+    narrowest = int(ratio.argmin())
+    if ratio[narrowest] > _WAIST:
+        return [contour]
+    a, b = int(i[narrowest]), int(j[narrowest])
+    parts = contour[a : b + 1], np.concatenate([contour[b:], contour[: a + 1]])
+    return [one for part in parts for one in lobes(part, depth, most)]
 
 
 def cut_out(
