@@ -65,9 +65,7 @@ class BlobRules:
     solidity: float = constant(
         0.9, "of its convex hull, that a blob without an elliptical rim fills"
     )
-    waist: float = constant(
-        1.5, "px below the hull, at least, of an outline between two that touch"
-    )
+    waist: float = constant(1.0, "px below its hull, at least, of an outline between two")
     step: int = constant(3, "px, width of the rings between which the step at an outline is taken")
     level_ratio: float = constant(
         1.4, "by which the level is higher at which what has no shape is searched again"
@@ -247,6 +245,8 @@ def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) 
     begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
     outlined = [(part.scene, part.contour) for part in large]
     for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):
+        if disk and disk.length >= rules.rims.long and len(_lobes(part, rules)) > 1:
+            continue  # an ellipse has no waist
         if disk and disk.carries:
             part.whole = [disk]
         elif disk:
@@ -261,12 +261,17 @@ def _part_lobes(parts: Sequence[Part], rules: BlobRules) -> None:
         for part in [*parts, *_below(parts)]
         if part.area > rules.small_area and not part.found
         if not any(one.found or one.area <= rules.small_area for one in _below([part]))
-        if len(some := lobes(part.contour, rules.waist, rules.spots.max_parts)) > 1
+        if len(some := _lobes(part, rules)) > 1
     ]
     outlined = [(part.scene, one) for part, some in several for one in some]
     disks = iter(_disks(outlined, none(len(outlined)), rules))
     for part, some in several:
         part.found = [disk for _, disk in zip(some, disks) if disk]
+
+
+def _lobes(part: Part, rules: BlobRules) -> list[Contour]:
+    # around a disk of half the area, but for its waist
+    return lobes(part.contour, rules.waist, 4 * math.sqrt(rules.small_area / 2 / math.pi))
 
 
 def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> None:

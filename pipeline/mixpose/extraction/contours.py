@@ -129,11 +129,11 @@ def is_solid(contour: Contour, least: float) -> bool:
     return bool(cv2.contourArea(contour) >= least * cv2.contourArea(cv2.convexHull(contour)))
 
 
-def lobes(contour: Contour, depth: float, most: int) -> list[Contour]:
+def lobes(contour: Contour, depth: float, least: float) -> list[Contour]:
     """The outlines of things that touch, as waists part their common one; one if it has none.
 
     A waist lies between two places that are so much deeper, px, than the convex hull, nearer to
-    each other than along the outline; more of these than so many parts have are no waists.
+    each other than along the outline, which is `least` px at least.
     """
     if len(contour) < 4:
         return [contour]
@@ -144,19 +144,19 @@ def lobes(contour: Contour, depth: float, most: int) -> list[Contour]:
         return [contour]
     *_, places, depths = defects.reshape(-1, 4).T  # in 1/256 px
     deep = np.sort(places[depths >= 256 * depth])
-    if not 2 <= len(deep) <= 2 * most:
+    if len(deep) < 2:
         return [contour]
     first, second = np.triu_indices(len(deep), 1)
     i, j = deep[first], deep[second]
     away = np.linalg.norm(contour[i, 0] - contour[j, 0], axis=1)
     along = np.minimum(j - i, len(contour) - (j - i))
-    ratio = away / along
+    ratio = np.where(along >= least, away / along, np.inf)
     narrowest = int(ratio.argmin())
     if ratio[narrowest] > _WAIST:
         return [contour]
     a, b = int(i[narrowest]), int(j[narrowest])
     parts = contour[a : b + 1], np.concatenate([contour[b:], contour[: a + 1]])
-    return [one for part in parts for one in lobes(part, depth, most)]
+    return [one for part in parts for one in lobes(part, depth, least)]
 
 
 def cut_out(
