@@ -28,7 +28,13 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.refinements import _carry, _paired, agreed, merged_pair
+from mixpose.tracking.refinements import (
+    _carry,
+    _paired,
+    agreed,
+    merged_pair,
+    without_sensor,
+)
 from mixpose.tracking.track import Track
 
 Floats = NDArray[np.float64]
@@ -257,6 +263,28 @@ def test_others_are_asked_where_spots_that_are_off_can_carry_them(
         J, offsets = used.J / noise[..., None], used.offsets / noise
         met = J[used.shares > 0]
         assert _carry(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
+
+
+def test_a_sensor_that_meets_one_of_eight_beside_others_may_meet_it_by_chance(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    tracker, track = followed(pinhole_cameras, EIGHT)
+    aside, seen = (one.project(transform(TRUTH, EIGHT.means))[0] for one in pinhole_cameras)
+    # it is turned by two degrees, and a spot is 3 px beside a marker
+    spots = np.concatenate([aside + np.array([40.0, 25.0]), aside[:1] + np.array([2.0, 2.0])])
+    views = [view_of("0", pinhole_cameras[0], spots), view_of("1", pinhole_cameras[1], seen)]
+    data = tracker.data(track, 6, 6 / 30, views)
+    likelihood, here = likelihood_of(data), Start(TRUTH, data.close)
+    judged = likelihood.judge(likelihood.fit(here), here)
+    assert judged.matches.met[0] == 1.0
+    (without,) = without_sensor(data, likelihood, judged)
+    assert [*without.left_out] == ["0"]
+    # where nothing is left beside it, it is covered
+    covered = [view_of("0", pinhole_cameras[0], spots[-1:]), views[1]]
+    data = tracker.data(track, 6, 6 / 30, covered)
+    judged = likelihood_of(data).judge(likelihood_of(data).fit(here), here)
+    assert judged.matches.met[0] == 1.0
+    assert list(without_sensor(data, likelihood_of(data), judged)) == []
 
 
 def test_what_a_prediction_meets_as_the_pose_does_shows_no_other_mode(

@@ -64,6 +64,48 @@ def test_whole_spots_teach_the_size_and_how_exact_it_is() -> None:
     assert cut > 0.999
 
 
+def test_what_glows_has_a_size_of_its_own_in_each_sensor_and_disks_have_one() -> None:
+    rng = np.random.default_rng(0)
+    glowing, disks = Sizes(), Sizes()
+    for _ in range(10):
+        left, right = np.log(RADIUS) + rng.normal(0, 0.02, (2, 7))
+        glowing = glowing.followed({"left": left, "right": right + 0.7}, RULES)
+        disks = disks.followed({"left": left, "right": right}, RULES)
+    for sizes, off in ((glowing, 0.7), (disks, 0.0)):
+        assert sizes.centre("left", RULES) == pytest.approx(np.log(RADIUS), abs=0.03)
+        assert sizes.centre("right", RULES) == pytest.approx(np.log(RADIUS) + off, abs=0.03)
+        assert sizes.scatter(RULES) < 0.04  # of either by itself
+    # a sensor that shows one spot, cut, for the first time: of disks the others tell it
+    cut = {"new": np.log(RADIUS) + np.array([-0.5])}
+    assert disks.followed(cut, RULES).centre("new", RULES) > np.log(RADIUS) - 0.25
+
+
+def test_markers_told_to_be_of_several_sizes_are_whole_at_their_own(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    ratios = np.array([0.5, 1.0, 1.5, 0.7, 1.2])
+    body = replace(BODY, radii=RADIUS * ratios)
+    views = []
+    for view in seen(pinhole_cameras, np.random.default_rng(0)):
+        pattern = view.observation.pattern
+        assert isinstance(pattern, PointPattern)
+        radii = PointPattern(
+            pattern.points, pattern.weights, np.zeros(len(ratios)), ratios * pattern.radii
+        )
+        views.append(replace(view, observation=Observation(radii, 1.5)))
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    track, told = tracker.advance(tracker.begin(), 0, 0.0, views)
+    assert told.status == "ok"
+    assert track.sizes.scatter(RULES) < RULES.scatter
+    for view in weighed_by_size(views, body, TRUTH, track.sizes, RULES):
+        pattern = view.observation.pattern
+        assert isinstance(pattern, PointPattern)
+        assert pattern.deviations.max() == 0.0
+    # told to be alike, the small ones seem cut
+    alike = weighed_by_size(views, BODY, TRUTH, Sizes(200.0, np.log(RADIUS), 0.02), RULES)
+    assert max(one.observation.pattern.deviations.max() for one in alike) > 1.0
+
+
 def test_sizes_that_scatter_tell_nothing() -> None:
     rng, sizes = np.random.default_rng(0), Sizes()
     for _ in range(20):

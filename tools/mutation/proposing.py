@@ -69,10 +69,18 @@ _PROPOSALS = (
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
         "tracking/refinements.py",
-        "len(frame.views) < 3 or judged.left_out:",
-        "len(frame.views) < 99 or judged.left_out:",
+        "if apart := disagreeing(seen, rules, frame.rules.judgement.noise):",
+        "if apart := []:",
         "a camera that was bumped bends the pose",
         (_STARTS,),
+    ),
+    Mutant(
+        "tracking-met-by-chance-and-believed",
+        "tracking/refinements.py",
+        "little = (coverage > 0) & (coverage < rules.agreeing) & spare",
+        "little = coverage < 0",
+        "one spot that a turned camera meets by chance bends the pose by degrees",
+        (_REFINEMENTS,),
     ),
     Mutant(
         "tracking-three-markers-of-eight-are-the-body",

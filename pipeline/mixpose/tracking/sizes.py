@@ -57,14 +57,17 @@ class Sizes:
         return max(float(np.sqrt(variance)), rules.least)
 
     def centre(self, sensor: str, rules: SizeRules) -> float:
-        """The logarithm of R in a sensor: its own mean, drawn to that of all by τ and ω."""
-        count, mean = self.sensors.get(sensor, (0.0, self.mean))
-        # sensors that saw few spots tell little of how far they are apart
-        told = [(n / (n + rules.scatter_counts), m - self.mean) for n, m in self.sensors.values()]
-        squares = sum([share * off * off for share, off in told])
-        apart = (rules.apart**2 + squares) / (1 + sum([share for share, _ in told]))
-        share = count / (count + self.scatter(rules) ** 2 / apart)
-        return self.mean + share * (mean - self.mean)
+        """The logarithm of R in a sensor: its own mean, drawn to that of all by ω."""
+        # of few spots each may be cut
+        told = {
+            name: (count / (count + rules.scatter_counts), mean - self.mean)
+            for name, (count, mean) in self.sensors.items()
+        }
+        squares = sum([share * off * off for share, off in told.values()])
+        apart = (rules.apart**2 + squares) / (1 + sum([share for share, _ in told.values()]))
+        share, off = told.get(sensor, (0.0, 0.0))
+        count = share * self.sensors[sensor][0] if share else 0.0
+        return self.mean + count / (count + rules.scatter**2 / apart) * off
 
     def cut(self, off: Floats, rules: SizeRules) -> Floats:
         """Chances (n,) that spots are cut or merged, by ln r/s less the sensor's centre (n,)."""
