@@ -293,7 +293,7 @@ _SIZES = (
     Mutant(
         "extraction-an-ellipse-has-a-waist",
         "extraction/blobs.py",
-        "if disk and disk.length >= rules.rims.long and len(_lobes(part, rules)) > 1:",
+        "if disk and _may_be_two(disk, rules) and len(_lobes(part, rules)) > 1:",
         "if False:",
         "two spheres that overlap are one between them",
         ("test_extraction_touching.py",),

@@ -245,13 +245,19 @@ def _without_disks(parts: Sequence[Part], are_oval: Ellipses, rules: BlobRules) 
     begun = joined([are_oval, none(len(large) - len(are_oval.sound))])
     outlined = [(part.scene, part.contour) for part in large]
     for part, disk in zip(large, _disks(outlined, begun, rules), strict=True):
-        if disk and disk.length >= rules.rims.long and len(_lobes(part, rules)) > 1:
+        if disk and _may_be_two(disk, rules) and len(_lobes(part, rules)) > 1:
             continue  # an ellipse has no waist
         if disk and disk.carries:
             part.whole = [disk]
         elif disk:
             part.found = [disk]
     return [part for part in large if not part.found]
+
+
+def _may_be_two(disk: Blob, rules: BlobRules) -> bool:
+    """Whether a disk is long, and its rim no whole ellipse."""
+    is_whole = disk.rim is not None and disk.rim.coverage >= rules.whole
+    return disk.length >= rules.rims.long and not is_whole
 
 
 def _part_lobes(parts: Sequence[Part], rules: BlobRules) -> None:

@@ -43,8 +43,8 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
-    Once it was followed for some frames, a pose convinces that misses no more all at once and is no
-    farther off than chance makes it.
+    Once it was followed for some frames, a pose convinces that misses no more all at once and that
+    one sensor alone meets no farther off than chance makes it.
     """
     track, rules = frame.track, frame.rules
     if frame.first_is(frame.trusted, ranked):
@@ -54,7 +54,8 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
     before = sum(track.met_before.values())
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
-    is_off = ranked[0].residual_ratio > 1
+    # what two sensors meet is bent, and not elsewhere
+    is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or track.misses or track.doubted or misses_more or is_off)
 
 
