@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mixpose.extraction import ExtractOptions, extract
-from mixpose.extraction.contours import lobes
+from mixpose.extraction.contours import Contour, lobes
 from mixpose.records import PointPattern
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,8 @@ def seen(disks: Floats, seed: int = 0) -> NDArray[np.uint8]:
         covered |= (at - u) ** 2 + ((at - v) ** 2)[:, None] < radius**2
     light = covered.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3))
     noise = np.random.default_rng(seed).normal(0.0, 2.0, light.shape)
-    return np.rint(20 + 150 * gaussian_filter(light, 0.7) + noise).astype(np.uint8)
+    blurred: Floats = gaussian_filter(light, 0.7)
+    return np.rint(20 + 150 * blurred + noise).astype(np.uint8)
 
 
 def farthest(disks: Floats, image: NDArray[np.uint8]) -> float:
@@ -58,7 +59,7 @@ def test_one_disk_by_itself_is_one(seed: int) -> None:
     assert farthest(disks, seen(disks, seed)) < 0.05
 
 
-def outline(mask: NDArray[np.uint8]) -> NDArray[np.integer]:
+def outline(mask: NDArray[np.uint8]) -> Contour:
     return cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0][0]
 
 
