@@ -27,7 +27,7 @@ def seen(disks: Floats, seed: int = 0) -> NDArray[np.uint8]:
     light = covered.reshape(SIZE, FINE, SIZE, FINE).mean(axis=(1, 3))
     noise = np.random.default_rng(seed).normal(0.0, 2.0, light.shape)
     blurred: Floats = gaussian_filter(light, 0.7)
-    return np.rint(20 + 150 * blurred + noise).astype(np.uint8)
+    return np.asarray(np.rint(20 + 150 * blurred + noise), dtype=np.uint8)
 
 
 def farthest(disks: Floats, image: NDArray[np.uint8]) -> float:
