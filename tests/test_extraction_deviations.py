@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.extraction.blobs import Blob, BlobRules, deviations_of, extract_blobs
+from mixpose.extraction.blob import Blob, BlobRules, deviations_of
+from mixpose.extraction.blobs import extract_blobs
 from mixpose.extraction.options import ExtractOptions
 from mixpose.records import PointPattern
 

@@ -11,7 +11,7 @@ _CORNERS = "test_extraction_corners.py"
 _LEVELS = (
     Mutant(
         "extraction-cut-disks-are-whole",
-        "extraction/blobs.py",
+        "extraction/blob.py",
         "rim.coverage < rules.whole or rim.residual > rules.exact * residual",
         "rim.coverage < 0",
         "what is cut counts as much as what is whole",
@@ -19,7 +19,7 @@ _LEVELS = (
     ),
     Mutant(
         "extraction-oblique-disks-are-cut",
-        "extraction/blobs.py",
+        "extraction/blob.py",
         "longer = [blob.length / typical[0] - 1 for blob in blobs]",
         "longer = [blob.length - 1 for blob in blobs]",
         "of three spots seen aslant all count little",
@@ -27,7 +27,7 @@ _LEVELS = (
     ),
     Mutant(
         "extraction-streaks-are-cut",
-        "extraction/blobs.py",
+        "extraction/blob.py",
         "longer = np.minimum(longer, longer_than_alike(shapes, rules.alike)).tolist()",
         "pass",
         "spots that are long alike count little beside round things",
@@ -35,7 +35,7 @@ _LEVELS = (
     ),
     Mutant(
         "extraction-slivers-are-whole",
-        "extraction/blobs.py",
+        "extraction/blob.py",
         "return rules.rough / math.pow(radius, 1.5)",
         "return math.inf",
         "what is left of a small spot counts as much as a whole one",

@@ -14,23 +14,20 @@ again at higher levels, so that blobs are found on it too.
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.constants import constant
+from mixpose.extraction.blob import Blob, BlobRules, deviations_of, usually_off
 from mixpose.extraction.conics import Ellipses, distances, joined, none, together
 from mixpose.extraction.contours import (
     Box,
     Contour,
-    ContourRules,
     cut_out,
     filled_area,
     is_solid,
@@ -42,60 +39,13 @@ from mixpose.extraction.contours import (
     ovals,
     pieces,
 )
-from mixpose.extraction.ellipse import EllipseRules, Rim, are_waisted, find_rims
+from mixpose.extraction.ellipse import are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.shape import longer_than_alike, off_centre
+from mixpose.extraction.shape import off_centre
 from mixpose.extraction.single_spots import all_spots
-from mixpose.extraction.spots import SpotRules, come_apart
-from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
-from mixpose.records import Floats, Image, PointPattern
-
-
-@dataclass(frozen=True)
-class BlobRules:
-    """What a blob is."""
-
-    threshold: ThresholdRules = ThresholdRules()
-    contours: ContourRules = ContourRules()
-    spots: SpotRules = SpotRules()
-    rims: EllipseRules = EllipseRules()
-    small_area: float = constant(
-        100.0, "px up to which the centroid of grey values is the better centre, above it the rim"
-    )
-    solidity: float = constant(
-        0.9, "of its convex hull, that a blob without an elliptical rim fills"
-    )
-    waist: float = constant(1.0, "px below its hull, at least, of an outline between two")
-    step: int = constant(3, "px, width of the rings between which the step at an outline is taken")
-    level_ratio: float = constant(
-        1.4, "by which the level is higher at which what has no shape is searched again"
-    )
-    core_ratio: float = constant(
-        3.0, "peak by median from which a core may be the feature, the rest what it lights"
-    )
-    large: float = constant(20.0, "px: the radius from which what is seen of a rim locates a disk")
-    whole: float = constant(0.97, "of the rim that is seen of whole disks")
-    exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
-    rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
-    off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
-    alike: int = constant(3, "others of one size, length and direction: by chance hardly so many")
-    by_rim: float = constant(0.3, "of what grey values show, that what is seen of a rim is off by")
-    beside: float = constant(2.0, "px outside of a rim that its grey values reach: optics blur it")
-    usual: float = constant(3.0, "of the lower quartile, beyond which grey values show a cut: 4 %")
-    finest: float = constant(0.01, "px, that this is at least: pixels alone make as much")
-
-
-class Blob(NamedTuple):
-    """One blob: centre in pixels of the window, area in px, and the rim of a disk."""
-
-    u: float
-    v: float
-    area: float
-    length: float = 1.0  # by width
-    turn: float = 0.0  # of its length from the rows, radians
-    rim: Rim | None = None
-    off: float | None = None  # px by which its centre may be off, where its grey values tell
-    carries: bool = False  # whether it has something far brighter on it: features, or a highlight
+from mixpose.extraction.spots import come_apart
+from mixpose.extraction.threshold import Foreground, Window, above, foreground
+from mixpose.records import Image, PointPattern
 
 
 def extract_blobs(
@@ -124,45 +74,6 @@ def extract_all(
         deviations = deviations_of(blobs, usual, rules)
         patterns.append(PointPattern(points + window[:2], np.ones(len(points)), deviations, radii))
     return patterns
-
-
-def usually_off(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> float:
-    """By how much centres of whole blobs seem off for noise, px: the lower quartile."""
-    told = sorted([blob.off for blob in blobs if blob.off is not None])
-    return max(told[(len(told) - 1) // 4] if told else 0.0, rules.finest)
-
-
-def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRules()) -> Floats:
-    """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
-
-    A disk of which something is hidden, or that is merged with something, is longer than wide by as
-    much as its centre is off, in radii.  So are oblique ones and streaks, but several alike, and
-    with all of a rim.  What little is hidden shows in grey values, beyond what noise makes.
-    """
-    deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
-    residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
-    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
-    longer = [blob.length / typical[0] - 1 for blob in blobs]
-    margins = [_roughness(blob, residual, rules) for blob in blobs]
-    if any(one > margin for one, margin in zip(longer, margins)):  # as a rule all are round
-        shapes = np.array([(blob.area, blob.length, blob.turn) for blob in blobs])
-        longer = np.minimum(longer, longer_than_alike(shapes, rules.alike)).tolist()
-    for k, (blob, margin) in enumerate(zip(blobs, margins)):
-        is_cut_rim = blob.rim is not None and margin < math.inf
-        off, share = blob.off or 0.0, rules.by_rim if is_cut_rim else 1.0
-        shown = share * off if off > rules.usual * usual else 0.0
-        radius = math.sqrt(blob.area / math.pi)
-        deviations[k] = max(rules.off_centre * radius * (longer[k] - margin), shown)
-    return deviations
-
-
-def _roughness(blob: Blob, residual: float, rules: BlobRules) -> float:
-    """By how much a whole blob may be longer than others; all of a rim tells by itself."""
-    radius, rim = math.sqrt(blob.area / math.pi), blob.rim
-    if rim is None:
-        return rules.rough / math.pow(radius, 1.5)
-    is_cut = rim.coverage < rules.whole or rim.residual > rules.exact * residual
-    return 0.0 if radius < rules.large and is_cut else math.inf
 
 
 @dataclass(eq=False)
