@@ -72,12 +72,13 @@ def test_what_glows_has_a_size_of_its_own_in_each_sensor_and_disks_have_one() ->
         glowing = glowing.followed({"left": left, "right": right + 0.7}, RULES)
         disks = disks.followed({"left": left, "right": right}, RULES)
     for sizes, off in ((glowing, 0.7), (disks, 0.0)):
-        assert sizes.centre("left", RULES) == pytest.approx(np.log(RADIUS), abs=0.03)
-        assert sizes.centre("right", RULES) == pytest.approx(np.log(RADIUS) + off, abs=0.03)
+        left, right = sizes.centres(["left", "right"], RULES)
+        assert left == pytest.approx(np.log(RADIUS), abs=0.03)
+        assert right == pytest.approx(np.log(RADIUS) + off, abs=0.03)
         assert sizes.scatter(RULES) < 0.04  # of either by itself
     # a sensor that shows one spot, cut, for the first time: of disks the others tell it
     cut = {"new": np.log(RADIUS) + np.array([-0.5])}
-    assert disks.followed(cut, RULES).centre("new", RULES) > np.log(RADIUS) - 0.25
+    assert disks.followed(cut, RULES).centres(["new"], RULES)[0] > np.log(RADIUS) - 0.25
 
 
 def test_markers_told_to_be_of_several_sizes_are_whole_at_their_own(

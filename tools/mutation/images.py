@@ -269,8 +269,8 @@ _SIZES = (
     Mutant(
         "tracking-sizes-alike-in-all-sensors",
         "tracking/sizes.py",
-        "return self.mean + count / (count + rules.scatter**2 / apart) * off",
-        "return self.mean",
+        "self.mean + off * share * n / (share * n + least)",
+        "self.mean + 0 * off * share * n",
         "what glows seems cut in one of two cameras of other scales",
         ("test_tracking_sizes.py",),
     ),
@@ -309,7 +309,7 @@ _SIZES = (
     Mutant(
         "tracking-sizes-learnt-from-slivers",
         "tracking/sizes.py",
-        "weights = 1 - known.cut(own - known.centre(name, rules), rules)",
+        "weights = 1 - known.cut(own - centre, rules)",
         "weights = np.ones(len(own))",
         "cut spots make markers small and sizes uncertain",
         ("test_tracking_sizes.py",),

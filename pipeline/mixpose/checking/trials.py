@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, pairwise
+from itertools import chain, pairwise, takewhile
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -339,8 +340,9 @@ def late_sensor(session: Session, frames: Frames) -> str | None:
             [view for view in now if view.name != name] + [v for v in after if v.name == name]
             for (_, now), (_, after) in pairwise(frames)
         ]
-        are_ok, offs = zip(*[_met(session, *one) for one in zip(numbers, given)], strict=True)
-        if all(are_ok) and max(offs) < _CLEARER * min(as_they_are):
+        met = takewhile(itemgetter(0), (_met(session, *one) for one in zip(numbers, given)))
+        offs = [off for _, off in met]
+        if len(offs) == len(given) and max(offs) < _CLEARER * min(as_they_are):
             return f"{name!r} is a frame late: with each of its frames given to the one before"
     return None
 

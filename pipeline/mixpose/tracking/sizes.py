@@ -56,18 +56,18 @@ class Sizes:
         variance = (self.squares + prior * rules.scatter**2) / (self.count + prior)
         return max(float(np.sqrt(variance)), rules.least)
 
-    def centre(self, sensor: str, rules: SizeRules) -> float:
-        """The logarithm of R in a sensor: its own mean, drawn to that of all by ω."""
+    def centres(self, sensors: Sequence[str], rules: SizeRules) -> list[float]:
+        """The logarithm of R in each sensor: its own mean, drawn to that of all by ω."""
         # of few spots each may be cut
         told = {
-            name: (count / (count + rules.scatter_counts), mean - self.mean)
+            name: (count / (count + rules.scatter_counts), count, mean - self.mean)
             for name, (count, mean) in self.sensors.items()
         }
-        squares = sum([share * off * off for share, off in told.values()])
-        apart = (rules.apart**2 + squares) / (1 + sum([share for share, _ in told.values()]))
-        share, off = told.get(sensor, (0.0, 0.0))
-        count = share * self.sensors[sensor][0] if share else 0.0
-        return self.mean + count / (count + rules.scatter**2 / apart) * off
+        squares = sum([share * off * off for share, _, off in told.values()])
+        apart = (rules.apart**2 + squares) / (1 + sum([share for share, *_ in told.values()]))
+        own = [told.get(name, (0.0, 0.0, 0.0)) for name in sensors]
+        least = rules.scatter**2 / apart
+        return [self.mean + off * share * n / (share * n + least) for share, n, off in own]
 
     def cut(self, off: Floats, rules: SizeRules) -> Floats:
         """Chances (n,) that spots are cut or merged, by ln r/s less the sensor's centre (n,)."""
@@ -89,8 +89,8 @@ class Sizes:
         known = replace(known, sensors=begun | dict(known.sensors))
         sensors = {name: (rules.memory * n, mean) for name, (n, mean) in self.sensors.items()}
         count, squares = rules.memory * self.count, rules.memory * self.squares
-        for name, own in logs.items():
-            weights = 1 - known.cut(own - known.centre(name, rules), rules)
+        for (name, own), centre in zip(logs.items(), known.centres([*logs], rules), strict=True):
+            weights = 1 - known.cut(own - centre, rules)
             before, mean = sensors.get(name, (0.0, begun[name][1]))
             after = before + float(weights.sum())
             mean += float(weights @ (own - mean)) / max(after, 1e-12)
@@ -112,13 +112,13 @@ def weighed_by_size(
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
     seen_otherwise, scatter = list(views), sizes.scatter(rules)
     every = _scales(at.J[:, 0]) * _by_radius(body.node_radii)
-    for k, view in enumerate(views):
+    centres = sizes.centres([view.name for view in views], rules)
+    for k, (view, centre) in enumerate(zip(views, centres, strict=True)):
         pattern = view.observation.pattern
         if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
         scales = every[k, seen[_nearest(pattern.points, at.y[k, 0, seen])]]
-        centre = sizes.centre(view.name, rules)
         off, whole = np.log(pattern.radii / scales) - centre, scales * np.exp(centre)
         smaller = np.exp(-2 * np.hypot(off, scatter))
         # of each of two coordinates
