@@ -8,12 +8,12 @@ from bodies_in_view import CAMERAS, at, body
 from detections import ALL_FREE
 from numpy.typing import NDArray
 
-from mixpose.body import Body
+from mixpose.body import Body, SegmentFeature
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
-from mixpose.search import search_copies
+from mixpose.search import SeenTogether, search_copies
 from mixpose.search.copies import _Candidates, _shared_out
 from mixpose.search.from_points import feature_triangles
 from mixpose.search.problem import SearchBudget
@@ -26,7 +26,7 @@ HEAD = body("head", np.array([[0.0, 0, 0], [42.0, 0, 0], [11.0, 49.5, 0]]))
 PLACES = [at(-150.0), at(-60.0, 90.0, turn=0.7), at(40.0, -80.0, turn=-0.5), at(130.0, 30.0)]
 
 
-def seen(bodies: list[Body], poses: list[Floats], seed: int, cameras: int = 2) -> list[View]:
+def seen(bodies: list[Body], poses: list[Floats], seed: int, cameras: int = 2) -> SeenTogether:
     """With 0.15 px of noise, and ten false spots each."""
     rng, views = np.random.default_rng(seed), []
     for name, one in list(CAMERAS.items())[:cameras]:
@@ -36,7 +36,7 @@ def seen(bodies: list[Body], poses: list[Floats], seed: int, cameras: int = 2) -
         )
         points = points + 0.15 * rng.standard_normal(points.shape)
         views.append(View(name, one, Observation(PointPattern(points, np.ones(len(points))), 1.5)))
-    return views
+    return SeenTogether(views)
 
 
 def test_equal_triangles_and_another_one_are_found_at_once_each_in_its_place() -> None:
@@ -79,17 +79,23 @@ def test_a_rival_is_a_pose_of_the_same_body_that_is_not_outdone(
     # both meet the same three detections
     found = [[(PLACES[0], 50.0)], []]
     found[kind].append((PLACES[1], 50.0 - less))
-    rivals = [
-        _Candidates(
+    rivals = {
+        k: _Candidates(
             np.array([T for T, _ in some]).reshape(-1, 4, 4),
             np.array([evidence for _, evidence in some]),
             np.zeros(len(some)),
             np.tile(np.arange(3), (len(some), 1)),
         )
-        for some in found
-    ]
+        for k, some in enumerate(found)
+    }
     (copy,) = _shared_out(rivals, [TRIANGLE, HEAD], SearchBudget())
     assert (copy.rival is not None) == is_rival
+
+
+def test_beside_a_body_of_strokes_one_of_points_is_found() -> None:
+    strokes = Body("strokes", tuple(SegmentFeature(p, 1.1 * p + 4.0) for p in TRIANGLE.means))
+    found = search_copies(seen([TRIANGLE], PLACES[:1], 0), [strokes, TRIANGLE], ALL_FREE)
+    assert [one.kind for one in found] == [1]
 
 
 def test_one_camera_sees_no_points_in_space() -> None:

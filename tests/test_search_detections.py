@@ -30,7 +30,7 @@ def test_features_that_share_a_detection_count_once(
     views = seen_by(pinhole_cameras, paper_body)
     detections = sensor_detections(views, paper_body)
     problem = SearchProblem(detections, paper_body, ALL_FREE, np.eye(4))
-    images = [label_image(problem, *camera) for camera in problem.cameras]
+    images = [label_image(*camera, problem.reach(camera[0])) for camera in problem.cameras]
     collapsed = TRUTH.copy()
     # far behind its place the whole body falls within one disk
     collapsed[:3, 3] = [50.0, 4e6, 40.0]

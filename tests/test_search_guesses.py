@@ -36,7 +36,7 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
     y = camera.project(transform(TRUTH, EIGHT.means))[0]
     detections = sensor_detections([view_of("0", camera, y)], EIGHT)
     problem = SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4))
-    images = [label_image(problem, *camera) for camera in problem.cameras]
+    images = [label_image(*camera, problem.reach(camera[0])) for camera in problem.cameras]
     towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     normals[5:] *= -1

@@ -1,6 +1,10 @@
 """Search: the first pose from nothing, over all orientations and positions."""
 
-from mixpose.search.copies import Copy as Copy, search_copies as search_copies
+from mixpose.search.copies import (
+    Copy as Copy,
+    SeenTogether as SeenTogether,
+    search_copies as search_copies,
+)
 from mixpose.search.from_points import (
     TriangulatedPoints as TriangulatedPoints,
     triangulate as triangulate,

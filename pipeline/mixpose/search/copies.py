@@ -7,8 +7,9 @@ set of poses of which no two have the same detections, the likelier having what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,16 @@ from mixpose.search.poses import (
     odds_at,
     unlike,
 )
-from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
+from mixpose.search.problem import (
+    THOROUGH,
+    SearchBudget,
+    SearchProblem,
+    SensorDetections,
+    is_pointlike,
+    largest_error,
+    sensor_detections,
+)
+from mixpose.sensors import Rays
 
 
 class _Candidates(NamedTuple):
@@ -44,6 +54,40 @@ class _Candidates(NamedTuple):
     evidence: Floats  # (K,) log odds against clutter, if they had not been chosen to fit
     gains: Floats  # (K,) nats that what is known before the frame adds to them
     numbers: Indices  # (K, L N) detections of all cameras that they meet; -1 for none
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTogether:
+    """What cameras see together, for whichever body: worked out once, when it is asked for."""
+
+    views: Sequence[View] = ()
+    rules: JudgementRules = JudgementRules()
+    budget: SearchBudget = THOROUGH
+
+    @cached_property
+    def detections(self) -> list[SensorDetections]:
+        """Of all views that saw something."""
+        return sensor_detections(self.views)
+
+    @cached_property
+    def _cameras(self) -> list[tuple[SensorDetections, Rays, float]]:
+        """Those with lines of sight, and the largest errors of detections."""
+        return [
+            (one, one.rays, largest_error(one, self.rules)) for one in self.detections if one.rays
+        ]
+
+    @cached_property
+    def points(self) -> TriangulatedPoints | None:
+        """Where rays of two cameras or more meet; None of fewer."""
+        if len(self._cameras) < 2:
+            return None
+        _, rays, reaches = zip(*self._cameras, strict=True)
+        return triangulate(rays, reaches, self.budget.min_sine)
+
+    @cached_property
+    def images(self) -> list[LabelImage]:
+        """The detections of each camera."""
+        return [label_image(*camera) for camera in self._cameras]
 
 
 class Copy(NamedTuple):
@@ -56,40 +100,39 @@ class Copy(NamedTuple):
 
 
 def search_copies(
-    views: Sequence[View],
+    seen: SeenTogether,
     bodies: Sequence[Body],
     free: Mask,
-    rules: JudgementRules = JudgementRules(),
-    budget: SearchBudget = THOROUGH,
     known: Callable[[int, Floats], Floats] = lambda kind, poses: np.zeros(len(poses)),
 ) -> list[Copy]:
     """Find poses of bodies, any number of each, that explain a frame together; most evident first.
 
-    By detections of two cameras or more that meet in space; there are none without.  What is
-    `known` of a kind's poses (K, 4, 4) before the frame are nats (K,) that they gain.
+    By detections of two cameras or more that meet in space; there are none without, nor of a body
+    whose features are no points.  What is `known` of a kind's poses (K, 4, 4) before the frame are
+    nats (K,) that they gain.
     """
-    detections = sensor_detections(views, bodies[0])
-    problems = [SearchProblem(detections, body, free, np.eye(4), rules, budget) for body in bodies]
-    cameras = problems[0].cameras
-    if len(cameras) < 2 or not free.all():
+    kinds = [k for k, body in enumerate(bodies) if is_pointlike(body)]
+    points, budget = seen.points, seen.budget
+    if points is None or not kinds or not free.all():
         return []
-    reaches = [problems[0].reach(sensor) for sensor, _ in cameras]
-    triangles = [feature_triangles(one, 6 * budget.sample, budget.min_sine) for one in bodies]
+    problems = [
+        SearchProblem(seen.detections, bodies[k], free, np.eye(4), seen.rules, budget)
+        for k in kinds
+    ]
+    triangles = [feature_triangles(bodies[k], 6 * budget.sample, budget.min_sine) for k in kinds]
     longest = max(float(tree.data.max(initial=0.0)) for _, tree in triangles)
-    points = triangulate([rays for _, rays in cameras], reaches, budget.min_sine)
     # a point that may be anywhere in a body tells nothing of it
     points = TriangulatedPoints._make(one[points.tolerance < longest / 2] for one in points)
     points = by_promise(problems[0], points)
     triples = _near_triples(points, longest, budget.batch)
-    images = [label_image(problems[0], *camera) for camera in cameras]
     poses = [
         of_triples(problem, points, own, triples)
         for problem, own in zip(problems, triangles, strict=True)
     ]
-    found = [
-        _candidates(problem, some, images, partial(known, kind))
-        for kind, (problem, some) in enumerate(zip(problems, poses, strict=True))
-    ]
+    found = {
+        k: _candidates(problem, some, seen.images, partial(known, k))
+        for k, problem, some in zip(kinds, problems, poses, strict=True)
+    }
     return _shared_out(found, bodies, budget)
 
 
@@ -143,14 +186,15 @@ def _are_alike(body: Body, a: Floats, b: Floats, budget: SearchBudget) -> bool:
 
 
 def _shared_out(
-    found: Sequence[_Candidates], bodies: Sequence[Body], budget: SearchBudget
+    found: Mapping[int, _Candidates], bodies: Sequence[Body], budget: SearchBudget
 ) -> list[Copy]:
     """The poses of which no two have the same detections, the likeliest first."""
-    kinds = np.repeat(np.arange(len(found)), [len(one.poses) for one in found]).tolist()
-    poses = np.concatenate([one.poses for one in found])
-    evidence = np.concatenate([one.evidence for one in found])
-    likely = evidence + np.concatenate([one.gains for one in found])
-    rows = [row[row >= 0].tolist() for one in found for row in one.numbers]
+    some = list(found.values())
+    kinds = np.repeat(list(found), [len(one.poses) for one in some]).tolist()
+    poses = np.concatenate([one.poses for one in some])
+    evidence = np.concatenate([one.evidence for one in some])
+    likely = evidence + np.concatenate([one.gains for one in some])
+    rows = [row[row >= 0].tolist() for one in some for row in one.numbers]
     owners, rivals = dict[int, int](), dict[int, int]()
     order = np.argsort(-likely, kind="stable")
     kept = list[int]()

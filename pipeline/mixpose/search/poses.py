@@ -38,8 +38,8 @@ class LabelImage(NamedTuple):
     cells: NDArray[np.int32]
 
 
-def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) -> LabelImage:
-    """Draw the detections of a camera."""
+def label_image(sensor: SensorDetections, rays: Rays, reach: float) -> LabelImage:
+    """Draw the detections of a camera, disks of radius `reach` in px."""
     middle = rays.directions.mean(axis=0)
     middle /= np.linalg.norm(middle)
     side = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
@@ -56,7 +56,7 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     # how many px a unit of the plane is at each detection, whatever the lens
     J = sensor.view.sensor.linearise(points)[1]
     per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * plane[:, 2] * unit
-    radii = problem.reach(sensor) / np.where(per_unit > 0, per_unit, 1.0)
+    radii = reach / np.where(per_unit > 0, per_unit, 1.0)
     # at 84° from the middle a ray misses the plane
     inside = plane[:, 2] > min(0.1, 0.5 * plane[:, 2].max())
     places, radii = (plane[:, :2] / plane[:, 2:] / unit)[inside], radii[inside]

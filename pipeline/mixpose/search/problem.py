@@ -109,8 +109,8 @@ class SensorDetections:
         return mean, float(np.sqrt(variance))
 
 
-def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetections]:
-    """Detections of all views that saw something."""
+def sensor_detections(views: Sequence[View], body: Body | None = None) -> list[SensorDetections]:
+    """Detections of all views that saw something; of densities the peaks, if a body has points."""
     sensors = []
     for view in views:
         seen, pattern = view.observation, view.observation.pattern
@@ -119,13 +119,18 @@ def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetection
         points = np.zeros((0, seen.dimension))
         if not isinstance(pattern, GridPattern):
             points = pattern.points[pattern.weights > 0]
-        elif seen.dimension == 2 and is_pointlike(body):
+        elif seen.dimension == 2 and body is not None and is_pointlike(body):
             points = peaks(pattern, seen.sigma)
         if len(points):
             seen = Observation(PointPattern(points, np.ones(len(points))), seen.sigma)
         even = replace(view, observation=seen)
         sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
     return sensors
+
+
+def largest_error(sensor: SensorDetections, rules: JudgementRules) -> float:
+    """Of a sensor's detections, in its units."""
+    return rules.noise.errors.met * sensor.sigma
 
 
 def can_fix(detections: Sequence[SensorDetections], body: Body, free: Mask) -> bool:
@@ -182,7 +187,7 @@ class SearchProblem:
 
     def reach(self, sensor: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""
-        return self.rules.noise.errors.met * sensor.sigma
+        return largest_error(sensor, self.rules)
 
     def allowed(self, poses: Floats) -> Floats:
         """Poses (H, 4, 4) with the held directions of the reference."""

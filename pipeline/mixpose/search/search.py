@@ -104,7 +104,7 @@ class _Search:
     def __init__(self, problem: SearchProblem) -> None:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
-        self._images = [label_image(problem, *camera) for camera in cameras]
+        self._images = [label_image(*camera, problem.reach(camera[0])) for camera in cameras]
         self._enough = self._budget.sufficient * sum(  # detections explained
             min(len(rays), len(self._body)) for _, rays in cameras
         )

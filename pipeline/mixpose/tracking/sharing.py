@@ -20,7 +20,7 @@ from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Mask
-from mixpose.search import search_copies
+from mixpose.search import SeenTogether, search_copies
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
@@ -41,7 +41,7 @@ class Explanation:
     frame: Frame
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
-    rest: Sequence[View] = ()  # what no body has
+    rest: SeenTogether = SeenTogether()  # what no body has
     told: Verdict | None = None  # the decision without `rest`, where it is at hand
 
     @cached_property
@@ -76,8 +76,7 @@ class Sharing:
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._judge_again()
-        left = self._nobody.part(self._claims().left(-1))
-        rest = [view for view in left if not view.observation.is_empty]
+        rest = self._rest()
         # of identical bodies another one is no surprise
         alone = [k for k in self.claimed if self.bodies[k].instance is None]
         told = [(k, self.found[k]) for k in alone]
@@ -100,11 +99,10 @@ class Sharing:
         """
         waiting = [k for k in range(len(self.bodies)) if k not in self.claimed]
         kinds = list({id(self.bodies[k].body): self.bodies[k] for k in waiting}.values())
-        views = self._nobody.part(self._claims().left(-1))
-        if self._shared is None or any(view.sensor.dimension != 2 for view in views):
+        if self._shared is None or any(view.sensor.dimension != 2 for view in self.views):
             return {}
-        seen, rules = [view for view in views if not view.observation.is_empty], kinds[0].rules
-        bodies, self.looked = [one.body for one in kinds], len(seen) > 1
+        rest, bodies = self._rest(), [one.body for one in kinds]
+        self.looked = len(rest.views) > 1
         groups = [[k for k in waiting if self.bodies[k].body is body] for body in bodies]
         data = {k: self._frame(k, self._nobody.left(k)) for k in waiting}
 
@@ -112,7 +110,7 @@ class Sharing:
             """What the likeliest of identical bodies lets expect."""
             return np.asarray(np.max([data[k].gains(poses) for k in groups[kind]], axis=0))
 
-        copies = search_copies(seen, bodies, kinds[0].free, rules.judgement, rules.search, known)
+        copies = search_copies(rest, bodies, kinds[0].free, known)
         found = dict[int, Starts]()
         for number, group in enumerate(groups):
             some = [one for one in copies if one.kind == number]
@@ -287,6 +285,12 @@ class Sharing:
             claims = self._nobody.taken(met)
             self.taken = met, claims
         return claims
+
+    def _rest(self) -> SeenTogether:
+        """What no body has by now."""
+        left, rules = self._nobody.part(self._claims().left(-1)), self.bodies[0].rules
+        seen = [view for view in left if not view.observation.is_empty]
+        return SeenTogether(seen, rules.judgement, rules.search)
 
     def _met(self, k: int) -> Met:
         """What the most evident pose of a body meets; of each explanation once."""

@@ -93,7 +93,7 @@ class Tracker(Setup):
         ranked = self.explain(data)
         verdict = decided(data, ranked)
         if verdict.best is not None and verdict.status == "ok":
-            verdict = with_second(verdict, data, left_by(verdict.best, data.still or data.views))
+            verdict = with_second(verdict, data, left_by(verdict.best, data))
         after = followed(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 

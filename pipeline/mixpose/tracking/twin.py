@@ -17,8 +17,7 @@ from scipy.special import expit, logit
 
 from mixpose.body import thickness
 from mixpose.judgement import APART, Alternative, ScoredPose, Second, Verdict, is_sure
-from mixpose.objective import View
-from mixpose.search import Candidate, Copy, search_copies
+from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of
@@ -32,12 +31,12 @@ def is_flat(data: Setup) -> bool:
     return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
-def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
+def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     """The same; in doubt where what is left of the frame's views shows the body once more.
 
     Either may be it then, whichever was followed so far; and the other one goes on to be the other.
     """
-    best, left = verdict.best, {one.name: one.observation.cells for one in rest}
+    best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
     if best is None or verdict.status != "ok":
         return verdict
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
@@ -64,18 +63,18 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     return verdict.doubted([Alternative(TWICE, either)])
 
 
-def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
-    """What a pose leaves of the views; those without single detections leave nothing."""
+def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
+    """What a pose leaves of a frame; views without single detections leave nothing."""
     numbers = dict(zip(pose.matches.names, pose.matches.detections, strict=True))
     rest = []
-    for view in views:
+    for view in data.still or data.views:
         points = view.observation.points
         is_left = np.ones(0 if points is None else len(points), dtype=np.bool_)
         if len(is_left) and view.name in numbers:
             is_left[numbers[view.name][numbers[view.name] >= 0]] = False
         if is_left.any():
             rest.append(replace(view, observation=view.observation.only(is_left)))
-    return rest
+    return SeenTogether(rest, data.rules.judgement, data.rules.search)
 
 
 def seen_beside(a: ScoredPose, b: ScoredPose) -> str:
@@ -132,15 +131,15 @@ def _log_odds_of_one(data: Frame) -> float:
     return float(logit(data.rules.judgement.detection.probability))
 
 
-def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
+def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
     """A pose that is sure by itself and may be the body's as well as the best one.
 
     Where sensors agree about that one, they do about this one.
     """
     agree = min(int(np.count_nonzero(best.used.met)), 2)
-    rest = data.alone(views=views, still=(), starts=())
-    likelihood = likelihood_of(rest)
-    for start in _starts(data, best, rest):
+    alone = data.alone(views=rest.views, still=(), starts=())
+    likelihood = likelihood_of(alone)
+    for start in _starts(alone, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
         is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
@@ -149,13 +148,13 @@ def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> Scored
     return None
 
 
-def _where_it_was(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
+def _where_it_was(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
     """The second pose of the frame before, in this one."""
-    if data.track.twice == -math.inf or not views:
+    if data.track.twice == -math.inf or not rest.views:
         return None
     if (start := next(_elsewhere(data, best), None)) is None:
         return None
-    likelihood = likelihood_of(data.seen_otherwise(views=views, still=(), starts=()))
+    likelihood = likelihood_of(data.seen_otherwise(views=rest.views, still=(), starts=()))
     return likelihood.judge(likelihood.fit(start), start)
 
 
@@ -167,13 +166,12 @@ def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
             yield Start(branch.T_world_object, branch.uncertainty)
 
 
-def _starts(data: Frame, best: ScoredPose, rest: Frame) -> Iterator[Start]:
+def _starts(alone: Frame, rest: SeenTogether) -> Iterator[Start]:
     """Where a second pose may be, as a search finds."""
-    views, rules = rest.views, data.rules
     found: Sequence[Copy | Candidate]
-    if len(views) > 1:  # quickly, by points that cameras see together
-        found = search_copies(views, [data.body], data.free, rules.judgement, rules.search)
+    if len(rest.views) > 1:  # quickly, by points that cameras see together
+        found = search_copies(rest, [alone.body], alone.free)
     else:
-        found = candidates_of(rest)
-    for one in found[: rules.proposals.seconds]:
-        yield Start(one.T_world_object, data.close)
+        found = candidates_of(alone)
+    for one in found[: alone.rules.proposals.seconds]:
+        yield Start(one.T_world_object, alone.close)
