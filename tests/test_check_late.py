@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
 import mixpose
 from mixpose.checking.trials import late_sensor
+from mixpose.cli.app import CheckRequest
+from mixpose.cli.check import check_session
 from mixpose.frames import pair
 from mixpose.objective import View
 from mixpose.runner import observe, open_sources
@@ -31,3 +37,15 @@ def test_a_sensor_whose_frames_belong_to_those_before_is_named() -> None:
     # of frames with gaps nobody knows
     assert late_sensor(session, list(zip((5, 7, 8), late, strict=True))) is None
     assert late_sensor(session, list(zip(numbers, late, strict=True))[:2]) is None
+
+
+def test_check_names_a_sensor_that_is_late_and_not_where_it_might_stand_instead(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(SESSION, tmp_path)
+    for n in range(8):
+        shutil.copy(SESSION.with_name(f"left{n + 1:04d}.png"), tmp_path / f"left{n:04d}.png")
+        shutil.copy(SESSION.with_name(f"right{n:04d}.png"), tmp_path)
+    check_session(CheckRequest(tmp_path / SESSION.name))
+    (warning,) = re.findall(r"^warning +(.*)$", capsys.readouterr().out, re.MULTILINE)
+    assert warning.startswith("'right' is a frame late: ")

@@ -17,7 +17,7 @@ from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.trials import diagnosis
+from mixpose.checking.trials import IN_A_ROW, Diagnosis, diagnosis, late_sensor
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
@@ -36,6 +36,7 @@ CAUSES = (
 
 _SEEN = 0.1  # of a sensor's density, from which it shows the body, even beside 60 false features
 _LIKELY = 0.5  # confidence from which a pose that is not sure is more than clutter
+_ROWS = 2  # of frames in a row that are asked for a sensor that is late; the body may rest in one
 _FIRST = 40  # frames of videos among which they are: to get far into one takes as long as all of it
 
 
@@ -74,9 +75,8 @@ def geometry_doubts(
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
     found = diagnosis(session, frames, others, further)
-    if found.likeliest:
-        mended = found.likeliest.of(session, frames[0][1])
-        return Doubts((f"{found.change}, {found.gain}",), mended)
+    if (told := _told(recording, frames, found)) is not None:
+        return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()
     numbers = ", ".join(str(number) for number in sorted(n for n, _ in frames[: found.count]))
     met = f", features met to {found.rms:.2g} sigma in the median" if found.good else ""
@@ -88,6 +88,21 @@ def geometry_doubts(
         text = f"only {tried}: are the markers found there, and is the body in view?"
         doubts = replace(doubts, unexplained=f"{text} mixpose inspect shows a frame")
     return doubts
+
+
+def _told(recording: _Recording, frames: Frames, found: Diagnosis) -> Doubts | None:
+    """What frames tell to be wrong, None of nothing; of a sensor that is late those in a row."""
+    session, change = recording.session, found.likeliest
+    # it does as if it stood elsewhere: some values may suit it
+    if (change.values if change else not found.good) and len(recording.sources) > 1:
+        for number, _ in frames[:_ROWS]:
+            row = [(each.number, observe(session, each)) for each in recording.in_a_row(number)]
+            if late := late_sensor(session, row):
+                text = f"{late}, features are met far closer, as in frame {row[0][0]}"
+                return Doubts((text,), tried=text)
+    if change is None:
+        return None
+    return Doubts((f"{found.change}, {found.gain}",), change.of(session, frames[0][1]))
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,12 @@ class _Recording:
         numbers = sorted(set.intersection(*full) or set.intersection(*[{*each} for each in shown]))
         is_video = any(isinstance(source, Video) for source in self.sources.values())
         return numbers[:_FIRST] if is_video else numbers
+
+    def in_a_row(self, number: int) -> Iterator[FrameSet]:
+        """That frame and the next ones, or the last ones, of those that all sensors have."""
+        known = sorted(set.intersection(*({*each.numbers} for each in self.surveys.values())))
+        first = max(min(known.index(number), len(known) - IN_A_ROW), 0)
+        yield from self.read(known[first : first + IN_A_ROW])
 
     def _shown(self) -> list[dict[int, float]]:
         """How much of the body each frame may show, by sensor."""

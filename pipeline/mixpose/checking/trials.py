@@ -26,7 +26,9 @@ from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.session import Session
 
-_FRAMES = 3  # in a row
+IN_A_ROW = 3
+"""Frames by which a sensor is told to be late."""
+
 _CLEARER = 0.5  # of what is met off: frames of other moments are met several times as far off
 
 
@@ -329,9 +331,9 @@ def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
 
 def late_sensor(session: Session, frames: Frames) -> str | None:
     """The sensor that is a frame late, in words; None of frames that are not in a row."""
-    frames = frames[:_FRAMES]
+    frames = frames[:IN_A_ROW]
     numbers = [number for number, _ in frames]
-    if len(numbers) < _FRAMES or len({*np.diff(numbers).tolist()}) != 1:
+    if len(numbers) < IN_A_ROW or len({*np.diff(numbers).tolist()}) != 1:
         return None
     as_they_are = [_met(session, *one)[1] for one in frames]
     for setup in session.sensors:
