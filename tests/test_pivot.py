@@ -250,3 +250,21 @@ def test_all_but_the_tip_stays_byte_for_byte(
     (tip,) = [line for line in after.split(ends) if line.startswith(b"tip = [")]
     assert b"one standard deviation" in tip
     assert after.replace(tip + ends, b"") == as_bytes(head + rest)
+
+
+def test_a_few_wrong_poses_lead_no_tip_astray() -> None:
+    """Least squares of all begin so far off that none of the poses seems to be wrong."""
+    for seed in range(20):
+        pivoting, rng = run_of(seed), np.random.default_rng(seed)
+        poses, wrong = pivoting.poses.copy(), rng.choice(100, 12, replace=False)
+        poses[wrong, :3, :3] = rigid.rotation_matrix(rng.uniform(-3, 3, (12, 3)))
+        poses[wrong, :3, 3] += rng.uniform(-400, 400, (12, 3))
+        tip = find_tip(pivoting._replace(poses=poses))
+        assert 12 <= tip.left_out <= 13
+        assert np.linalg.norm(tip.place - TIP) < 5 * np.sqrt(np.trace(tip.covariance))
+
+
+def test_parts_that_err_by_chance_disagree_as_often_as_rules_say() -> None:
+    told = [find_tip(run_of(seed)).lasting > 1 for seed in range(150)]
+    # 0.4 ± 0.04
+    assert abs(np.mean(told) - PivotRules().accident) < 0.12

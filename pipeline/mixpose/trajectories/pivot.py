@@ -35,10 +35,11 @@ class PivotRules:
         1.5, "times what errors alone swing a direction by: of ten poses they reach 1.45 by 0.1 %"
     )
     steps: int = constant(20, "to the likeliest tip and poses: 4 do where turns err by 1 deg")
+    drawn: int = constant(100, "triples to begin with: 3 of 10 poses wrong, one in 3 has none")
     foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
     parts: int = constant(5, "of the recording that are held out in turn")
     accident: float = constant(
-        0.2, "chance of parts that disagree as much: errors last, and more poses tell no more"
+        0.4, "chance of parts that disagree as much: errors last; at 0.2 some that do are missed"
     )
     uneven: float = constant(
         3.0, "ratio of deviations from which a direction is said to lack turns"
@@ -94,12 +95,13 @@ def find_tip(pivoting: Pivoting) -> Tip:
         )
     turns, directions = turns_seen(pivoting)
     _require_turns(pivoting, turns, directions, 1.0, rules)
-    kept = np.ones(len(pivoting.poses), bool)
-    for _ in range(10):
+    kept = _alike(pivoting, rules)
+    for turn in range(10):
         x, information, squared = _solved(pivoting, kept, rules)
         # of three numbers, the median of χ² is 2.37; a slipping tip makes all of them larger
         usual = max(1.0, float(np.median(squared[kept])) / 2.366)
         now = squared <= usual * chdtri(3, rules.foreign)
+        now &= kept | (turn < 5)  # one that is on the edge comes and goes
         if (now == kept).all() or now.sum() < rules.fewest:
             break
         kept = now
@@ -165,12 +167,32 @@ def _require_turns(
     )
 
 
+def _linear(pivoting: Pivoting) -> tuple[Floats, Floats]:
+    """Coefficients (N, 3, 6) of tip and point, and what they should make (N, 3)."""
+    A = np.concatenate([pivoting.poses[:, :3, :3], -pivoting.references[:, :3, :3]], axis=2)
+    return A, pivoting.references[:, :3, 3] - pivoting.poses[:, :3, 3]
+
+
+def _alike(pivoting: Pivoting, rules: PivotRules) -> Mask:
+    """The poses (N,) to begin with, which a tip and a point bring together about as well as most.
+
+    Those of three poses, of which the median of all is off least (Rousseeuw, J. Am. Stat. Assoc. 79
+    (1984) 871).
+    """
+    (A, b), rng = _linear(pivoting), np.random.default_rng(0)
+    some = rng.permuted(np.tile(np.arange(len(b)), (rules.drawn, 1)), axis=1)[:, :3]
+    x = np.linalg.pinv(A[some].reshape(-1, 9, 6)) @ b[some].reshape(-1, 9, 1)
+    off = np.linalg.norm(A @ x[:, None] - b[..., None], axis=(2, 3))
+    medians = np.median(off, axis=1)
+    # of three numbers as large by chance, the median of the length is 1.54 deviations
+    gate = medians.min() / 1.54 * np.sqrt(chdtri(3, rules.foreign))
+    return np.asarray(off[medians.argmin()] <= gate)
+
+
 def _solved(pivoting: Pivoting, kept: Mask, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
     """Tip and point (6,) by the poses that are kept; information (N, 6, 6) and χ² (N,) of each."""
-    R, R_reference = pivoting.poses[kept, :3, :3], pivoting.references[kept, :3, :3]
-    b = pivoting.references[kept, :3, 3] - pivoting.poses[kept, :3, 3]
-    A = np.concatenate([R, -R_reference], axis=2)
-    x = np.linalg.lstsq(A.reshape(-1, 6), b.ravel(), rcond=None)[0]
+    A, b = _linear(pivoting.part(kept))
+    x: Floats = np.linalg.lstsq(A.reshape(-1, 6), b.ravel(), rcond=None)[0].astype(np.float64)
     steps = np.zeros((len(pivoting.poses), 12))  # from the measured poses to those that fit
     for _ in range(rules.steps):
         rest, by_poses, by_x = _at_tip(pivoting, x, steps)
@@ -243,7 +265,9 @@ def _held_out(
         # of nested least squares the covariance of a difference is that of covariances
         differing = scale * (_of_tip(information[others]) - _of_tip(information))
         squared += float(away @ np.linalg.pinv(differing) @ away)
-    freedom = 3 * (rules.parts - 1)  # all of them differ from their own mean
+    # all of them differ from their own mean; two of n have n - 2 parts in common
+    freedom = 3 * (rules.parts - 1)
+    squared *= (rules.parts - 1) / rules.parts
     held_out = _rms(np.concatenate(rest))
     if squared <= chdtri(freedom, rules.accident):
         return held_out, 1.0, 1.0
