@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, PointFeature, symmetries
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame
 from mixpose.calibration.adjust import Adjusted, adjust
 from mixpose.calibration.bundle import Bundle
@@ -80,7 +81,8 @@ def adjusted(
 ) -> list[Learnt]:
     """Adjust bodies one by one, each by the detections that belong to no other.
 
-    Markers of which too few frames are left are dropped; bodies with fewer than three, too.
+    Markers of which too few frames are left are dropped; bodies with fewer than three, too.  What
+    may map onto itself is as `as_symmetric` has it.
     """
     learnt = []
     for body in bodies:
@@ -105,10 +107,30 @@ def adjusted(
                     residual=float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2))),
                     spread=_spread(body, clouds),
                 )
-                learnt.append(one)
+                learnt.append(as_symmetric(one, usual_reach(body.places, clouds)))
                 break
             points = points[kept]
     return learnt
+
+
+def as_symmetric(learnt: Learnt, reach: float) -> Learnt:
+    """The body as symmetric as it may be, where a frame that errs by `reach` cannot tell its turns.
+
+    In each frame that turn was taken which noise suits best, so that noise is learnt as the body's
+    own shape.  How far the markers were off their mean over all turns is in their covariances, as
+    nobody knows whether that is their own.
+    """
+    points = learnt.points
+    turns = symmetries(points, 2 * reach)
+    images = transform(turns, points)
+    nearest = np.array([cKDTree(points).query(each)[1] for each in images])
+    # of each turn, the image that lies at each marker
+    mean = images[np.arange(len(turns))[:, None], nearest.argsort(axis=1)].mean(axis=0)
+    off = np.linalg.norm(points - mean, axis=1)
+    if len(turns) == 1 or off.max() > reach:
+        return learnt
+    own = np.eye(3) * float(np.mean(off**2)) / 3
+    return replace(learnt, points=mean, covariances=learnt.covariances + own)
 
 
 def _frames_of(
