@@ -16,6 +16,7 @@ from mixpose.cli.check import check_session
 from mixpose.frames import pair
 from mixpose.objective import View
 from mixpose.runner import observe, open_sources
+from mixpose.simulation import SimulationOptions, simulate
 
 SESSION = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
 
@@ -49,3 +50,15 @@ def test_check_names_a_sensor_that_is_late_and_not_where_it_might_stand_instead(
     check_session(CheckRequest(tmp_path / SESSION.name))
     (warning,) = re.findall(r"^warning +(.*)$", capsys.readouterr().out, re.MULTILINE)
     assert warning.startswith("'right' is a frame late: ")
+
+
+def test_a_delay_that_the_session_tells_is_no_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = SESSION.read_text().replace('name = "right"', 'name = "right"\ndelay = 0.03')
+    (tmp_path / "late.toml").write_text(late)
+    session = mixpose.load_session(tmp_path / "late.toml")
+    motion = SimulationOptions(frames=8, amplitude_rotation_deg=40.0, amplitude_translation=80.0)
+    simulate(session, tmp_path / "recording", motion)
+    check_session(CheckRequest(tmp_path / "recording" / "session.toml"))
+    assert "warnings  none" in capsys.readouterr().out

@@ -11,6 +11,7 @@ import pytest
 from inspected import copied, left_image, write_left
 
 from mixpose import runner
+from mixpose.body import Body, SegmentFeature
 from mixpose.checking import key_warnings
 from mixpose.checking.keys import _trials, advice
 from mixpose.cli.app import CheckRequest
@@ -193,3 +194,13 @@ def test_a_recording_without_a_frame_is_told(
     printed = capsys.readouterr().out
     assert "warning   sensor 'left': its recording has no frame" in printed
     assert "sensor 'right': its recording" not in printed
+
+
+def test_lines_of_which_points_are_taken_are_doubted(session: Session) -> None:
+    ends = 50.0 * np.eye(3)
+    body = Body("frame", tuple(SegmentFeature(a, b) for a, b in zip(ends, ends[::-1] + 9.0)))
+    lines = replace(session, body=body)
+    (warning,) = key_warnings(lines)
+    assert warning.startswith("'frame': segments are seen as lines of grey values, and 'left' and ")
+    grey = [replace(s, extract=replace(s.extract, method="intensity")) for s in lines.sensors]
+    assert key_warnings(replace(lines, sensors=tuple(grey))) == []

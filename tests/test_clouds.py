@@ -346,3 +346,14 @@ def test_nine_triangles_are_as_well_found_in_points_as_by_cameras(tmp_path: Path
         numbers.append(len(right))
     # in all 60 frames 488 in points, 481 by cameras
     assert numbers[0] >= numbers[1]
+
+
+def test_check_names_a_cloud_in_another_unit(seven: Recording) -> None:
+    rows = (seven.session.parent / "cloud.csv").read_text().splitlines()
+    metres = [rows[0]]
+    for row in rows[1:]:
+        frame, *place = row.split(",")
+        metres.append(",".join([frame, *(f"{float(each) / 1000:.7f}" for each in place)]))
+    (seven.session.parent / "metres.csv").write_text("\n".join(metres) + "\n")
+    said = run("check", text(seven.session, ("cloud.csv", "metres.csv")))
+    assert "two units of length: with points a thousandth as large, 4 of 4 frames" in said

@@ -33,6 +33,7 @@ Frames: TypeAlias = Sequence[tuple[int, Views]]
 Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # as in `Seen`
 Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
 
+_BEGIN_S = 0.0  # of the first frame, of which the time tells nothing but that sensors have one
 _FEW = 3  # features in view that tell of a pose
 _MISSED = 0.3  # of the body: a camera that meets less mostly misses it
 _REACH = 3.0  # times sigma, from a displaced feature to its detection
@@ -116,7 +117,7 @@ def anywhere(session: Session) -> Session:
 def estimate_of(session: Session, number: int, views: Views) -> Estimate:
     """What a run tells of a frame that is its first."""
     tracker, track = begin(session)
-    return tracker.advance(track, number, None, views)[1]
+    return tracker.advance(track, number, _BEGIN_S, views)[1]
 
 
 def best_pose(
@@ -135,7 +136,7 @@ def best_pose(
     search = replace(tracker.rules.search, max_guesses=guesses, useful=useful)
     tracker = replace(tracker, rules=replace(tracker.rules, search=search))
     with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
-        data = tracker.data(track, number, None, views)
+        data = tracker.data(track, number, _BEGIN_S, views)
         ranked = tracker.explain(data)
     made = sum(report.made for report, _ in data.searches)
     return (ranked[0] if ranked else None), made
@@ -147,7 +148,7 @@ def pose_near(
     """The pose of a frame near another (4, 4)."""
     tracker, track = begin(replace(session, body=body))
     with np.errstate(all="ignore"), one_blas_thread():
-        data = tracker.data(track, number, None, views)
+        data = tracker.data(track, number, _BEGIN_S, views)
         if not data.views:
             return None
         likelihood, start = likelihood_of(data), Start(T_world_object, data.close)

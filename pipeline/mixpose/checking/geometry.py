@@ -25,7 +25,7 @@ from mixpose.judgement import APART
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import observe
-from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.sensors import CloudSensor, FisheyeCamera, PinholeCamera
 from mixpose.session import Session
 
 CAUSES = (
@@ -58,8 +58,11 @@ def geometry_doubts(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()
     )
-    cameras = any(isinstance(s.sensor, PinholeCamera | FisheyeCamera) for s in session.sensors)
-    if len(session.labels) > 1 or streams or not (cameras or len(sources) > 1):
+    tells = any(
+        isinstance(one.sensor, PinholeCamera | FisheyeCamera | CloudSensor)
+        for one in session.sensors
+    )
+    if len(session.labels) > 1 or streams or not (tells or len(sources) > 1):
         return Doubts()
     recording, count = _Recording(session, sources, surveys), DiagnosisRules().frames
     frames = [(each.number, observe(session, each)) for each in recording.shared(count)]
@@ -102,7 +105,10 @@ def _told(recording: _Recording, frames: Frames, found: Diagnosis) -> Doubts | N
                 return Doubts((text,), tried=text)
     if change is None:
         return None
-    return Doubts((f"{found.change}, {found.gain}",), change.of(session, frames[0][1]))
+    # where a cloud is in another unit, it is the table that is to be mended
+    are_clouds = all(isinstance(one.sensor, CloudSensor) for one in session.sensors)
+    mended = None if are_clouds else change.of(session, frames[0][1])
+    return Doubts((f"{found.change}, {found.gain}",), mended, tried=found.gain)
 
 
 @dataclass(frozen=True)
@@ -164,8 +170,8 @@ class _Recording:
                         frames[name] = next(found)
                 except (RecordingError, StopIteration):  # said of the recording
                     return
-            times = [each.time_s for each in frames.values() if each.time_s is not None]
-            yield FrameSet(number, min(times, default=None), frames)
+            times = (each.time_s for each in frames.values() if each.time_s is not None)
+            yield FrameSet(number, next(times, None), frames)  # as they are paired
 
 
 def _can_tell(views: Views) -> bool:

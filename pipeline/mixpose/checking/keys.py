@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.body import LookAlike, congruent_parts, of_size
+from mixpose.checking.changes import called
 from mixpose.checking.evidence import anywhere, estimate_of
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.placement import typical_poses
@@ -21,6 +22,7 @@ from mixpose.frames import files_of
 from mixpose.objective import View
 from mixpose.records import FrameSet, Image, RawFrame
 from mixpose.runner import observe, source_spec
+from mixpose.search import is_pointlike
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 
@@ -159,7 +161,7 @@ def _count(views: Sequence[View]) -> int:
 
 def key_warnings(session: Session) -> list[str]:
     """What is most likely wrong about calibrations and widths; images have their recorded sizes."""
-    return _off_centre(session) + _too_wide(session)
+    return _off_centre(session) + _too_wide(session) + _lines_as_points(session)
 
 
 def _off_centre(session: Session) -> list[str]:
@@ -196,6 +198,23 @@ def _too_wide(session: Session) -> list[str]:
         f"sensor {wide[0].name!r}{more}: sigma = {sigma:g} {session.unit} in {where} is wider than "
         f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
         "about what ranges err by"
+    ]
+
+
+def _lines_as_points(session: Session) -> list[str]:
+    """Cameras of which points are taken that should see the lines of a body."""
+    bodies = [one.body.name for one in session.objects if not is_pointlike(one.body)]
+    cameras = [
+        setup.name
+        for setup in session.sensors
+        if setup.sensor.unit == "px" and setup.extract.method != "intensity"
+    ]
+    if not (bodies and cameras):
+        return []
+    return [
+        f"{called(bodies)}: segments are seen as lines of grey values, and {called(cameras)} "
+        f'{"gives" if len(cameras) == 1 else "give"} points: set method = "intensity" in '
+        "[extract], of images, or give the ends of the lines as points"
     ]
 
 
