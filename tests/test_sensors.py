@@ -257,3 +257,12 @@ def test_a_sensor_moved_against_a_motion_measures_what_it_would_of_moved_points(
     np.testing.assert_array_equal(visible, seen)
     np.testing.assert_allclose(y, expected, atol=1e-8)
     assert np.abs(expected - sensor.project(points)[0]).max() > 5.0
+
+
+@pytest.mark.parametrize("coefficients", [[], [0.1, 0.01, 0.001, 0.001], [0.1] * 8])
+def test_of_no_pixels_there_are_no_lines_of_sight(coefficients: list[float]) -> None:
+    K = np.array([[900.0, 0, 640], [0, 900.0, 512], [0, 0, 1]])
+    camera = PinholeCamera(K, np.array(coefficients), (1280, 1024))
+    assert len(camera.rays(np.zeros((0, 2)))) == 0
+    fisheye = FisheyeCamera(K, np.zeros(4), (1280, 1024))
+    assert len(fisheye.rays(np.zeros((0, 2)))) == 0

@@ -70,6 +70,8 @@ class FisheyeCamera:
         """Lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
         distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        if not len(y):  # OpenCV has no empty arrays
+            return central_rays(self, y, distorted)
         xy = cv2.fisheye.undistortPoints(distorted.reshape(-1, 1, 2), np.eye(3), self.distortion)
         return central_rays(self, y, np.asarray(xy, dtype=np.float64).reshape(-1, 2))
 

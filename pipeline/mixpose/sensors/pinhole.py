@@ -94,7 +94,7 @@ class PinholeCamera:
         K = self.camera_matrix
         # cv2 ignores skew, so that the camera matrix is taken off before
         distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        if self.lens is None:
+        if self.lens is None or not len(y):  # OpenCV has no empty arrays
             return central_rays(self, y, distorted)
         given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
         xy = cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2)
