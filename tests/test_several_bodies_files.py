@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mixpose
 from mixpose import rigid
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.convert import convert_poses
@@ -216,3 +217,25 @@ def test_wrong_poses_that_are_near_neither_body_are_no_swap(tmp_path: Path) -> N
     found = evaluate(file_of(tmp_path, "poses.jsonl", poses), truth)
     assert found.swaps is not None
     assert found.swaps.count == 0
+
+
+def test_of_identical_bodies_all_have_the_directions_held_that_the_first_starts_with(
+    tmp_path: Path,
+) -> None:
+    """Two tools on a plane: the second begins nowhere, and lies as high and as level."""
+    points = np.array([[0.0, 0, 0], [52, 6, 10], [-35, 38, -12], [-30, -46, 15], [36, 30, 42]])
+    K, rows = np.array([[800.0, 0, 640], [0, 800.0, 512], [0, 0, 1]]), ["frame,u,v"]
+    truth = [rigid.from_rotation_vector([0, 0, 0.1], [-100.0, 0, 900])]
+    truth.append(rigid.from_rotation_vector([0, 0, 0.9], [130.0, 50.0, 900]))
+    for frame in range(3):
+        seen = np.concatenate([rigid.transform(place, points) for place in truth])
+        y = seen[:, :2] / seen[:, 2:] * K[0, 0] + K[:2, 2]
+        rows += [f"{frame},{u:.3f},{v:.3f}" for u, v in y]
+    (tmp_path / "left.csv").write_text("\n".join(rows) + "\n")
+    head = f'[[object]]\nname = "tool"\ncount = 2\npoints = {points.tolist()}\n'
+    start = "[object.start]\nrotation_vector = [0, 0, 0]\ntranslation = [-100, 0, 900]\n"
+    session = session_of(tmp_path, head + start + '[estimator]\nfree = ["x", "y", "rz"]\n')
+    for one in mixpose.run(session):
+        assert one.T_world_object is not None
+        away = [np.abs(one.T_world_object - place).max() for place in truth]
+        assert away[one.instance or 0] < 0.5

@@ -142,9 +142,9 @@ def scene_of(session: Session, starts: Starts | None = None) -> Scene:
     bodies = []
     for one in session.objects:
         for instance, label in zip(one.instances, one.labels, strict=True):
-            start = one.start if not instance else None
-            T_start = (starts or {}).get(label)
-            bodies.append(_tracker(session, one.body, start, T_start, instance))
+            start, T_start = one.start if not instance else None, (starts or {}).get(label)
+            held = None if one.start is None else one.start.T_world_object
+            bodies.append(_tracker(session, one.body, start, T_start, instance, held))
     return Scene(tuple(bodies))
 
 
@@ -160,6 +160,7 @@ def _tracker(
     start: Start | None,
     T_start: Floats | None,
     instance: int | None = None,
+    T_held: Floats | None = None,
 ) -> Tracker:
     if T_start is None and start is not None:
         T_start = start.T_world_object
@@ -170,6 +171,7 @@ def _tracker(
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
         instance=instance,
+        T_held=T_held,
     )
 
 

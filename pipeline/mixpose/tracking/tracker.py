@@ -23,7 +23,7 @@ from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, Proposer
+from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
@@ -39,6 +39,7 @@ class Tracker(Setup):
     proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
     refinements: tuple[Refinement, ...] = REFINEMENTS
     instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
+    T_held: Floats | None = None  # (4, 4), that of another one, where directions are held
 
     @classmethod
     def create(
@@ -51,6 +52,7 @@ class Tracker(Setup):
         distance: float | None = None,
         rules: Rules = Rules(),
         instance: int | None = None,
+        T_held: Floats | None = None,
     ) -> Tracker:
         """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
         start = per_kind(body, rules.motion.start)
@@ -69,6 +71,7 @@ class Tracker(Setup):
             rules,
             T_start,
             instance=instance,
+            T_held=T_start if T_held is None else T_held,
         )
 
     @property
@@ -121,7 +124,7 @@ class Tracker(Setup):
             views=seen,
             track=track,
             predictions=predictions,
-            T_reference=predictions[0].T_world_object if predictions else self.T_start,
+            T_reference=predictions[0].T_world_object if predictions else self.T_held,
             frame=frame,
             time_s=time_s,
             sensors=[view.name for view in views],
@@ -266,7 +269,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         T, second = one.T_world_object, verdict.second
         other = -second.either if second and one is second.pose else data.other_at(T)
         branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
-        found.append(branch)
+        found.append((branch, [each.T_body_other for each in congruent(data, one)]))
     used = best.used
     met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
