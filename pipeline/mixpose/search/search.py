@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -61,6 +61,15 @@ class SearchState(NamedTuple):
     batch: int = 0  # batches of it tried
 
 
+Known: TypeAlias = Callable[[Floats], Floats]
+"""By how many nats (K,) poses (K, 4, 4) are likelier by what is known before their frame."""
+
+
+def nothing_known(poses: Floats) -> Floats:
+    """All poses (K, 4, 4) are as likely."""
+    return np.zeros(len(poses))
+
+
 class SearchResult(NamedTuple):
     """Candidates, best first, what they cost, and where to go on while none convinces."""
 
@@ -79,12 +88,14 @@ def search_frame(
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
     state: SearchState = SearchState(),
+    known: Known = nothing_known,
 ) -> SearchResult:
     """Find poses that explain the views of one frame, without a start.
 
     They are ranked by `rules`, as they are judged in the end.  `seed` is of the order in which
     guesses are tried, where not all can be; `state` of the frame before, where its budget was used
-    up.  Raises `SessionError` if directions are held without a reference pose.
+    up.  What explains about as much goes by what is `known` before the frame.  Raises
+    `SessionError` if directions are held without a reference pose.
     """
     if T_reference is None and not free.all():
         raise SessionError(
@@ -95,13 +106,14 @@ def search_frame(
     if not can_fix(detections, body, free):
         return SearchResult([])
     T = np.eye(4) if T_reference is None else T_reference
-    return _Search(SearchProblem(detections, body, free, T, rules, budget, seed)).run(state)
+    return _Search(SearchProblem(detections, body, free, T, rules, budget, seed), known).run(state)
 
 
 class _Search:
     """What stays the same during one search, and its poses so far, the best first."""
 
-    def __init__(self, problem: SearchProblem) -> None:
+    def __init__(self, problem: SearchProblem, known: Known) -> None:
+        self._known = known
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
         self._images = [label_image(*camera, problem.reach(camera[0])) for camera in cameras]
@@ -159,9 +171,12 @@ class _Search:
         The guesses that explain most distinct detections, and among equals most closely, are
         refined.  A few are at once, where they explain more than all before: that may be enough.
         """
-        budget, body, length = self._budget, self._body, self._budget.refined(len(self._body))
-        few = sparse(body, 2 * budget.sample)
-        poses, ranks, best, checked, done = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0, skipped
+        budget, body = self._budget, self._body
+        # of the sides of a body that are turned away nothing is seen
+        seen = min(max(len(rays) for _, rays in self._problem.cameras), len(body))
+        few, length = sparse(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
+        poses, ranks, gains = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
+        best, checked, done = 0.0, 0.0, skipped
         for make in islice(generator, skipped, None):
             done += 1
             more = self._problem.allowed(make())
@@ -171,12 +186,14 @@ class _Search:
                 more = more[np.argsort(-rank, kind="stable")[: budget.shortlist]]
             self._cost["tested"] += len(more)
             rank = self._count(body, more)
-            better = rank > (ranks[-1] if len(ranks) == length else -np.inf)
-            poses = np.concatenate([poses, more[better]])
-            ranks = np.append(ranks, rank[better])
-            order = np.argsort(-ranks, kind="stable")
+            # detections that are missed cost four nats each
+            likely = rank > ranks.max(initial=0.0) - budget.outdone / 4
+            poses = np.concatenate([poses, more[likely]])
+            ranks = np.append(ranks, rank[likely])
+            gains = np.append(gains, self._known(more[likely]))
+            order = np.argsort(-ranks - gains / 4, kind="stable")
             order = order[unlike(body, poses[order], budget.alike)][:length]
-            poses, ranks = poses[order], ranks[order]
+            poses, ranks, gains = poses[order], ranks[order], gains[order]
             best = float(ranks.max(initial=0.0))
             if best > 1.1 * checked + 1:
                 checked = best
@@ -186,7 +203,6 @@ class _Search:
                     break
             if self._cost["made"] >= most:
                 break
-        # detections that are missed cost four nats each
         self._refine(poses[ranks > best - budget.outdone / 4], self._stages)
         return done
 
@@ -240,8 +256,9 @@ class _Search:
         self._cost["refined"] += len(guesses)
         if len(poses := self._descent.refine(guesses, stages)):
             judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
-            best = np.argsort(-judged[0], kind="stable")
-            self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]
+            poses = np.append(self._poses, poses, axis=0)
+            best = np.argsort(-judged[0] - self._known(poses), kind="stable")
+            self._poses, self._judged = poses[best], judged[:, best]
 
     def _judge(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""

@@ -30,6 +30,7 @@ from mixpose.sensors import Rays
 # batches of poses (K, 4, 4), worked out when they are called: what is skipped costs nothing
 Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 
+_FACING, _SIDE = 0.5, 0.9  # cosines of normals that are seen together, and of one side
 _TINY = np.finfo(np.float64).tiny
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
@@ -195,9 +196,9 @@ def sparse(body: Body, count: int) -> Body:
 def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
     """Batches of problems: three detections (3, K) as three features (3, K).
 
-    All, where they can be tried; else of detections and features those far apart first, which
-    fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
-    near detections as features that are near each other, at random.
+    All, where they can be tried; else of detections and of the features of a side those far apart
+    first, which fix a pose best, unless most detections are false: the outermost are the body's no
+    more.  Then near detections as features that are near each other, at random.
     """
     budget, features, cameras = problem.budget, problem.body.means, len(problem.cameras)
     rng = np.random.default_rng(problem.seed)
@@ -206,13 +207,15 @@ def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, I
         most //= 4 * cameras
     all_tried = comb(M, 3) * perm(n, 3) <= most
     if all_tried or budget.crowded * n >= M:
-        detections, corners = np.arange(M), np.arange(n)
+        detections, corners = np.arange(M), [np.arange(n)]
         if not all_tried:
             most //= 2
             detections = far_apart(rays.pixels, 3 * budget.sample // 2)
-            corners = far_apart(features, budget.sample)
+            sides = _sides(problem.body)
+            corners = [side[far_apart(features[side], budget.sample)] for side in sides]
         by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
-        by_feature = np.array(list(permutations(corners, 3)), dtype=np.intp).T
+        triples = [triple for some in corners for triple in permutations(some.tolist(), 3)]
+        by_feature = np.array(list(dict.fromkeys(triples)), dtype=np.intp).T
         order = rng.permutation(by_detection.shape[1] * by_feature.shape[1])[:most]
         for start in range(0, len(order), batch):
             a, b = np.divmod(order[start : start + batch], by_feature.shape[1])
@@ -229,6 +232,20 @@ def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, I
         crowd = crowds[k % len(crowds)]
         some, few = min(crowd, M), min(max(crowd // 2, 3), n)
         yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
+
+
+@lru_cache(maxsize=32)
+def _sides(body: Body) -> list[Indices]:
+    """Features that face about the same way as one of them, until each is among those of a side."""
+    if body.normals is None:
+        return [np.arange(len(body))]
+    cosines, sides = body.normals @ body.normals.T, list[Indices]()
+    left = np.ones(len(body), dtype=np.bool_)
+    while left.any():
+        own = cosines[left.argmax()]
+        sides.append(np.flatnonzero(own > _FACING))
+        left &= own < _SIDE
+    return sides
 
 
 def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
