@@ -238,3 +238,39 @@ def test_of_what_is_surely_clutter_no_look_alikes_are_asked_for() -> None:
         some = list(look_alikes(data, [replace(best, log_evidence=evidence)]))
         assert bool(some) == is_asked
     assert best.log_evidence > 0
+
+
+def test_a_confidence_of_a_half_leaves_room_for_look_alikes() -> None:
+    K = np.array([[900.0, 0, 640], [0, 900.0, 512], [0, 0, 1]])
+    one = PinholeCamera(K, resolution=(1280, 1024))
+    places = 20.0 * np.array([[x, y, 0.0] for x in range(4) for y in range(6)])
+    grid = Body("grid", tuple(PointFeature(place) for place in places))
+    T = from_rotation_vector([0.3, 0.2, 0.1], [-30.0, -50.0, 500.0])
+    dots = view_of("one", one, one.project(transform(T, grid.means[6:18]))[0])
+    tracker = Tracker.create(grid, EstimatorOptions(confidence=0.5), T)
+    data = tracker.data(tracker.begin(), 0, None, [dots])
+    likelihood, start = likelihood_of(data), Start(T)
+    steps = list(look_alikes(data, [likelihood.judge(likelihood.fit(start), start)]))
+    # a step of the grid on
+    shifts = [np.linalg.norm(step.T_world_object[:3, 3] - T[:3, 3]) for step in steps]
+    assert any(19 < shift < 21 for shift in shifts)
+
+
+def test_four_corners_of_one_side_of_a_body_may_be_tilted_the_other_way() -> None:
+    """The body is as thick as wide; what is seen of it is flat."""
+    K = np.array([[3000.0, 0, 640], [0, 3000.0, 512], [0, 0, 1]])
+    one = PinholeCamera(K, resolution=(1280, 1024))
+    square = 30.0 * np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1.0]])
+    turned = square[:, [2, 0, 1]] + [10.0, 0, 0]
+    normals = np.repeat([[0.0, 0, 1], [1.0, 0, 0]], 4, axis=0)
+    both = np.concatenate([square, turned])
+    body = Body("block", tuple(PointFeature(place) for place in both), normals)
+    T = from_rotation_vector([np.pi - 0.3, 0.0, 0.0], [0.0, 0.0, 900.0])
+    seen = view_of("one", one, one.project(transform(T, square))[0])
+    tracker = Tracker.create(body, EstimatorOptions(), T)
+    data = tracker.data(tracker.begin(), 0, None, [seen])
+    likelihood, start = likelihood_of(data), Start(T)
+    starts = list(look_alikes(data, [likelihood.judge(likelihood.fit(start), start)]))
+    tilts = [rotation_angle_deg(each.T_world_object, T) for each in starts]
+    # turned by 0.3 rad against the line of sight, and so by as much the other way
+    assert np.isclose(tilts, np.degrees(0.6), atol=2.0).any()

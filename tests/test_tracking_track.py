@@ -20,7 +20,7 @@ from mixpose.judgement import (
     judge,
 )
 from mixpose.objective import matched_objective
-from mixpose.rigid import perturb, transform, twist_between
+from mixpose.rigid import from_rotation_vector, inverse, perturb, transform, twist_between
 from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker, predict
@@ -46,7 +46,7 @@ def moved(frame: float) -> Floats:
 
 def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
     data = Tracker.create(EIGHT, EstimatorOptions()).data(track, frame, time_s, [])
-    return follow(data, [Branch(T, 1.0 / len(places)) for T in places])
+    return follow(data, [(Branch(T, 1.0 / len(places)), ()) for T in places])
 
 
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
@@ -159,14 +159,14 @@ def test_no_velocity_holds_where_only_one_of_two_frames_has_a_time(
     (prediction,) = predict(track, EIGHT, 8, after)
     np.testing.assert_array_equal(prediction.T_world_object, TRUTH)
     data = Tracker.create(EIGHT, EstimatorOptions()).data(track, 8, after, [])
-    assert follow(data, [Branch(moved(1))]).branches[0].velocity is None
+    assert follow(data, [(Branch(moved(1)), ())]).branches[0].velocity is None
 
 
 def test_a_clock_that_goes_back_tells_no_time() -> None:
     track = Track((branch(velocity=VELOCITY),), frame=7, time_s=2.0)
     assert track.elapsed(8, 1.3) == 0.0
     data = Tracker.create(EIGHT, EstimatorOptions()).data(track, 8, 1.3, [])
-    after = follow(data, [Branch(moved(1), spread=NARROW)])
+    after = follow(data, [(Branch(moved(1), spread=NARROW), ())])
     assert np.isfinite(after.branches[0].uncertainty).all()
 
 
@@ -244,3 +244,18 @@ def test_a_course_goes_on_by_its_derivatives_and_spreads_by_what_jerk_may_do() -
     walked = moved @ moved.T * t / 20000
     per_jerk = covariances / covariances[..., 3:, 3:] * t
     np.testing.assert_allclose(per_jerk, np.broadcast_to(walked, per_jerk.shape), rtol=1e-6)
+
+
+def test_a_pose_that_looks_like_the_one_before_is_no_turn_by_what_lies_between() -> None:
+    """A square that seems to have turned by a quarter was followed at the wrong quarter before."""
+    quarter = from_rotation_vector([0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.0])
+    track = followed(Track(), [np.eye(4)], 0, 0.0)
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(track, 1, 0.1, [])
+    T = perturb(quarter, np.array([2.0, 0, 0, 0, 0, 0.01]))
+    as_told = follow(data, [(Branch(T), ())]).branches[0]
+    alike = follow(data, [(Branch(T), (inverse(quarter), quarter @ quarter))]).branches[0]
+    assert as_told.velocity is not None
+    assert alike.velocity is not None
+    np.testing.assert_allclose(as_told.velocity[3:], [0, 0, 10 * (np.pi / 2 + 0.01)], atol=1e-9)
+    np.testing.assert_allclose(alike.velocity, [20.0, 0, 0, 0, 0, 0.1], atol=1e-9)
+    assert (alike.uncertainty[3:] < as_told.uncertainty[3:]).all()

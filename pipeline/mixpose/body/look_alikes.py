@@ -148,24 +148,28 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
     return tuple(sorted(found, key=lambda part: (-len(part.features), part.off)))
 
 
-def other_tilt(body: Body, T_world_object: Floats, towards: Floats) -> Floats:
-    """The pose (4, 4) of a flat body tilted the other way, as seen along a direction (3,).
+def other_tilt(
+    body: Body, features: frozenset[int], T_world_object: Floats, towards: Floats
+) -> Floats:
+    """The pose (4, 4) with flat features tilted the other way, as seen along a direction (3,).
 
-    Depths about its middle change their sign, which changes its image by perspective alone.
+    Depths about their middle change their sign, which changes its image by perspective alone.
     """
-    centre = body.means.mean(axis=0)
+    points = body.means[sorted(features)]
+    centre = points.mean(axis=0)
     R, v = T_world_object[:3, :3], towards / np.linalg.norm(towards)
-    n = np.linalg.svd(body.means - centre, full_matrices=False)[2][2]
-    # two mirrors make a turn: across the body's own plane, which leaves it alone, and in depth
+    n = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    # two mirrors make a turn: across their own plane, which leaves it alone, and in depth
     R_tilted = (np.eye(3) - 2 * np.outer(v, v)) @ R @ (np.eye(3) - 2 * np.outer(n, n))
     return from_parts(R_tilted, T_world_object[:3, 3] + (R - R_tilted) @ centre)
 
 
-@lru_cache(maxsize=64)
-def thickness(body: Body) -> float:
-    """Extent across the plane nearest to the features, by the shorter extent in it; 0 if flat."""
-    extents = np.linalg.svd(body.means - body.means.mean(axis=0), compute_uv=False)
-    if len(extents) < 3 or extents[1] <= len(body) * np.finfo(np.float64).eps * extents[0]:
+@lru_cache(maxsize=1024)
+def thickness(body: Body, features: frozenset[int] | None = None) -> float:
+    """Extent across the plane nearest to some features, by the shorter extent in it; 0 if flat."""
+    points = body.means if features is None else body.means[sorted(features)]
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if len(extents) < 3 or extents[1] <= len(points) * np.finfo(np.float64).eps * extents[0]:
         return 0.0
     return float(extents[2] / extents[1])
 

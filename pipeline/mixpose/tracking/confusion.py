@@ -21,6 +21,7 @@ from mixpose.fit import Fit
 from mixpose.judgement import Alternative, ScoredPose, Verdict
 from mixpose.objective import project_body
 from mixpose.records import Floats
+from mixpose.search import is_pointlike
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import met_features
@@ -98,6 +99,8 @@ def _in_place_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[tuple[
 
     One camera sees a body that is larger by some factor, and as much farther away, as the same.
     """
+    if not (is_pointlike(data.body) and is_pointlike(other.body)):
+        return
     met, sizes, centre = met_features(best), [1.0], np.zeros(3)
     factor = data.body.radius / other.body.radius
     if abs(factor - 1) > 1e-9 and (of_one := _centre_of_one(data, best)) is not None:

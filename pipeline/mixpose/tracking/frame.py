@@ -314,6 +314,21 @@ class Frame(Setup):
         return branch.course.expected(moved if is_there else None, elapsed)
 
 
+def _least_moved(
+    T_before: Floats, T_world_object: Floats, body: Body, alike: Sequence[Floats]
+) -> tuple[Floats, bool]:
+    """The least twist (6,) to a pose, if that before was right, or a look-alike of what was right.
+
+    And whether it was one.
+    """
+    if not alike:
+        return twist_between(T_before, T_world_object), False
+    before = np.concatenate([T_before[None], T_before @ np.linalg.inv(alike)])
+    moved = twist_between(before, T_world_object)
+    least = int(np.linalg.norm(moved / np.repeat([body.radius, 1.0], 3), axis=1).argmin())
+    return moved[least], least > 0
+
+
 def given(frame: Frame, T_world_object: Floats) -> float:
     """How far features in view may be off by the body's spread, in σ_ε of their sensor."""
     projection = frame.finest.projection
@@ -324,18 +339,22 @@ def given(frame: Frame, T_world_object: Floats) -> float:
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 
-def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
-    """The track after a frame with poses, the best first, and with what else is `known` by then."""
+def follow(frame: Frame, found: Sequence[tuple[Branch, Sequence[Floats]]], **known: Any) -> Track:
+    """The track after a frame with poses, the best first, and with what else is `known` by then.
+
+    Where a pose has look-alikes, motions (4, 4) of the body, one of them may have been followed.
+    """
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
     steady, branches = per_kind(body, rules.steady), list[Branch]()
     is_timed = track.is_timed_as(frame.time_s)
-    for one in found:
+    for one, alike in found:
         T, deviation = one.T_world_object, one.deviation
         velocity, course, uncertainty = None, None, rules.unsteady * steady
         parent = track.nearest(T, body)
         if parent is not None and track.frame is not None and elapsed > 0:
-            moved = twist_between(parent.T_world_object, T)
+            moved, is_other = _least_moved(parent.T_world_object, T, body, alike)
+            parent = replace(parent, velocity=None, course=None) if is_other else parent
             if one.spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)
                 walk = walk.joined(moved, body.radius, elapsed)

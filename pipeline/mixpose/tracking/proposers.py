@@ -21,7 +21,15 @@ from mixpose.fit import blur_schedule
 from mixpose.judgement import ScoredPose, is_sure
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
+from mixpose.search import (
+    Candidate,
+    Descent,
+    SearchReport,
+    SearchState,
+    is_pointlike,
+    search_frame,
+    sparse,
+)
 from mixpose.tracking.frame import Frame, Start
 
 # from the poses found so far, the most evident first
@@ -112,6 +120,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         T_reference=frame.T_reference,
         rules=frame.rules.judgement,
         seed=frame.options.seed,
+        known=frame.gains,
     )
     among_moving, spent = list[Candidate](), SearchReport()
     moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)
@@ -147,7 +156,7 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
     """In words, if one of the rivals is a look-alike of the best pose; else empty."""
-    body, alike = frame.body, _congruent(frame, best)
+    body, alike = frame.body, congruent(frame, best)
     limit = frame.rules.look_alikes.alike * body.radius
     for rival, one in product(rivals, alike):
         there = transform(rival.T_world_object @ body.symmetries, body.means)
@@ -167,11 +176,11 @@ def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
     return T_world_object if len(frame.track.branches) > 1 else None
 
 
-def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
+def congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
     """Motions under which what is met at a pose lies like other features of the body."""
     body = frame.body
     # single ranges do not say what is met
-    if len(body.nodes.points) != len(body) or 1 in best.matches.dimensions.tolist():
+    if not is_pointlike(body) or 1 in best.matches.dimensions.tolist():
         return ()
     met, rules = met_features(best), frame.rules.look_alikes
     return like_features(body, met, body, tolerance_of(body, body, rules.alike))
@@ -179,7 +188,7 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
 
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     """The best pose moved, where it meets as much, and more where motion tells against it."""
-    rules, T, alike = frame.rules, best.T_world_object, _congruent(frame, best)
+    rules, T, alike = frame.rules, best.T_world_object, congruent(frame, best)
     if not alike:
         return
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
@@ -187,7 +196,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     for one, pose in zip(alike, poses[1:], strict=True):
         moved = _moves_alike(frame, T) if one.is_step else None
         against = own - frame.prior(pose if moved is None else moved)[0]
-        limits.append(1 + max(against, 0.0) / rules.acceptance.log_doubt)
+        limits.append(1 - max(against, 0.0) / max(-rules.acceptance.log_doubt, 1.0))
     least = rules.look_alikes.fewer * np.array(limits)
     # mostly what has no detection near it tells, which is less than to look all up
     near = _near_any(frame, poses)
@@ -220,18 +229,23 @@ def _near_any(frame: Frame, poses: Floats) -> Floats:
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The pose tilted the other way, where one camera alone meets a nearly flat body."""
+    """The pose tilted the other way, where one camera alone meets what is nearly flat."""
     body, views, T = frame.body, frame.views, best.T_world_object
     if len(views) > 1:
         least, seen = frame.rules.acceptance.agreeing, best.matches
         met = {name for name, share in zip(seen.names, seen.coverage) if share >= least}
         views = [view for view in views if view.name in met]
-    if len(views) != 1 or views[0].sensor.dimension != 2 or len(body) < 3:
+    if len(views) != 1 or views[0].sensor.dimension != 2:
         return
-    if thickness(body) <= frame.rules.look_alikes.flat:
-        away = views[0].sensor.towards(transform(T, body.means.mean(axis=0)[None]))[0]
+    some, flat = frozenset(range(len(body))), frame.rules.look_alikes.flat
+    # a wrong tilt may be why little of a flat body is met
+    if thickness(body) > flat and is_pointlike(body):
+        some = met_features(best)
+    if len(some) >= 3 and thickness(body, some) <= flat:
+        middle = body.means[sorted(some)].mean(axis=0)
+        away = views[0].sensor.towards(transform(T, middle[None]))[0]
         wide = frame.close * frame.rules.proposals.narrowing
-        tilted = other_tilt(body, T, away)
+        tilted = other_tilt(body, some, T, away)
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 
