@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -166,3 +167,13 @@ def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:
 
     assert kept([0, 0, -1], [0, 1, -1]) == [True, True]
     assert kept([0, 0, 0], [0, 1, -1]) == [True, False]
+
+
+def test_a_sensor_that_meets_hardly_any_markers_is_named() -> None:
+    body = replace(learnt(turning(30.0, 30.0)), met={"a": 4.0, "b": 5.0, "c": 0.2})
+    (told,) = doubts_of(body, "body.csv", "mm", RULES)
+    assert told == (
+        "body.csv: 'c' meets 0.2 of its markers in a frame, and others 4.5: does it look "
+        "elsewhere, or stand elsewhere than the session says?"
+    )
+    assert doubts_of(replace(body, met={"a": 4.0, "b": 1.0}), "body.csv", "mm", RULES) == []

@@ -52,6 +52,8 @@ class Learnt:
     # standard deviation of markers about their places on the body, along an axis, beyond what
     # errors of detections explain; 0 of a rigid body
     spread: float
+    # by sensor, how many markers it meets in a frame on average
+    met: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def deviations(self) -> Floats:
@@ -106,6 +108,7 @@ def adjusted(
                     count=body.count,
                     residual=float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2))),
                     spread=_spread(body, clouds),
+                    met=dict(zip(rig.names, _met(found) / len(frames), strict=True)),
                 )
                 learnt.append(as_symmetric(one, usual_reach(body.places, clouds)))
                 break
@@ -173,6 +176,14 @@ def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes
     gauge, _ = gauge_rows(state, blocks, free)
     bundle = Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules, eyes.errors)
     return adjust(bundle, state)
+
+
+def _met(found: Adjusted) -> Floats:
+    """How often each sensor (L,) met a marker."""
+    return np.array(
+        [np.count_nonzero(rows.pairs.nearest & (weight > _MET)) for rows, weight in found.weighted],
+        dtype=np.float64,
+    )
 
 
 def _seen(found: Adjusted, markers: int, frames: int) -> Indices:

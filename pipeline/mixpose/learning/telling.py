@@ -19,6 +19,7 @@ from mixpose.session.marker_files import LEARNT_COLUMNS
 MARK = ",".join(LEARNT_COLUMNS)
 """By which mixpose knows the tables that it wrote."""
 
+_HARDLY = 0.1  # of what other sensors meet, below which one does not see a body where it is
 _ALIKE = 0.03  # of the radius: markers nearer are in one place to those who tell poses apart
 _ONE_AXIS = 0.2  # of the turn about the main axis that there is about any other
 
@@ -75,6 +76,13 @@ def doubts_of(learnt: Learnt, name: str, unit: str, rules: LearningRules) -> lis
             f"{name}: its markers map onto themselves in {turns - 1} other "
             f"way{'s' * (turns > 2)}: such poses cannot be told apart; move or add a marker"
         )
+    for sensor, met in learnt.met.items():
+        others = float(np.median([each for one, each in learnt.met.items() if one != sensor]))
+        if met < _HARDLY * others:
+            told.append(
+                f"{name}: {sensor!r} meets {met:.2g} of its markers in a frame, and others "
+                f"{others:.2g}: does it look elsewhere, or stand elsewhere than the session says?"
+            )
     if learnt.spread > 0:
         told.append(
             f"{name}: its markers move on it by {learnt.spread:.2g} {unit}: write "
