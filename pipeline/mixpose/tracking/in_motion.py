@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverted, nearest_alike
@@ -109,7 +110,7 @@ def fit_in_motion(
 
 
 def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> ScoredPose:
-    """A judged pose, as sure as its velocity lets it be."""
+    """A judged pose, as sure as its velocity and acceleration let it be."""
     free, expected = frame.free, frame.expected(judged.T_world_object)
     met, inner = offsets_of(frame, judged.used, expected), np.ix_(free, free)
     covariance, alone = judged.covariance.copy(), (met.rows.T @ met.rows)[inner]
@@ -118,6 +119,10 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     if not np.isfinite(scale) or scale <= 0:
         return judged
     design, known = met.unknowns(motion.velocity, expected, free)
+    by_acceleration = met.rows[:, free] * (met.late**2 / 2)[:, None]
+    design = np.hstack([design, by_acceleration])
+    prior = block_diag(known.J, np.diag(1 / expected.unsteady[free]))
+    known = LinearResiduals(prior, np.concatenate([known.residuals, np.zeros(len(alone))]))
     information = least_squares(known, _weighed(design, met.offsets, scale))[1]
     together = inverted(information)[: len(alone), : len(alone)]
     extra = together - scale * inverted(alone)

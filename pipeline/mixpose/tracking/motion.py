@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -145,6 +145,7 @@ class Expected(NamedTuple):
     gain: Floats  # more per second for a pose farther on; 0 where none was seen before
     deviation: Floats  # standard deviation
     acceleration: Floats  # per second more
+    unsteady: Floats  # standard deviation of the acceleration
 
     def at(self, T_world_object: Floats) -> Motion:
         """How a body moves at that pose."""
@@ -156,7 +157,7 @@ def at_rest(body: Body, rules: MotionRules) -> Expected:
     """Nothing is known of a velocity but how large it may be; not to be written to."""
     fastest, none = per_kind(body, rules.fastest), np.zeros(6)
     fastest.flags.writeable = none.flags.writeable = False
-    return Expected(none, none, fastest, none)
+    return Expected(none, none, fastest, none, rules.quickest * fastest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,24 +186,31 @@ class Course:
     def expected(self, moved: Floats | None, elapsed: float) -> Expected:
         """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
         means, covariances = self._foretold(elapsed)
-        likeliest = self.log_likelihoods.argmax(axis=0).repeat(3), np.arange(6)
-        mean, covariance = means[likeliest], covariances[likeliest]
-        moved = mean[:, 0] if moved is None else moved
-        gains = covariance[:, 1:3, 0] / covariance[:, :1, 0]
-        rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
-        variance = covariance[:, 1, 1] - gains[:, 0] * covariance[:, 1, 0]
+        rest = 0.0 if moved is None else (moved - means[..., 0])[..., None]
+        gains = covariances[..., 1:3, 0] / covariances[..., :1, 0]
+        each = means[..., 1:3] + gains * rest
+        variances = covariances[..., [1, 2], [1, 2]] - gains * covariances[..., 1:3, 0]
+        weights = self._weights[..., None]
+        rates = (weights * each).sum(axis=0)
+        variances = (weights * (np.maximum(variances, 0.0) + (each - rates) ** 2)).sum(axis=0)
+        moved = (self._weights * means[..., 0]).sum(axis=0) if moved is None else moved
         rates[3:] += cross(moved[3:, None], rates[3:]) / 2
-        return Expected(rates[:, 0], gains[:, 0], np.sqrt(np.maximum(variance, 0.0)), rates[:, 1])
+        gain = (weights * gains).sum(axis=0)[:, 0]
+        deviation, unsteady = np.sqrt(variances).T
+        return Expected(rates[:, 0], gain, deviation, rates[:, 1], unsteady)
+
+    @cached_property
+    def _weights(self) -> Floats:
+        """How much each filter (F, 6) is believed: a few frames do not tell which is right."""
+        weights = np.exp(self.log_likelihoods)
+        return np.asarray((weights / weights.sum(axis=0)).repeat(3, axis=1))
 
     def ahead(self, elapsed: float) -> tuple[Floats, Floats]:
         """The twist (6,) to where the body goes in some seconds, and by what variance it may err.
 
-        That is what is added to the variance of the last pose. All filters have a say: which of
-        them is right, a few frames do not tell surely.
+        That is what is added to the variance of the last pose.
         """
-        means, covariances = self._foretold(elapsed)
-        weights = np.exp(self.log_likelihoods)
-        weights = (weights / weights.sum(axis=0)).repeat(3, axis=1)
+        (means, covariances), weights = self._foretold(elapsed), self._weights
         twists = means[..., 0] - self.means[..., 0]
         twist = (weights * twists).sum(axis=0)
         grown = covariances[..., 0, 0] - self.covariances[..., 0, 0] + (twists - twist) ** 2
