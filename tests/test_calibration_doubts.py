@@ -93,6 +93,18 @@ def test_biases_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     assert 5 <= found.moved_by_biases.max() < 30
 
 
+def test_lenses_that_are_held_as_exact_are_told_with_what_they_would_do() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 16, 0.05)
+    found = calibrate(task_of(sensors, frames, 1.0, free={1: ("pose",)}), NO_FRAME_HELD_BACK)
+    (told,) = [line for line in lines_of(found, "mm") if line.startswith("held")]
+    assert "0.1 % of the focal length and by 1 px of the principal point" in told
+    # a pixel turns a line of sight by a thousandth, which is a millimetre of a metre or more
+    assert 0.5 < found.moved_by_lenses.max() < 5
+    freed = task_of(sensors, frames, 1.0, free=dict.fromkeys(range(2), ("pose", "focal")))
+    assert not calibrate(freed, NO_FRAME_HELD_BACK).moved_by_lenses.any()
+
+
 def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it() -> None:
     sensors = cameras(2)
     off = POINTS + np.eye(6)[:, 3:4] * [0.0, 0.0, 2.0]

@@ -14,14 +14,14 @@ from mixpose.calibration.contradicted import Contradiction, contradiction
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.recorded import held_back_with
-from mixpose.calibration.rig import Block, Rig, State, blocks_of, centre_of
+from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import searched
 from mixpose.calibration.start import Start, start_from_cameras, starts_together
 from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
-from mixpose.sensors import CalibrationError, RangeSensor
+from mixpose.sensors import CalibrationError
 from mixpose.threads import one_blas_thread
 
 _STAGES = 8  # of a calibration, for progress
@@ -230,15 +230,14 @@ class _Run:
         found = adjust(self._bundle(part), part.state, blurs=blurs)
         return replace(part, state=found.state), found
 
-    def _moved_by_biases(self, part: Start, adjusted: Adjusted) -> Floats:
-        """What biases as large as σ_ε would move (G,), of sensors of which nothing is stated."""
-        task = self._task
-        errors = {
-            s: CalibrationError(range_bias=float(task.sigmas[s]))
-            for s, eye in enumerate(task.rig.sensors)
-            if isinstance(eye, RangeSensor) and s not in task.errors
-            if "range_bias" not in task.free.get(s, ())
-        }
+    def _moved_by(self, kind: Kind, part: Start, adjusted: Adjusted) -> Floats:
+        """What errors of a kind would move (G,), of sensors of which it is held and not stated."""
+        task, errors = self._task, dict[int, CalibrationError]()
+        for s, eye in enumerate(task.rig.sensors):
+            if s in task.errors or kind in task.free.get(s, ()) or kind not in kinds_of(eye):
+                continue
+            bias = CalibrationError(range_bias=float(task.sigmas[s]))
+            errors[s] = result.HELD_LENS if kind == "focal" else bias
         if not errors:
             return np.zeros(sum(len(block.names) for block in self._blocks))
         return moved_by_held(replace(self._bundle(part), errors=errors), adjusted)
@@ -264,7 +263,8 @@ class _Run:
             noise=adjusted.noise,
             inflation=adjusted.inflation,
             certainty=adjusted.certainty,
-            moved_by_biases=self._moved_by_biases(part, adjusted),
+            moved_by_biases=self._moved_by("range_bias", part, adjusted),
+            moved_by_lenses=self._moved_by("focal", part, adjusted),
             explained=result.explained_share(adjusted, part.frames, task),
             sights=result.sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.state.poses, strict=True)),

@@ -23,6 +23,10 @@ from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame, Task
 from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts, inverse
+from mixpose.sensors import CalibrationError
+
+HELD_LENS = CalibrationError(focal=1e-3, principal_point=1.0)
+"""What a lens that was calibrated by itself is easily off by."""
 
 _MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
 _CLIMBS = 12
@@ -70,9 +74,10 @@ class Calibration:
     # share of the weight of pairs of which each is the nearest that the other has: near 1, or
     # detections cannot be told apart
     certainty: float
-    # (G,): standard deviations that biases of ranges as large as σ_ε would add, where they are held
-    # and nothing is stated of them
+    # (G,): standard deviations that come of what is held of sensors of which nothing is stated:
+    # biases of ranges as large as σ_ε, and lenses that are off by `HELD_LENS`
     moved_by_biases: Floats
+    moved_by_lenses: Floats
     # (L,): share of what each sensor could show that is met, weighted as in the objective; NaN
     # without
     explained: Floats

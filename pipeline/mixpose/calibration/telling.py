@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.calibration.result import Calibration, Displacement, displacements, residuals_by
+from mixpose.calibration.result import (
+    HELD_LENS,
+    Calibration,
+    Displacement,
+    displacements,
+    residuals_by,
+)
 from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
@@ -46,17 +52,26 @@ def _plus_minus(deviation: float, unit: str) -> str:
 
 
 def _held_lines(found: Calibration, unit: str) -> list[str]:
-    """What biases of ranges that are taken as exact would do."""
+    """What would do that is taken as exact, where it would do more than what is told."""
     lengths = np.array([unit == "length" for block in found.blocks for unit in block.units], bool)
-    moved = np.where(np.isfinite(found.deviations) & lengths, found.moved_by_biases, 0.0)
-    if not moved.any():
-        return []
-    worst = int(np.argmax(moved))
-    return [
-        f"{'held':<10}range biases, as exact; off by extract.sigma each they would move what "
-        f"was found by {moved[worst]:.2g} {unit}, told as ± {found.deviations[worst]:.2g} {unit}: "
-        "state calibration_error, or free range_bias"
-    ]
+    told, lines = np.where(np.isfinite(found.deviations) & lengths, found.deviations, np.inf), []
+    lens = HELD_LENS
+    for moved, words, kind in (
+        (found.moved_by_biases, "range biases, as exact; off by extract.sigma each", "range_bias"),
+        (
+            found.moved_by_lenses,
+            f"lenses, as exact; off by {100 * lens.focal:g} % of the focal length and by "
+            f"{lens.principal_point:g} px of the principal point",
+            "focal",
+        ),
+    ):
+        worst = int(np.argmax(moved / told)) if len(moved) else 0
+        if len(moved) and moved[worst] > told[worst]:
+            lines.append(
+                f"{'held':<10}{words} they would move what was found by {moved[worst]:.2g} {unit}, "
+                f"told as ± {told[worst]:.2g} {unit}: state calibration_error, or free {kind}"
+            )
+    return lines
 
 
 def doubts_of(found: Calibration, unit: str) -> list[str]:
