@@ -173,7 +173,8 @@ class _Search:
         """
         budget, body = self._budget, self._body
         # of the sides of a body that are turned away nothing is seen
-        seen = min(max(len(rays) for _, rays in self._problem.cameras), len(body))
+        most_seen = max(len(rays) for _, rays in self._problem.cameras)
+        seen = max(min(most_seen, len(body)), 1)
         few, length = sparse(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
         poses, ranks, gains = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
         best, checked, done = 0.0, 0.0, skipped
