@@ -232,12 +232,12 @@ class _Run:
 
     def _moved_by(self, kind: Kind, part: Start, adjusted: Adjusted) -> Floats:
         """What errors of a kind would move (G,), of sensors of which it is held and not stated."""
-        task, errors = self._task, dict[int, CalibrationError]()
-        for s, eye in enumerate(task.rig.sensors):
-            if s in task.errors or kind in task.free.get(s, ()) or kind not in kinds_of(eye):
-                continue
-            bias = CalibrationError(range_bias=float(task.sigmas[s]))
-            errors[s] = result.HELD_LENS if kind == "focal" else bias
+        task, lens = self._task, result.HELD_LENS
+        errors = {
+            s: lens if kind == "focal" else CalibrationError(range_bias=float(task.sigmas[s]))
+            for s, eye in enumerate(task.rig.sensors)
+            if kind in kinds_of(eye) and kind not in task.free.get(s, ()) and s not in task.errors
+        }
         if not errors:
             return np.zeros(sum(len(block.names) for block in self._blocks))
         return moved_by_held(replace(self._bundle(part), errors=errors), adjusted)

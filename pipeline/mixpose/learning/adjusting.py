@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -125,12 +125,14 @@ def as_symmetric(learnt: Learnt, reach: float) -> Learnt:
     """
     points = learnt.points
     turns = symmetries(points, 2 * reach)
+    if len(turns) == 1:
+        return learnt
     images = transform(turns, points)
     nearest = np.array([cKDTree(points).query(each)[1] for each in images])
     # of each turn, the image that lies at each marker
     mean = images[np.arange(len(turns))[:, None], nearest.argsort(axis=1)].mean(axis=0)
     off = np.linalg.norm(points - mean, axis=1)
-    if len(turns) == 1 or off.max() > reach:
+    if off.max() > reach:
         return learnt
     own = np.eye(3) * float(np.mean(off**2)) / 3
     return replace(learnt, points=mean, covariances=learnt.covariances + own)
@@ -178,20 +180,23 @@ def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes
     return adjust(bundle, state)
 
 
+def _pairs_met(found: Adjusted) -> Iterator[Indices]:
+    """Frame and marker (n, 2) of what each sensor met."""
+    for rows, weight in found.weighted:
+        good = rows.pairs.nearest & (weight > _MET)
+        yield np.column_stack([rows.pairs.frame, rows.pairs.feature])[good]
+
+
 def _met(found: Adjusted) -> Floats:
     """How often each sensor (L,) met a marker."""
-    return np.array(
-        [np.count_nonzero(rows.pairs.nearest & (weight > _MET)) for rows, weight in found.weighted],
-        dtype=np.float64,
-    )
+    return np.array([len(pairs) for pairs in _pairs_met(found)], dtype=np.float64)
 
 
 def _seen(found: Adjusted, markers: int, frames: int) -> Indices:
     """Frames (N,) in which two sensors or more met a marker."""
     met = np.zeros((frames, markers), dtype=np.intp)
-    for rows, weight in found.weighted:
-        good = rows.pairs.nearest & (weight > _MET)
-        np.add.at(met, (rows.pairs.frame[good], rows.pairs.feature[good]), 1)
+    for pairs in _pairs_met(found):
+        np.add.at(met, tuple(pairs.T), 1)
     return np.asarray((met >= 2).sum(axis=0))
 
 

@@ -34,6 +34,8 @@ from mixpose.search.problem import (
 )
 from mixpose.search.three_points import Guesses, sparse
 
+_MISSED = 4.0  # nats that a detection costs that is missed
+
 
 class Candidate(NamedTuple):
     """A pose that may explain the views, ranked by its evidence.
@@ -131,7 +133,8 @@ class _Search:
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         self._stages = [((blur,) * len(views), n, self._budget.shortlist) for blur, n in plan]
-        self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((2, 0))
+        # by pose: as `_judge` has it, and what is known before the frame
+        self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((3, 0))
         self._cost = Counter(made=0)
 
     def run(self, state: SearchState) -> SearchResult:
@@ -156,7 +159,7 @@ class _Search:
 
     def _candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        budget, (ranks, _) = self._budget, self._judged
+        budget, ranks = self._budget, self._judged[0]
         kept = self._distinct(budget.sample)
         if self._by_evidence and kept:
             least = max(ranks[0] - budget.outdone, budget.hopeless)
@@ -187,12 +190,11 @@ class _Search:
                 more = more[np.argsort(-rank, kind="stable")[: budget.shortlist]]
             self._cost["tested"] += len(more)
             rank = self._count(body, more)
-            # detections that are missed cost four nats each
-            likely = rank > ranks.max(initial=0.0) - budget.outdone / 4
+            likely = rank > ranks.max(initial=0.0) - budget.outdone / _MISSED
             poses = np.concatenate([poses, more[likely]])
             ranks = np.append(ranks, rank[likely])
             gains = np.append(gains, self._known(more[likely]))
-            order = np.argsort(-ranks - gains / 4, kind="stable")
+            order = np.argsort(-ranks - gains / _MISSED, kind="stable")
             order = order[unlike(body, poses[order], budget.alike)][:length]
             poses, ranks, gains = poses[order], ranks[order], gains[order]
             best = float(ranks.max(initial=0.0))
@@ -204,7 +206,7 @@ class _Search:
                     break
             if self._cost["made"] >= most:
                 break
-        self._refine(poses[ranks > best - budget.outdone / 4], self._stages)
+        self._refine(poses[ranks > best - budget.outdone / _MISSED], self._stages)
         return done
 
     def _count(self, body: Body, poses: Floats) -> Floats:
@@ -256,10 +258,10 @@ class _Search:
         """Keep what guesses lead to from less to less blur."""
         self._cost["refined"] += len(guesses)
         if len(poses := self._descent.refine(guesses, stages)):
-            judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
-            poses = np.append(self._poses, poses, axis=0)
-            best = np.argsort(-judged[0] - self._known(poses), kind="stable")
-            self._poses, self._judged = poses[best], judged[:, best]
+            judged = np.array([*self._judge(poses), self._known(poses)])
+            judged = np.append(self._judged, judged, axis=1)
+            best = np.argsort(-judged[0] - judged[2], kind="stable")
+            self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]
 
     def _judge(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""

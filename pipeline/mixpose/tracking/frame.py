@@ -24,7 +24,7 @@ from mixpose.judgement import (
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
-from mixpose.rigid import transform, twist_between
+from mixpose.rigid import inverse, transform, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import Course, Expected, RandomWalk, at_rest, per_kind
@@ -323,7 +323,7 @@ def _least_moved(
     """
     if not alike:
         return twist_between(T_before, T_world_object), False
-    before = np.concatenate([T_before[None], T_before @ np.linalg.inv(alike)])
+    before = np.concatenate([T_before[None], T_before @ inverse(np.array(alike))])
     moved = twist_between(before, T_world_object)
     least = int(np.linalg.norm(moved / np.repeat([body.radius, 1.0], 3), axis=1).argmin())
     return moved[least], least > 0

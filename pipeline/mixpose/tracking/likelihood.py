@@ -33,6 +33,7 @@ from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
+from mixpose.search import is_pointlike
 from mixpose.sensors import Motion
 from mixpose.tracking.frame import Frame, Start, given
 from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown
@@ -145,7 +146,8 @@ def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeR
     return (
         all(view.sensor.dimension == 1 for view in views)
         and all(view.observation.points is not None for view in views)
-        and len(body.nodes.points) == len(body) <= rules.max_features
+        and is_pointlike(body)
+        and len(body) <= rules.max_features
     )
 
 

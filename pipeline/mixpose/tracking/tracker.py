@@ -17,6 +17,7 @@ from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
+from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, Start, follow
@@ -71,7 +72,7 @@ class Tracker(Setup):
             rules,
             T_start,
             instance=instance,
-            T_held=T_start if T_held is None else T_held,
+            T_held=T_held,
         )
 
     @property
@@ -111,6 +112,7 @@ class Tracker(Setup):
         """A frame, and what is known before it; sensors that saw nothing are left out."""
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
+        reference = self.T_held if self.T_start is None else self.T_start
         seen = track.delays.applied(seen, time_s)
         if predictions:
             T = predictions[0].T_world_object
@@ -124,7 +126,7 @@ class Tracker(Setup):
             views=seen,
             track=track,
             predictions=predictions,
-            T_reference=predictions[0].T_world_object if predictions else self.T_held,
+            T_reference=predictions[0].T_world_object if predictions else reference,
             frame=frame,
             time_s=time_s,
             sensors=[view.name for view in views],
@@ -180,7 +182,7 @@ class Tracker(Setup):
         """The estimate of a frame, with reports of the first pose, believed or not."""
         body, best = self.body, verdict.best
         shown = best or next(iter(ranked), None)
-        used = shown.used if shown and len(body.nodes.points) == len(body) else None
+        used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
         reports |= shown.reports(_residuals(used, body) if used else {}) if shown else {}
         rivals = verdict.kept if verdict.status == "ambiguous" else ()
