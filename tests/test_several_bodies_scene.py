@@ -243,6 +243,20 @@ def test_a_body_of_which_one_camera_sees_two_markers_is_found_in_the_frame_it_en
     assert turn < 1.0
 
 
+def test_a_body_that_nobody_looked_at_for_seconds_is_found_in_the_frame_after() -> None:
+    tool, other = body("tool", TOOL), body("other", OTHER[:4])
+    scene = scene_of(tool, other)
+    tracks = scene.begin()
+    for frame, time_s in enumerate((0.0, 0.03, 0.06, 5.0)):
+        there = at(-150.0 if time_s > 1 else 150.0, 60.0)
+        views = views_of([tool, other], [at(2.0 * frame), there], frame)
+        if time_s > 1:  # what two cameras see of it are no three points in space
+            views[1] = views_of([tool, body("part", OTHER[:2])], [at(2.0 * frame), there], frame)[1]
+        tracks, estimates = scene.advance(tracks, frame, time_s, views)
+        assert [one.status for one in estimates] == ["ok", "ok"]
+    assert off(estimates[1], there)[0] < 2.0
+
+
 def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -> None:
     # a body of which three markers lie as three of the tool, and two that do not
     twin = body("twin", np.concatenate([TOOL[:3], [[15.0, -60.0, 10.0], [-50.0, -20.0, 30.0]]]))

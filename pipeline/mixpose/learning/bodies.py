@@ -16,8 +16,8 @@ from scipy.spatial.distance import cdist
 from mixpose.body.symmetry import congruent_triples_of_each, motions
 from mixpose.calibration.task import Progress, silent
 from mixpose.learning.copies import is_chance, left_by, with_copies
-from mixpose.learning.growing import Found, grown, placed
-from mixpose.learning.placing import FEWEST, Placement, Shape, triples_of
+from mixpose.learning.growing import Found, Places, grown, least_met, placed
+from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats, Mask
@@ -43,6 +43,10 @@ def find_bodies(
         body = _next(left, rules, rng)
         if body is None:
             break
+        # a frame that shows few points of a body may show none of the triples it was found by
+        least = least_met(len(body.shape))
+        more = _missed(body, left_by(body.places, left), rules, least, rules.many_bases)
+        body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
         found.append(_of_all(body, left))
         left = _without(left, body, rules)
     return sorted(found, key=lambda each: -each.met)
@@ -89,14 +93,22 @@ def _loose_enough(
 def _without(clouds: Sequence[Cloud], body: Found, rules: LearningRules) -> list[Cloud]:
     """Clouds without a body, also where too few of its points are seen for a frame to count."""
     left = left_by(body.places, clouds)
-    looser = [cloud.loosened(body.loose) for cloud in left]
-    missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(clouds))
-    rest = list[tuple[int, Placement]]()
-    for k, one in placed(body.shape, looser, rules, body.count, FEWEST):
-        if missing[k] > 0:
-            rest.append((k, one))
-            missing[k] -= 1
-    return left_by(rest, left)
+    return left_by(_missed(body, left, rules, FEWEST, rules.bases), left)
+
+
+def _missed(
+    body: Found, left: Sequence[Cloud], rules: LearningRules, least: int, bases: int
+) -> Places:
+    """Where it is in what it left, in frames in which fewer of it were found than there are."""
+    missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(left))
+    frames = np.flatnonzero(missing > 0)
+    some = [left[k].loosened(body.loose) for k in frames]
+    found, rest = placed(body.shape, some, rules, body.count, least, bases), []
+    for k, one in found:
+        if missing[frames[k]] > 0:
+            rest.append((int(frames[k]), one))
+            missing[frames[k]] -= 1
+    return rest
 
 
 def _shapes(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Shape]:

@@ -51,14 +51,15 @@ def placed(
     rules: LearningRules,
     most: int = 1,
     least: int | None = None,
+    bases: int | None = None,
 ) -> list[tuple[int, Placement]]:
     """Where a shape is in all clouds, at most so many times in each."""
-    bases = wide_triples(shape.points, shape.reach, rules.bases)
+    triples = wide_triples(shape.points, shape.reach, bases or rules.bases)
     least = least_met(len(shape)) if least is None else least
     return [
         (k, one)
         for k, cloud in enumerate(clouds)
-        for one in placements(shape, bases, cloud, rules, most, least)
+        for one in placements(shape, triples, cloud, rules, most, least)
     ]
 
 

@@ -225,6 +225,7 @@ class Sharing:
         if is_new:
             often = min(often, 1 + track.misses // coasting)
         is_due = (is_new or track.misses >= coasting) and (track.misses + k) % often == 0
+        is_due |= not track.misses and self._is_forgotten(k)  # it went on, and nobody looked
         if self.claimed and (self.looked or (not is_due and track.misses > coasting)):
             data = replace(data, options=replace(data.options, search="live"))
         if not self.looked or is_due:
@@ -309,8 +310,10 @@ class Sharing:
 
     def _is_forgotten(self, k: int) -> bool:
         """Whether where the body was says nothing any more: no velocity is believed then."""
-        track = self.tracks[k]
-        return not track.branches or track.misses > self.bodies[k].rules.motion.coasting
+        track, rules = self.tracks[k], self.bodies[k].rules.motion
+        seconds = track.seconds_until(self.time_s) or 0.0
+        is_long = track.misses > rules.coasting or seconds > rules.longest_s
+        return not track.branches or is_long
 
     def _features(self, k: int, pose: Start | ScoredPose) -> Floats:
         return self._nobody.features(self.bodies[k].body, pose.T_world_object)
