@@ -348,12 +348,14 @@ def test_nine_triangles_are_as_well_found_in_points_as_by_cameras(tmp_path: Path
     assert numbers[0] >= numbers[1]
 
 
-def test_check_names_a_cloud_in_another_unit(seven: Recording) -> None:
+@pytest.mark.parametrize(("factor", "told"), [(1e-3, "1000 times as large"), (1e3, "a thousandth")])
+def test_check_names_a_cloud_in_another_unit(seven: Recording, factor: float, told: str) -> None:
     rows = (seven.session.parent / "cloud.csv").read_text().splitlines()
-    metres = [rows[0]]
+    other = [rows[0]]
     for row in rows[1:]:
         frame, *place = row.split(",")
-        metres.append(",".join([frame, *(f"{float(each) / 1000:.7f}" for each in place)]))
-    (seven.session.parent / "metres.csv").write_text("\n".join(metres) + "\n")
-    said = run("check", text(seven.session, ("cloud.csv", "metres.csv")))
-    assert "two units of length: with points a thousandth as large, 4 of 4 frames" in said
+        other.append(",".join([frame, *(f"{float(each) * factor:.7f}" for each in place)]))
+    (seven.session.parent / "other.csv").write_text("\n".join(other) + "\n")
+    said = run("check", text(seven.session, ("cloud.csv", "other.csv")))
+    assert f"the points of 'mocap' are in another unit than the session: with them {told}" in said
+    assert "4 of 4 frames are explained" in said

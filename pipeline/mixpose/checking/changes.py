@@ -19,9 +19,10 @@ from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
-from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.sensors import CloudPlane, CloudSensor, FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
 
+_UNITS = ((1000.0, "1000 times as large"), (0.001, "a thousandth as large"))
 _OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
 
 
@@ -59,8 +60,13 @@ class Change:
 def changes(session: Session) -> Iterator[Change]:
     """Changes without values, those that are simple first."""
     cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
+    clouds = [setup.name for setup in session.sensors if isinstance(setup.sensor, CloudSensor)]
     are_points = all(isinstance(feature, PointFeature) for feature in session.body.features)
+    if clouds:
+        yield from _of_clouds(clouds)
     if are_points:
+        # a cloud by itself has all but the body in one unit
+        yield from () if len(clouds) == len(session.sensors) else of_units(session.body)
         yield from _of_the_body(session.body)
     yield from _inversions(cameras)
     for a, b in combinations([setup.name for setup in cameras], 2):
@@ -125,8 +131,22 @@ def of_camera(view: View, **changed: Floats) -> View:
     return replace(view, sensor=replace(camera, **changed))
 
 
+def _of_clouds(names: Sequence[str]) -> Iterator[Change]:
+    """Points in space in another unit than that of the session."""
+    for factor, where in _UNITS:
+        yield Change(
+            f"the points of {called(names)} {{are}} in another unit than the session",
+            f"with them {where}",
+            lambda views, k=factor: [  # type: ignore[misc]
+                _with_points(view, lambda points: k * points)
+                if isinstance(view.sensor, CloudPlane)
+                else view
+                for view in views
+            ],
+        )
+
+
 def _of_the_body(body: Body) -> Iterator[Change]:
-    yield from of_units(body)  # before what takes long to search with a tiny body
     middle, normals = body.means.mean(axis=0), body.normals
     other_side = np.array([1.0, 1.0, -1.0])
     turned = None if normals is None else normals * other_side
@@ -145,7 +165,7 @@ def _of_the_body(body: Body) -> Iterator[Change]:
 
 def of_units(body: Body) -> Iterator[Change]:
     """Points in metres for millimetres, and the reverse."""
-    for factor, where in ((1000.0, "1000 times as large"), (0.001, "a thousandth as large")):
+    for factor, where in _UNITS:
         yield Change(
             "points and translations {are} in two units of length",
             f"with points {where}",
@@ -218,12 +238,16 @@ def _swapped(views: Views, a: str, b: str) -> Views:
 
 
 def _flipped(view: View, width: int) -> View:
+    return _with_points(view, lambda points: points * [-1.0, 1.0] + [width - 1.0, 0.0])
+
+
+def _with_points(view: View, changed: Callable[[Floats], Floats]) -> View:
+    """A view of detections that are elsewhere."""
     pattern = view.observation.pattern
     if not isinstance(pattern, PointPattern):
         return view
-    points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
-    flipped = replace(pattern, points=np.asarray(points))
-    return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))
+    moved = replace(pattern, points=np.asarray(changed(pattern.points)))
+    return replace(view, observation=type(view.observation)(moved, view.observation.sigma))
 
 
 def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
