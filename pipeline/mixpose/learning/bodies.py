@@ -102,7 +102,7 @@ def _missed(
     """Where it is in what it left, in frames in which fewer of it were found than there are."""
     missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(left))
     frames = np.flatnonzero(missing > 0)
-    some = [left[k].loosened(body.loose) for k in frames]
+    some = [left[k].loosened(body.loose) for k in frames.tolist()]
     found, rest = placed(body.shape, some, rules, body.count, least, bases), []
     for k, one in found:
         if missing[frames[k]] > 0:
