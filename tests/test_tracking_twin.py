@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,13 @@ from bodies_in_view import OTHER, TOOL, at, body, off, scene_of, views_of
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
-from mixpose.records import Estimate
+from mixpose.judgement import ScoredPose
+from mixpose.records import Estimate, Floats
+from mixpose.rigid import from_rotation_vector
 from mixpose.tracking import Scene, Tracker
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import likelihood_of
+from mixpose.tracking.mirrors import mirrored
 from mixpose.tracking.twin import IN_A_MIRROR, TWICE
 
 FLAT = body("flat", TOOL * [1.0, 1.0, 0.0])
@@ -102,11 +108,88 @@ def test_identical_bodies_that_the_session_counts_are_no_surprise() -> None:
         assert [one.status for one in estimates] == ["ok", "ok"]
 
 
-def test_where_there_are_mirrors_a_flat_body_is_never_ok() -> None:
+def test_where_there_are_mirrors_a_flat_body_by_itself_is_never_ok() -> None:
     options = replace(EstimatorOptions(), mirrors=True)
     found = estimates_of(FLAT, [[HERE]] * 6, options)
     assert {(one.status, one.doubt) for one in found} == {("ambiguous", IN_A_MIRROR)}
     assert all(one.status == "ok" for one in estimates_of(SOLID, [[HERE]] * 6, options))
+
+
+def in_mirror(T: Floats, own: Sequence[float] = (1.0, 1.0, -1.0)) -> Floats:
+    """Where a body is seen in a mirror 150 mm behind the middle of the scene.
+
+    A reflection, by the signs of its coordinates, maps it onto its `own` features.
+    """
+    M = np.diag([1.0, 1.0, -1.0, 1.0])
+    M[2, 3] = 300.0
+    return M @ T @ np.diag([*own, 1.0])
+
+
+@pytest.mark.parametrize("mirrors", [False, True])
+def test_of_a_flat_body_and_its_mirror_image_the_nearer_one_is_it(mirrors: bool) -> None:
+    own = [at(-60.0 + 4.0 * frame, turn=0.02 * frame) for frame in range(10)]
+    shown = [[in_mirror(T), T][: 1 + (k >= 4)] for k, T in enumerate(own)]
+    found = estimates_of(FLAT, shown, replace(EstimatorOptions(), mirrors=mirrors))
+    # what is seen in the mirror alone could be the body behind a window
+    assert {one.status for one in found[:4]} == {"ambiguous" if mirrors else "ok"}
+    assert [one.status for one in found[4:]] == ["ambiguous"] + ["ok"] * 5
+    for one, T in zip(found[4:], own[4:], strict=True):
+        assert off(one, T)[0] < 1.0  # 0.2 px are 0.24 mm across
+
+
+def test_a_body_that_is_seen_beside_its_mirror_image_is_known_when_that_is_hidden() -> None:
+    own = [at(-60.0 + 4.0 * frame) for frame in range(8)]
+    shown = [[T, in_mirror(T)][: 2 if k < 5 else 1] for k, T in enumerate(own)]
+    found = estimates_of(FLAT, shown, replace(EstimatorOptions(), mirrors=True))
+    assert [one.status for one in found] == ["ok"] * 8
+
+
+def frame_of(tracked: Body, T: Floats, T_other: Floats) -> tuple[Frame, ScoredPose, ScoredPose]:
+    """A frame that shows a body twice, and the poses that were fitted there."""
+    tracker = Tracker.create(tracked, OPTIONS)
+    data = tracker.data(tracker.begin(), 0, None, views_of([tracked] * 2, [T, T_other], 0))
+    likelihood = likelihood_of(data)
+    starts = [Start(each, data.close) for each in (T, T_other)]
+    one, other = (likelihood.judge(likelihood.fit(start), start) for start in starts)
+    return data, one, other
+
+
+def test_two_poses_are_mirrored_only_about_a_plane_between_them() -> None:
+    T = at(-60.0)
+    for there, is_mirrored in (
+        (in_mirror(T), True),
+        (in_mirror(T) @ from_rotation_vector([0.0, 0.0, 0.1], np.zeros(3)), False),  # 6 deg
+        (in_mirror(T) + np.eye(4)[:, :1] * [0.0, 0.0, 0.0, 10.0], False),  # 10 mm along it
+        (THERE, False),
+    ):
+        data, one, other = frame_of(FLAT, T, there)
+        odds, is_first = mirrored(data, one, other)
+        # a turn within 2π that is known to 3e-3, and two shifts within 300 mm to 0.5 mm
+        assert (odds > 12.0) == is_mirrored
+        assert (odds < 0.0) != is_mirrored
+        back, is_other = mirrored(data, other, one)
+        assert back == pytest.approx(odds, rel=1e-3)
+        assert not is_mirrored or (is_first and not is_other)
+
+
+def test_no_body_reaches_through_a_mirror() -> None:
+    # its other tilt before one camera is nearly its image in a plane across the line of sight
+    T, tilted = at(0.0), at(0.0)
+    tilted[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ T[:3, :3] @ np.diag([1.0, 1.0, -1.0])
+    data, one, other = frame_of(FLAT, T, tilted)
+    assert mirrored(data, one, other)[0] == -np.inf
+    # and what is not flat has no mirror image that looks like it
+    data, one, other = frame_of(SOLID, T, in_mirror(T))
+    assert mirrored(data, one, other)[0] == -np.inf
+
+
+def test_a_solid_body_that_looks_the_same_in_a_mirror_is_told_from_its_image() -> None:
+    roof = np.array([[50, 0, 0], [-50, 0, 0], [0, 40, 30], [0, -40, 30], [0, 70, -10.0]])
+    T = at(-60.0, turn=0.3)
+    data, one, other = frame_of(body("roof", roof), T, in_mirror(T, (-1.0, 1.0, 1.0)))
+    odds, is_first = mirrored(data, one, other)
+    assert odds > 12.0
+    assert is_first
 
 
 def test_where_nothing_is_left_beside_the_body_nothing_is_sought() -> None:

@@ -12,6 +12,7 @@ from mixpose.body.look_alikes import (
     congruent_parts as congruent_parts,
     like_features as like_features,
     mirror_image as mirror_image,
+    reflection as reflection,
     of_points as of_points,
     of_size as of_size,
     other_tilt as other_tilt,

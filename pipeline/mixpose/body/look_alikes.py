@@ -174,18 +174,21 @@ def thickness(body: Body, features: frozenset[int] | None = None) -> float:
     return float(extents[2] / extents[1])
 
 
+def reflection(points: Floats) -> Floats:
+    """The reflection (4, 4) in the plane nearest to points (N, 3)."""
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre)[2][-1]
+    R = np.eye(3) - 2 * np.outer(normal, normal)
+    return from_parts(R, centre - R @ centre)
+
+
 @lru_cache(maxsize=64)
 def mirror_image(body: Body, near: frozenset[int]) -> Body:
     """The body reflected in the plane nearest to some of its features."""
-    points = body.means
-    chosen = points[sorted(near)]
-    centre = chosen.mean(axis=0)
-    normal = np.linalg.svd(chosen - centre)[2][-1]
-    mirrored = points - 2 * ((points - centre) @ normal)[:, None] * normal
-    outward = body.normals
+    T, outward = reflection(body.means[sorted(near)]), body.normals
     if outward is not None:
-        outward = outward - 2 * (outward @ normal)[:, None] * normal
-    return of_points(body, mirrored, outward)
+        outward = outward @ T[:3, :3]
+    return of_points(body, transform(T, body.means), outward)
 
 
 @lru_cache(maxsize=64)

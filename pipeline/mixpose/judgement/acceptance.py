@@ -61,6 +61,7 @@ class Second(NamedTuple):
     pose: ScoredPose | None  # None where there is nothing
     there: float  # log odds that it is there
     either: float  # that it is the body, and not the best pose
+    told: bool = False  # whether one of the two is seen to be the other's image in a mirror
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,10 @@ class Verdict:
     def doubted(self, more: Iterable[Alternative]) -> Verdict:
         """The same, with more alternatives."""
         return replace(self, against=(*self.against, *more))
+
+    def without(self, what: str) -> Verdict:
+        """The same, but for an alternative."""
+        return replace(self, against=tuple([one for one in self.against if one.what != what]))
 
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:

@@ -162,7 +162,8 @@ class EstimatorTable(Table):
     Example: `confidence = 0.99`"""
     mirrors: bool = False
     """Whether windows, polished tables or screens show the body as in a mirror.  A flat body looks
-    the same there, and is never `ok` then; of others the mirror image is as likely as the body.
+    the same there, and is not `ok` until it is seen beside its image; of others the mirror image is
+    as likely as the body.
     Example: `mirrors = true`"""
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -35,19 +36,22 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
+from mixpose.tracking.mirrors import mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
-from mixpose.tracking.twin import IN_A_MIRROR, is_flat, seen_beside
+from mixpose.tracking.twin import IN_A_MIRROR, MIRRORED, is_flat, seen_beside
 
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
-MIRRORED = "it shows the body's mirror image"
 
 
 def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
     verdict = decide(ranked, data.free, data.rules.acceptance)
+    if len(verdict.kept) > 1 and (images := _in_mirrors(data, verdict)):
+        own = [one for one in ranked if not any(one is image for image in images)]
+        verdict = decide(own, data.free, data.rules.acceptance)
     best = verdict.best
     if best is None:
         return verdict
@@ -80,13 +84,24 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
 
 
+def _in_mirrors(data: Frame, verdict: Verdict) -> list[ScoredPose]:
+    """Poses that show others in a mirror."""
+    images = list[ScoredPose]()
+    for (one, _), (other, _) in combinations(verdict.kept, 2):
+        odds, is_first = mirrored(data, one, other)
+        if odds > -data.rules.acceptance.log_doubt:
+            images.append(other if is_first else one)
+    return images
+
+
 def _alternatives(
     data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], told: float
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
-        yield Alternative(IN_A_MIRROR)
+        known = data.other_at(best.T_world_object)  # where it was seen beside its mirror image
+        yield Alternative(IN_A_MIRROR, 0.0 if known is None else known)
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(UNSURE, _of_chance_that_lasts(best, told))
     # of a scene with mirrors nobody knows which side a frame shows

@@ -339,10 +339,13 @@ def given(frame: Frame, T_world_object: Floats) -> float:
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 
-def follow(frame: Frame, found: Sequence[tuple[Branch, Sequence[Floats]]], **known: Any) -> Track:
+def follow(
+    frame: Frame, found: Sequence[tuple[Branch, Sequence[Floats] | None]], **known: Any
+) -> Track:
     """The track after a frame with poses, the best first, and with what else is `known` by then.
 
-    Where a pose has look-alikes, motions (4, 4) of the body, one of them may have been followed.
+    Where a pose has look-alikes, motions (4, 4) of the body, one of them may have been followed;
+    None where it goes on from nothing.
     """
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
@@ -351,8 +354,8 @@ def follow(frame: Frame, found: Sequence[tuple[Branch, Sequence[Floats]]], **kno
     for one, alike in found:
         T, deviation = one.T_world_object, one.deviation
         velocity, course, uncertainty = None, None, rules.unsteady * steady
-        parent = track.nearest(T, body)
-        if parent is not None and track.frame is not None and elapsed > 0:
+        parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
+        if parent is not None and alike is not None:
             moved, is_other = _least_moved(parent.T_world_object, T, body, alike)
             parent = replace(parent, velocity=None, course=None) if is_other else parent
             if one.spread is not None and not branches:

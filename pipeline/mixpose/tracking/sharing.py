@@ -42,12 +42,17 @@ class Explanation:
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
     rest: SeenTogether = SeenTogether()  # what no body has
-    told: Verdict | None = None  # the decision without `rest`, where it is at hand
+    told: Verdict | None = None  # `alone`, where it is at hand
+
+    @cached_property
+    def alone(self) -> Verdict:
+        """The decision without `rest`."""
+        return self.told or decided(self.frame, self.ranked)
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return with_second(self.told or decided(self.frame, self.ranked), self.frame, self.rest)
+        return with_second(self.alone, self.frame, self.rest)
 
 
 @dataclass
@@ -80,7 +85,7 @@ class Sharing:
         # of identical bodies another one is no surprise
         alone = [k for k in self.claimed if self.bodies[k].instance is None]
         told = [(k, self.found[k]) for k in alone]
-        return self.found | {k: replace(one, rest=rest, told=one.verdict) for k, one in told}
+        return self.found | {k: replace(one, rest=rest, told=one.alone) for k, one in told}
 
     def _expected(self) -> dict[int, Starts]:
         """Where bodies are expected to within their own size: farther off there may be others."""

@@ -20,10 +20,14 @@ from mixpose.judgement import APART, Alternative, ScoredPose, Second, Verdict, i
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
+from mixpose.tracking.mirrors import mirrored
 from mixpose.tracking.proposers import candidates_of
 
 TWICE = "the body seems to be there twice: a mirror image, or a second one (`count = 2`)"
+MIRRORED = "it shows the body's mirror image"
 IN_A_MIRROR = "a flat body looks the same in a mirror, and the session says that there are some"
+SECOND_POSE = "second_pose"
+"""What proposes a pose that goes on from none of the frame before."""
 
 
 def is_flat(data: Setup) -> bool:
@@ -34,10 +38,12 @@ def is_flat(data: Setup) -> bool:
 def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     """The same; in doubt where what is left of the frame's views shows the body once more.
 
-    Either may be it then, whichever was followed so far; and the other one goes on to be the other.
+    Either may be it then, whichever was followed so far, unless one is the other's mirror image;
+    and the other one goes on to be the other.
     """
     best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
-    if best is None or verdict.status != "ok":
+    alone = verdict.without(IN_A_MIRROR).without(MIRRORED)
+    if best is None or alone.status != "ok":
         return verdict
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
@@ -47,20 +53,52 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     is_there = second is not None and is_sure(second, data.free, accepted)
     if not is_there and _is_due(data, best, left):
         most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
-        verdict, found = replace(verdict, tried=most), _second_pose(data, best, rest)
+        verdict, alone = (replace(one, tried=most) for one in (verdict, alone))
+        found = _second_pose(data, best, rest)
         if found is not None:
             second, odds = found, -accepted.log_doubt
     if second is None or odds <= accepted.log_doubt:
         against = [] if known is None else [Alternative(TWICE, known)]
         return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
     either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
+    either, in_mirror = _by_mirror(either, best, second, data)
     # of all frames the one counts that tells most
     if known is not None and abs(known) > abs(either):
         either = known
-    share = float(expit(either))
+    of_image = {one.what: one for one in verdict.against if one.what in (MIRRORED, IN_A_MIRROR)}
+    if IN_A_MIRROR in of_image:
+        of_image[IN_A_MIRROR] = Alternative(IN_A_MIRROR, in_mirror)
+    alone = alone.doubted(of_image.values())
+    share, is_told = float(expit(either)), in_mirror < accepted.log_doubt
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
-    verdict = replace(verdict, kept=kept, second=Second(second, odds, either))
-    return verdict.doubted([Alternative(TWICE, either)])
+    if either <= 0:
+        alone = replace(alone, kept=kept, second=Second(second, odds, either, is_told))
+        return alone.doubted([Alternative(TWICE, either)])
+    # it is the body, of which the next frame asks what else there may be
+    return Verdict(
+        second,
+        [kept[-1], *kept[:-1]],
+        (Alternative("", -second.log_evidence), Alternative(TWICE)),
+        alone.most,
+        alone.tried,
+        Second(best, odds, -either, is_told),
+        # what was mirrored is its image
+        {name: told for name, told in data.track.mistaken.items() if name != MIRRORED},
+    )
+
+
+def _by_mirror(
+    either: float, best: ScoredPose, second: ScoredPose, data: Frame
+) -> tuple[float, float]:
+    """Log odds that the second pose is the body, with those before that were `either`.
+
+    And that neither of the two shows the other in a mirror.
+    """
+    odds, is_first = mirrored(data, best, second)
+    in_none = -float(np.logaddexp(0.0, odds))
+    if is_first:
+        return either + in_none, in_none
+    return float(np.log(np.expm1(np.logaddexp(0.0, either) - in_none))), in_none
 
 
 def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
@@ -144,7 +182,7 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
         is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
         if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
-            return replace(pose, proposer="second_pose")
+            return replace(pose, proposer=SECOND_POSE)
     return None
 
 
