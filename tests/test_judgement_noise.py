@@ -272,3 +272,19 @@ def test_sums_over_markers_are_those_over_pairs_of_markers() -> None:
     markers, taken = noise.of_each(by_place, seen), J.T @ P
     given = fields, left, noise.of_each(left, seen), markers, taken, np.linalg.inv(A) @ taken
     np.testing.assert_allclose(noise.expected_squares(*given, kinds), exact, rtol=1e-9, atol=1e-9)
+
+
+def test_what_a_frame_leaves_open_is_no_wider_than_anywhere() -> None:
+    rng = np.random.default_rng(0)
+    one = sensor("0", rng, 0.1 * rng.standard_normal((40, 2)))
+    one.J[..., 4] = 0.0  # a turn that it does not see, and a shift that is next to another one
+    one.J[..., 1] = one.J[..., 0] * (1 + 1e-9 * rng.standard_normal(one.J[..., 0].shape))
+    anywhere = np.repeat([1e4, 2.0], 3)
+    found = matches_of(one)
+    covariance = noise_of(found, FREE, RememberedNoise(), MODEL, None, anywhere, anywhere)[1]
+    own, bounded = np.linalg.eigvalsh(covariance), np.diag(covariance)
+    assert own.min() > 0.0
+    # the noise is known to few degrees of freedom, for which all of it is larger
+    larger = MODEL.enlargement(MODEL.guess)
+    assert 0.9 * 2.0**2 < bounded[4] < larger * 2.0**2 * 1.01
+    assert 0.4 * 1e8 < bounded[0] < larger * 1e8

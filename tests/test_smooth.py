@@ -222,6 +222,38 @@ def test_the_track_tells_which_hypothesis_of_ambiguous_frames_is_right() -> None
         assert rigid.rotation_angle_deg(one.T_world_object, truth[k]) < 0.5  # the tilt is 23 deg
 
 
+def test_the_track_tells_nothing_of_a_body_of_another_size() -> None:
+    covariance = covariance_of(0.1, 0.001)
+    lines = lines_of(measured(swinging(40), covariance), covariance)
+    T = lines[20].T_world_object
+    assert T is not None
+    doubt, rivals = "the body seems to be of another size", (Hypothesis(T, 1.0),)
+    # and one in doubt for clutter, which goes along with no track
+    for k, why in ((20, doubt), (30, "")):
+        changed = replace(lines[k], status="ambiguous", confidence=0.4, hypotheses=rivals)
+        lines[k] = replace(changed, doubt=why)
+    smooth = smooth_body(lines, rules=QUICK)
+    one, other = smooth.estimates[20], smooth.estimates[30]
+    assert (one.status, one.doubt) == ("ambiguous", doubt)
+    assert one.confidence == pytest.approx(0.4, abs=1e-4)
+    assert other.confidence is not None
+    assert other.confidence > 0.9
+
+
+def test_a_pose_that_says_next_to_nothing_moves_no_others() -> None:
+    covariance = covariance_of(0.1, 0.001)
+    lines = lines_of(measured(swinging(40), covariance), covariance)
+    usual = smooth_body(lines, rules=QUICK).estimates
+    for power in (6, 12, 20):
+        lines[20] = replace(lines[20], covariance=covariance * 10.0**power)
+        changed = smooth_body(lines, rules=QUICK).estimates
+        for k in (0, 10, 30, 39):
+            before, after = usual[k].T_world_object, changed[k].T_world_object
+            assert before is not None
+            assert after is not None
+            assert np.abs(after - before)[:3, 3].max() < 0.01  # a tenth of a deviation
+
+
 @pytest.mark.parametrize("seed", [4, 11])
 def test_no_probability_of_many_paths_is_above_1(seed: int) -> None:
     truth, covariance = swinging(40), covariance_of(0.1, 0.001)

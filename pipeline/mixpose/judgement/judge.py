@@ -47,6 +47,9 @@ class JudgementRules:
     noise: NoiseModel = NoiseModel()
 
 
+# deviations of what a frame leaves open, in those of where nothing is known: a turn is any, and a
+# place is farther away than anybody looks
+_FARTHEST = np.repeat([100.0, 1 / math.sqrt(3)], 3)
 MEETS_NOTHING = "it meets nothing of the body"
 
 
@@ -160,9 +163,11 @@ def judge_together(
     for case in cases:
         at = case.objective, case.T_world_object
         whole.append(case.matches or associate(*at, *association))
-        known = (case.prior or flat_prior(case.body, free, rules.detection))[1]
+        anywhere = flat_prior(case.body, free, rules.detection)[1]
+        known = case.prior[1] if case.prior else anywhere
         part = taken_part(whole[-1], left_out)
-        noises.append(noise_of(part, free, case.before, rules.noise, case.noise, known))
+        given = case.before, rules.noise, case.noise, known, _FARTHEST * anywhere
+        noises.append(noise_of(part, free, *given))
         counted.append(case.clutter.log_odds(part, rules.detection.log_blind))
     # one pose needs no axis of poses
     variances, seen = noises[0][0], whole[0]

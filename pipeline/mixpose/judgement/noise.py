@@ -118,6 +118,7 @@ def noise_of(
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
     known: Floats = np.full(6, np.inf),  # how uncertain the pose was before
+    anywhere: Floats = np.full(6, np.inf),  # and where nothing is known
 ) -> tuple[Floats, Floats, Floats, RememberedNoise, float, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
@@ -141,7 +142,8 @@ def noise_of(
         r, rows, fields = (_folded(one, found) for one in (r, rows, fields))
     J = rows[:, chosen]
     markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
-    inverse, q = inverted(information := J.T @ J), fields.shape[1]
+    information, q = J.T @ J + np.diag(anywhere[chosen] ** -2.0), fields.shape[1]
+    inverse = inverted(information)
     by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
     taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
     # by how much fields move the pose, and what it leaves of those of sensors, which may last

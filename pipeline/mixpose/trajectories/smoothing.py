@@ -328,7 +328,10 @@ def _estimate(
         return replace(one, status="ambiguous", confidence=0.0, hypotheses=rivals)
     if not line.hypotheses or not is_met:
         return one
-    shares = choice.probabilities
+    shares, first = choice.probabilities, line.hypotheses[0].weight
+    # a track tells a pose from its rivals, and from clutter, and nothing of a wrong session
+    if line.doubt and line.confidence is not None:
+        shares = shares * min(line.confidence / max(first, 1e-6), 1.0)
     sure = float(shares[choice.which])
     if sure >= rules.sure:
         return replace(one, status="ok", confidence=sure, hypotheses=())

@@ -11,7 +11,7 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
 
 _DIFFUSE = 10.0  # times the motion from frame to frame: nothing is known of rates at first
-_FLOOR = 1e-9  # of the largest variance: what float64 can tell apart
+_FLOOR = 1e-9  # of a pose's largest variance: what float64 can tell apart
 
 
 @dataclass(frozen=True)
@@ -55,19 +55,20 @@ def of_free(covariances: Floats, free: Mask) -> Floats:
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
     """A track whose covariances can be inverted; directions without variance are held.
 
-    A held direction gets the mean variance of the others of its kind: its poses agree, so that any
-    will do.
+    A held direction gets the median variance of the others of its kind: its poses agree, so that
+    any will do.
     """
     seen = covariances[measured]
-    variances = np.diagonal(seen, axis1=1, axis2=2).max(axis=0)
+    variances = np.median(np.diagonal(seen, axis1=1, axis2=2), axis=0)
     kinds = variances.reshape(2, 3).max(axis=1).repeat(3)
     free = variances > 1e-12 * np.where(kinds > 0, kinds, np.inf)
     covariances = of_free(covariances, free)
-    typical = np.diagonal(seen, axis1=1, axis2=2).mean(axis=0)
+    own = np.diagonal(covariances, axis1=1, axis2=2)
     for kind in (slice(0, 3), slice(3, 6)):
-        own = free[kind]
-        mean = typical[kind][own].mean() if own.any() else 1.0
-        floor = np.where(own, _FLOOR * mean, mean)
+        each, some = own[:, kind].max(axis=1), free[kind]
+        # where poses say hardly anything theirs are larger than all others by any factor
+        typical = float(np.median(own[measured][:, kind][:, some])) if some.any() else 1.0
+        floor = np.where(some, _FLOOR * each[:, None], typical)
         covariances[:, range(kind.start, kind.stop), range(kind.start, kind.stop)] += floor
     return Track(times, poses, covariances, measured, free)
 
