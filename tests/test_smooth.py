@@ -225,19 +225,19 @@ def test_the_track_tells_which_hypothesis_of_ambiguous_frames_is_right() -> None
 def test_the_track_tells_nothing_of_a_body_of_another_size() -> None:
     covariance = covariance_of(0.1, 0.001)
     lines = lines_of(measured(swinging(40), covariance), covariance)
-    T = lines[20].T_world_object
-    assert T is not None
-    doubt, rivals = "the body seems to be of another size", (Hypothesis(T, 1.0),)
+    doubt = "the body seems to be of another size"
     # and one in doubt for clutter, which goes along with no track
     for k, why in ((20, doubt), (30, "")):
+        T = lines[k].T_world_object
+        assert T is not None
+        rivals = (Hypothesis(T, 1.0),)
         changed = replace(lines[k], status="ambiguous", confidence=0.4, hypotheses=rivals)
         lines[k] = replace(changed, doubt=why)
     smooth = smooth_body(lines, rules=QUICK)
     one, other = smooth.estimates[20], smooth.estimates[30]
     assert (one.status, one.doubt) == ("ambiguous", doubt)
     assert one.confidence == pytest.approx(0.4, abs=1e-4)
-    assert other.confidence is not None
-    assert other.confidence > 0.9
+    assert other.status == "ok"
 
 
 def test_a_pose_that_says_next_to_nothing_moves_no_others() -> None:
