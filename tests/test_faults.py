@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from matches import Seen, scored
 
 from mixpose.cli.findings import Stretches
-from mixpose.judgement import AcceptanceRules, NoiseModel, one_misses
+from mixpose.judgement import AcceptanceRules, NoiseModel, others_miss
 from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -169,7 +170,7 @@ def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> 
 
 
 def is_missed(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
-    return one_misses(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
+    return others_miss(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
 
 
 @pytest.fixture
@@ -198,6 +199,19 @@ def test_a_sensor_that_never_met_the_body_but_sees_as_much_is_not_believed(
     assert not is_missed([one, empty], np.zeros(2), False)
     # once they agreed, what is seen elsewhere may be anything
     assert not is_missed([one, empty])
+
+
+def test_one_sensor_of_four_is_not_believed_where_others_see_as_much_elsewhere(
+    jacobians: Floats,
+) -> None:
+    one, other = seen(jacobians, [0.0, 0.0])
+    blind = sensor("2", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
+    empty = sensor("3", np.zeros((7, 2)), jacobians[2], np.zeros(7), 0.0)
+    for agreed in (False, True):
+        assert is_missed([one, blind, replace(blind, name="1"), empty], agreed=agreed)
+        # two that agree outvote it, and blind ones say nothing
+        assert not is_missed([one, other, blind, empty], agreed=agreed)
+        assert not is_missed([one, empty, replace(empty, name="1")], agreed=agreed)
 
 
 def test_stretches_are_told_with_the_longest_first_in_the_order_of_the_run() -> None:

@@ -14,7 +14,7 @@ from mixpose.judgement.acceptance import (
     is_possible as is_possible,
     is_sure as is_sure,
     nearest_alike as nearest_alike,
-    one_misses as one_misses,
+    others_miss as others_miss,
 )
 from mixpose.judgement.evidence import (
     DetectionModel as DetectionModel,

@@ -257,36 +257,36 @@ def _are_one(
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 
-def one_misses(
+def others_miss(
     judged: ScoredPose, before: Floats, agreed: bool, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
-    """Whether one of two sensors meets most of the body, and the other sees as much elsewhere.
+    """Whether one sensor alone meets most of the body, and another sees as much elsewhere.
 
     `before` are squares and degrees of freedom (2,) of residuals of the frames before; where two
-    sensors `agreed` in one of them, one may miss the body now.
+    sensors `agreed` in one of them, others may miss the body now.
     """
-    used = judged.matches  # of a sensor that is left out as well
-    if len(used.images) != 2 or (used.dimensions != 2).any():
+    used = judged.matches  # of sensors that are left out as well
+    if len(used.images) < 2 or (used.dimensions != 2).any():
         return False
     coverage, nearby, missed, count, met = (
         used.summed(each) / used.images
         for each in (used.coverage, used.unmatched_nearby, used.missed, used.count, used.met)
     )
-    least, most = sorted(range(2), key=coverage.tolist().__getitem__)
-    if not coverage[least] < rules.agreeing <= coverage[most]:
+    *_, second, first = sorted(range(len(coverage)), key=coverage.tolist().__getitem__)
+    if not coverage[second] < rules.agreeing <= coverage[first]:
         return False
-    # beside the body, or, where the two never agreed, anywhere
-    beside, needed = nearby[least], missed[least]
+    # beside the body, or, where no two ever agreed, anywhere
+    beside, needed = nearby, missed
     if not agreed:
-        beside, needed = count[least] - met[least], met[most]
-    if needed <= 0 or beside < rules.agreeing * needed:
-        return False
-    # what it meets is of the body, against detections anywhere near
+        beside, needed = count - met, np.full(len(met), met[first])
+    sees = (needed > 0) & (beside >= rules.agreeing * needed)
+    sees[first] = False
+    # what each meets is of the body, against detections anywhere near
     variance = _variance(before, model, model.errors.typical)
     v = min(variance, model.usual**2) + used.extra
     odds = np.log(model.errors.met**2 / (2 * v)) - used.squared / (2 * v)
     odds = used.summed(np.vecdot(used.shares, odds) * used.each_part)
-    return bool(odds[least] < -rules.log_doubt)
+    return bool((odds[sees] < -rules.log_doubt).any())
 
 
 def _variance(before: Floats, model: NoiseModel, typical: float) -> float:

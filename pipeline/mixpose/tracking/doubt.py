@@ -29,7 +29,7 @@ from mixpose.judgement import (
     is_open,
     is_sure,
     odds_of_each,
-    one_misses,
+    others_miss,
     possible_mistakes,
     shape_shown,
 )
@@ -108,7 +108,7 @@ def _alternatives(
     mirrored = 0.5 if data.options.mirrors else rules.mistaken
     likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
     yield from map(Alternative, (one.what for one in mistakes), odds_of_each(mistakes, likely))
-    if one_misses(best, _noise_before(data, best), track.agreed, rules, noise):
+    if others_miss(best, _noise_before(data, best), track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
