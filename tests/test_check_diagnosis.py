@@ -431,3 +431,21 @@ def test_a_body_far_larger_than_what_is_seen_is_searched_for_without_a_remark(
     larger = with_points(right, right.body.means * 1000)
     (estimate,) = mixpose.run(larger, selection=Selection(0, 1))
     assert estimate.status != "ok"
+
+
+def test_corners_that_are_taken_for_spots_are_told(recordings: Path, tmp_path: Path) -> None:
+    # centres of a chessboard's dark squares lie as a part of its corners do, half a square aside
+    source = recordings / "stereo_chessboard"
+    for path in (*source.glob("*.jpg"), *source.glob("*.yml")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    content = (source / "session.toml").read_text()
+    extract = content.index("[extract]")
+    kept = content[extract:].replace('method = "corners"', "").replace("sigma = 2.0", "")
+    for polarity in ("bright", "dark"):
+        changed = kept.replace("[extract]", f'[extract]\npolarity = "{polarity}"')
+        (tmp_path / "session.toml").write_text(content[:extract] + changed)
+        session = load_session(tmp_path / "session.toml")
+        sources = open_sources(session, {})
+        surveys = {s.name: survey(session, s, sources[s.name]) for s in session.sensors}
+        (warning, *_) = geometry_doubts(session, sources, surveys).warnings
+        assert 'corners and no spots: with method = "corners" in [extract]' in warning

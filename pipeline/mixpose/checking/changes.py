@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, PointFeature, of_points, of_size
-from mixpose.checking.evidence import Frames, Views, anywhere, best_pose
+from mixpose.checking.evidence import Frames, Views, anywhere, best_pose, can_tell
+from mixpose.checking.rules import DiagnosisRules
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
@@ -297,7 +298,9 @@ def _other_sizes(session: Session, found: Sequence[dict[str, Any]]) -> Iterator[
 
 def _alone(session: Session, number: int, view: View) -> Floats | None:
     """T_world_object (4, 4) that one camera finds by itself."""
-    if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
+    is_camera = isinstance(view.sensor, PinholeCamera | FisheyeCamera)
+    if not (is_camera and can_tell([view], len(session.body))):
         return None
-    pose, _ = best_pose(anywhere(session), session.body, number, [view])
+    most = DiagnosisRules().guesses
+    pose, _ = best_pose(anywhere(session), session.body, number, [view], most)
     return None if pose is None else pose.T_world_object

@@ -20,6 +20,7 @@ from mixpose.judgement import ScoredPose
 from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Indices, Mask, PointPattern
+from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.sensors.moving import moments
@@ -35,6 +36,7 @@ Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
 
 _BEGIN_S = 0.0  # of the first frame, of which the time tells nothing but that sensors have one
 _FEW = 3  # features in view that tell of a pose
+_FEWEST = 0.1  # of the body's features, without which no pose is told
 _MISSED = 0.3  # of the body: a camera that meets less mostly misses it
 _REACH = 3.0  # times sigma, from a displaced feature to its detection
 _BESIDE = 10.0  # times sigma, from a feature that is missed to a detection that may be its own
@@ -118,6 +120,19 @@ def estimate_of(session: Session, number: int, views: Views) -> Estimate:
     """What a run tells of a frame that is its first."""
     tracker, track = begin(session)
     return tracker.advance(track, number, _BEGIN_S, views)[1]
+
+
+def can_tell(views: Views, features: int) -> bool:
+    """Whether detections have more coordinates than a pose, which meets as many as it has itself.
+
+    And are a tenth of the body's features at least: each that is met gains up to ten nats against
+    clutter, and one that is missed costs two.
+    """
+    patterns = [view.observation.pattern for view in views]
+    points = [each.points for each in patterns if isinstance(each, PointPattern)]
+    are_few = max(map(len, points), default=0) < _FEWEST * features
+    are_enough = sum(each.size for each in points) > len(TWIST_NAMES) and not are_few
+    return len(points) < len(patterns) or are_enough
 
 
 def best_pose(

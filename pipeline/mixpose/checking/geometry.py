@@ -6,13 +6,19 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.checking.changes import Change, called, of_units
-from mixpose.checking.evidence import Frames, Views, estimate_of, evidence_of, pose_near
+from mixpose.checking.evidence import (
+    Frames,
+    can_tell,
+    estimate_of,
+    evidence_of,
+    pose_near,
+)
 from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
@@ -22,8 +28,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
 from mixpose.judgement import APART
-from mixpose.records import Estimate, FrameSet, PointPattern
-from mixpose.rigid import TWIST_NAMES
+from mixpose.records import Estimate, FrameSet
 from mixpose.runner import observe
 from mixpose.sensors import CloudSensor, FisheyeCamera, PinholeCamera
 from mixpose.session import Session
@@ -69,7 +74,8 @@ def geometry_doubts(
     if not frames:
         return Doubts()
     others = _otherwise(recording, [number for number, _ in frames])
-    if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
+    seen = [views for each in (frames, *(changed for _, changed in others)) for _, views in each]
+    if not any(can_tell(views, len(session.body)) for views in seen):
         return _at_the_start(recording)
 
     def further() -> Frames:
@@ -174,13 +180,6 @@ class _Recording:
             yield FrameSet(number, next(times, None), frames)  # as they are paired
 
 
-def _can_tell(views: Views) -> bool:
-    """Whether features have more coordinates than a pose, which meets as many as it has itself."""
-    patterns = [view.observation.pattern for view in views]
-    points = [each.points for each in patterns if isinstance(each, PointPattern)]
-    return len(points) < len(patterns) or sum(each.size for each in points) > len(TWIST_NAMES)
-
-
 def _at_the_start(recording: _Recording) -> Doubts:
     """Whether the first frame has the body at [start] only if points are in another unit."""
     rules, session, start = DiagnosisRules(), recording.session, recording.session.start
@@ -248,28 +247,36 @@ def _by_some(estimate: Estimate) -> str:
 
 
 def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:
-    """The other polarity, where images hold too few features or too many."""
+    """Other polarity, and spots for corners, where images hold too few features or too many."""
     session, surveys = recording.session, recording.surveys
     for setup in session.sensors:
         counts, expected = surveys[setup.name].counts, expected_count(setup, session)
         is_odd = (
             counts
             and surveys[setup.name].size is not None
-            and setup.extract.method in ("blobs", "log")
+            and setup.extract.method in ("blobs", "log", "corners")
             and judge(float(np.median(counts)), expected, fewest_count(setup, session)) is not None
         )
         if not is_odd:
             return []
-    is_bright = session.sensors[0].extract.polarity == "bright"
-    polarity: Literal["bright", "dark"] = "dark" if is_bright else "bright"
-    setups = [replace(s, extract=replace(s.extract, polarity=polarity)) for s in session.sensors]
-    changed = replace(session, sensors=tuple(setups))
-    own = [setup.name for setup in session.sensors if "polarity" in setup.own]
-    tables = ["[extract]"] if len(own) < len(setups) else []
-    tables += [f"[sensor.extract] of {called(own)}"] if own else []
-    change = Change(
-        f"features {{are}} {polarity} in the images",
-        f'with polarity = "{polarity}" in {" and in ".join(tables)}',
-    )
-    anew = replace(recording, surveys={}).read(numbers)
-    return [(change, [(each.number, observe(changed, each)) for each in anew])]
+    given, found = session.sensors[0].extract, list[tuple[Change, Frames]]()
+    polarity = "dark" if given.polarity == "bright" else "bright"
+    other = "blobs" if given.method == "corners" else "corners"
+    words = {"blobs": "spots and no corners", "corners": "corners and no spots"}
+    for key, value, what in (
+        ("polarity", polarity, f"{polarity} in the images"),
+        ("method", other, words[other]),
+    ):
+        if key == "polarity" and given.method == "corners":
+            continue  # which have none
+        own = [setup.name for setup in session.sensors if key in setup.own]
+        tables = ["[extract]"] if len(own) < len(session.sensors) else []
+        tables += [f"[sensor.extract] of {called(own)}"] if own else []
+        where = " and in ".join(tables)
+        change = Change(f"features {{are}} {what}", f'with {key} = "{value}" in {where}')
+        option: dict[str, Any] = {key: value}
+        setups = [replace(s, extract=replace(s.extract, **option)) for s in session.sensors]
+        changed = replace(session, sensors=tuple(setups))
+        anew = replace(recording, surveys={}).read(numbers)
+        found.append((change, [(each.number, observe(changed, each)) for each in anew]))
+    return found

@@ -84,7 +84,7 @@ def advice(
             f"with no value tried the body is found for sure{rule}; clutter is allowed for, and "
             "mixpose inspect shows what is found"
         )
-    keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
+    keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
     usual = "polarity, threshold, min_area and max_area"
     change = keys.get(options.method, usual)
     own = [key for key in re.findall(r"\w+", change) if key in setup.own]
@@ -131,7 +131,9 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
         trials += [("threshold", rule) for rule in ("local", "otsu", "triangle", "li", "sauvola")]
         trials += [("min_area", area) for area in (3.0, 1.0, 10.0, 30.0, 100.0, 300.0)]
         trials += [("max_area", area) for area in (30.0, 100.0, 1000.0) if area > options.min_area]
-        trials.append(("method", "log"))
+        trials += [("method", "log"), ("method", "corners")]
+    if options.method == "corners":
+        trials = [("threshold", "auto"), ("method", "blobs")]
     if options.method == "log":
         trials += [("spot_sigma", width) for width in (3.0, 1.5, 6.0, 12.0)]
     low, high = float(image.min()), float(image.max())

@@ -40,6 +40,9 @@ class LookAlikeRules:
     )
     alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
     behind: float = constant(50.0, "nats at σ_ε: rivals gain 25 by narrow blurs; 25 make no odds")
+    tried: int = constant(
+        4, "that meet most, of what is likelier clutter: a slip of the body itself"
+    )
     fewer: float = constant(1.5, "features fewer that a rival may meet: each is e⁴ in odds, or so")
     flat: float = constant(0.15, "thickness by smaller width below which what is met may be tilted")
     by_chance: float = constant(14.0, "coordinates beyond six met by chance: 5 points, 2 cameras")
