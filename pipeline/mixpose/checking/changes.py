@@ -90,14 +90,7 @@ def changes(session: Session) -> Iterator[Change]:
                     distortion=lenses[view.name].distortion,
                 ),
             )
-    sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
-    for names in _all_or_one(list(sized)):
-        yield _of_sensors(
-            f"images of {called(names)} {{are}} mirrored",
-            "with left and right of them exchanged",
-            names,
-            lambda view: _flipped(view, sized[view.name]),
-        )
+    yield from _flips(cameras, "mirrored", "left and right", 0)
     for names in _all_or_one([setup.name for setup in cameras]):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
             yield _of_sensors(
@@ -106,6 +99,25 @@ def changes(session: Session) -> Iterator[Change]:
                 names,
                 lambda view, k=factor: with_sensor(view, scaled(view.sensor, k)),  # type: ignore[misc]
             )
+
+
+def rare_changes(session: Session) -> Iterator[Change]:
+    """Others, that are not tried along with a second one."""
+    cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
+    if len(cameras) > 1:  # to one camera that is mirrored, but for a half-turn
+        yield from _flips(cameras, "upside down", "top and bottom", 1)
+
+
+def _flips(cameras: Sequence[SensorSetup], what: str, ends: str, axis: int) -> Iterator[Change]:
+    """Images of which an axis counts from the other end."""
+    sized = {s.name: s.resolution for s in cameras if s.resolution is not None}
+    for names in _all_or_one(list(sized)):
+        yield _of_sensors(
+            f"images of {called(names)} {{are}} {what}",
+            f"with {ends} of them exchanged",
+            names,
+            lambda view: _flipped(view, sized[view.name][axis], axis),
+        )
 
 
 def _of_sensors(
@@ -238,8 +250,10 @@ def _swapped(views: Views, a: str, b: str) -> Views:
     ]
 
 
-def _flipped(view: View, width: int) -> View:
-    return _with_points(view, lambda points: points * [-1.0, 1.0] + [width - 1.0, 0.0])
+def _flipped(view: View, pixels: int, axis: int) -> View:
+    """A view of which an axis, of so many pixels, counts from the other end."""
+    along = np.arange(2) == axis
+    return _with_points(view, lambda points: np.where(along, pixels - 1.0 - points, points))
 
 
 def _with_points(view: View, changed: Callable[[Floats], Floats]) -> View:

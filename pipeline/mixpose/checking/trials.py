@@ -18,7 +18,7 @@ import numpy as np
 
 from mixpose.body import of_points
 from mixpose.checking import evidence
-from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes, rare_changes, with_sensor
 from mixpose.checking.evidence import Explained, Frames, Views, best_pose, evidence_of
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
@@ -53,6 +53,7 @@ class _Runner:
     change: Change
     frames: Frames
     poses: list[ScoredPose | None] = field(default_factory=list)
+    leads: bool = True  # whether others are tried along with it
 
     def advance(self, session: Session, useful: float) -> int:
         """Try the next frame, for a pose of `useful` evidence; the guesses that took."""
@@ -154,6 +155,7 @@ def _without_values(case: _Case, others: Sequence[tuple[Change, Frames]]) -> Ite
     """Changes that explain frames better: a race in which those far behind the best drop out."""
     session, before, runners = case.session, case.before, [_Runner(*each) for each in others]
     runners += [_Runner(change, case.frames) for change in changes(session)]
+    runners += [_Runner(change, case.frames, leads=False) for change in rare_changes(session)]
     rules, left = DiagnosisRules(), DiagnosisRules().all_guesses
     for k in range(len(case.frames)):
         best = 0.0
@@ -184,7 +186,9 @@ def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
     def best() -> list[_Runner]:
         ahead = [one for one in runners if one.gain(case.before) > rules.margin]
         ahead.sort(key=lambda one: -one.gain(case.before))
-        return [] if ahead and ahead[0].explains(rules) else ahead[: rules.leaders]
+        if ahead and ahead[0].explains(rules):
+            return []
+        return [one for one in ahead if one.leads][: rules.leaders]
 
     first = [one for one in runners if one.poses and one.explains(rules)]
     if best() or not first:

@@ -18,6 +18,7 @@ from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source
+from mixpose.frames.tables import DetectionTable
 from mixpose.judgement import expected_covariance
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, transform
@@ -45,12 +46,12 @@ class _Report:
     def warn(self, text: str) -> None:
         self.warnings.append(f"{self.of}{text}")
 
-    def write(self, tried: str) -> None:
-        """Print all; `tried` is what is known where nothing is warned of."""
+    def write(self, tried: str, beside: str = "") -> None:
+        """Print all; `tried` is what is known where nothing is warned of, `beside` what follows."""
         for warning in self.warnings:
             self.say("warning", warning)
         if not self.warnings:
-            self.say("warnings", f"none; {tried}")
+            self.say("warnings", f"none{beside}; {tried}")
         sys.stdout.write("\n".join(self.lines) + "\n")
 
 
@@ -98,8 +99,9 @@ def check_session(request: CheckRequest) -> None:
     report.warnings = [*_pairing_warnings(opened), *report.warnings]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
-    report.write(doubts.tried or not_tried)
     damage = [text for each in surveys.values() for text in each.damage]
+    beside = " but for the error that follows" if damage else ""
+    report.write(doubts.tried or not_tried, beside)
     if damage:
         more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
         raise RecordingError(f"{damage[0]}{more}")
@@ -177,16 +179,22 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
         known = set().union(*(each for other, each in numbers.items() if other != name))
         pairs = len(own & known)
         if known and pairs < 0.5 * min(len(own), len(known)):
+            is_table = isinstance(sources[name], DetectionTable)
+            by = (
+                "in the column frame; count all tables alike"
+                if is_table
+                else "that their names end in; rename the files"
+            )
             warnings.append(
                 f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other "
-                "sensors: frames are paired by the number that their names end in; rename the files"
+                f"sensors: frames are paired by the number {by}"
             )
     for (one, own), (other, others) in combinations(numbers.items(), 2):
         if own & others and own != others and {k - min(own) + min(others) for k in own} == others:
             warnings.append(
                 f"sensors {one!r} and {other!r} have {len(own)} frames each, numbered from "
-                f"{min(own)} and from {min(others)}: if both began at once, rename the files of "
-                "one, as frames of one number are taken together"
+                f"{min(own)} and from {min(others)}: if both began at once, number those of one "
+                "anew, as frames of one number are taken together"
             )
     return warnings
 

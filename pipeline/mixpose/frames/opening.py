@@ -9,6 +9,7 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Callable, Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 
 from mixpose.errors import RecordingError, SessionError
@@ -150,6 +151,11 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
     )
 
 
+def _alike(name: str, wanted: str) -> float:
+    """How much a name is like one that is not there, to a tenth: 1 but for its case."""
+    return round(SequenceMatcher(None, name.lower(), wanted.lower()).ratio(), 1)
+
+
 def _looked_in(path: Path) -> str:
     """The folder where a file was looked for, and what lies there instead."""
     folder = path.parent
@@ -165,7 +171,9 @@ def _looked_in(path: Path) -> str:
         return f"{text}, which cannot be read: {error.strerror}"
     # files numbered alike are shown by their first
     kinds = {re.sub(r"[0-9]+", "0", each.name): each.name for each in reversed(names)}
-    shown = ", ".join(list(kinds.values())[::-1][:_SHOWN])
+    kept = list(kinds.values())[::-1]
+    kept.sort(key=lambda name: -_alike(name, path.name))
+    shown = ", ".join(kept[:_SHOWN])
     more = f", ... ({len(names)} in all)" if len(names) > min(len(kinds), _SHOWN) else ""
     return f"{text}, where there is {shown}{more}" if names else f"{text}, which is empty"
 

@@ -24,7 +24,7 @@ from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent
+from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent, predicted, searched
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
@@ -186,6 +186,9 @@ class Tracker(Setup):
         reports = dict.fromkeys(data.sensors, SensorReport(False))
         reports |= shown.reports(_residuals(used, body) if used else {}) if shown else {}
         rivals = verdict.kept if verdict.status == "ambiguous" else ()
+        origin = best.proposer if best else ""
+        if data.is_found_at_once and origin == predicted.__name__:
+            origin = searched.__name__
         return Estimate(
             frame=data.frame,
             time_s=data.time_s,
@@ -198,7 +201,7 @@ class Tracker(Setup):
             sensors=reports,
             hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
             instance=self.instance,
-            proposer=best.proposer if best else "",
+            proposer=origin,
             blurs=best.blurs if best else (),
             guesses=data.searches[-1][0] if data.searches else None,
             delays=after.delays.seconds,
