@@ -14,6 +14,7 @@ from mixpose.records import Estimate, Floats
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 
+_ROUNDED = 1e-4  # deg, of true poses that are equal
 _RESTS = 5.0  # times its deviation: a body that is nowhere farther off its mean rests
 _FLAT = 1e-6  # of the largest spread: points on a line span no plane
 _SURELY = 3.0  # times what they are off the plane, or err by: points on a line span none by chance
@@ -45,7 +46,9 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
         bodies.setdefault(each.label, []).append(each)
     rests = [_rests(own) for own in bodies.values()]
     if len(bodies) == 1 and rests[0]:
-        return Floor(_mean_pose(estimates), f"the body {estimates[0].label!r}")
+        T = _mean_pose(estimates)
+        _require_still(estimates, T)
+        return Floor(T, f"the body {estimates[0].label!r}")
     if all(rests):
         points = np.stack([np.mean([_point(e) for e in own], axis=0) for own in bodies.values()])
     if not all(rests) or len(points) < 3:
@@ -76,6 +79,18 @@ def _rests(estimates: Sequence[Estimate]) -> bool:
     points = np.stack([_point(each) for each in estimates])
     away = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
     return bool(away <= _RESTS * np.sqrt(np.mean([np.trace(_covariance(e)) for e in estimates])))
+
+
+def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
+    """Raise a RecordingError where a body whose point rests turns about it."""
+    poses = [each.T_world_object for each in estimates if each.T_world_object is not None]
+    turned = max(rigid.rotation_angle_deg(T_mean, T) for T in poses)
+    known = [np.trace(e.covariance[3:, 3:]) for e in estimates if e.covariance is not None]
+    if turned > _RESTS * np.degrees(np.sqrt(np.mean(known or [0.0]))) + _ROUNDED:
+        raise RecordingError(
+            f"the body {estimates[0].label!r} turns by {turned:.3g} deg about a point that rests; "
+            "allowed: a body that rests, or poses of which these points are all over the floor"
+        )
 
 
 def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
