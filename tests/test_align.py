@@ -122,7 +122,7 @@ def test_what_spans_no_floor_is_refused() -> None:
     # a tool that is turned about its tip
     tip, turns = np.array([3.0, -8.0, -150.0]), rigid.rotation_matrix(np.diag([0.1, 0.3, 0.5]))
     about = estimates_at(rigid.from_parts(turns, FLOOR[:3, 3] - turns @ tip))
-    with pytest.raises(RecordingError, match="turns by .* deg about a point that rests"):
+    with pytest.raises(RecordingError, match=r"turns by .* deg about a point that rests"):
         floor_of([replace(each, tip_object=tip) for each in about], "z", ABOVE)
     anywhere = rigid.from_parts(np.eye(3), np.random.default_rng(0).normal(size=(9, 3)) * 100)
     with pytest.raises(RecordingError, match="no plane"):
