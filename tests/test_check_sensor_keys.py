@@ -56,6 +56,14 @@ def test_a_calibration_of_images_twice_as_large_is_doubted(session: Session) -> 
     assert "of 640x512 px: is the calibration of images of another size" in warning
 
 
+def test_a_width_of_a_twentieth_of_the_image_is_doubted(session: Session) -> None:
+    widest = 0.05 * max(session.sensors[0].resolution or (0, 0))
+    for sigma, doubted in ((0.99 * widest, False), (1.01 * widest, True)):
+        setups = [replace(s, extract=replace(s.extract, sigma=sigma)) for s in session.sensors]
+        said = key_warnings(replace(session, sensors=tuple(setups)))
+        assert any("wider than a twentieth of the image" in one for one in said) == doubted
+
+
 def test_ranges_with_the_width_of_pixels_are_doubted() -> None:
     ranges = load_session(SYNTHETIC / "range_profiles" / "session.toml")
     wide = [replace(s, extract=replace(s.extract, sigma=500.0)) for s in ranges.sensors]

@@ -31,6 +31,7 @@ _SHARED, _OWN = "in [extract]", "in its own [sensor.extract]"
 _ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
 _MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
 _OFF_CENTRE = 0.25  # of the image: lenses are centred better, crops and other sizes often are not
+_WIDEST = 0.05  # of an image: what is as wide hides how features of a body lie
 _NOISES = 3.0  # standard deviations that markers may be off each other
 _LEAST = 0.01  # of the smaller body's radius: nearer than this they are the same
 
@@ -185,22 +186,28 @@ def _off_centre(session: Session) -> list[str]:
 
 
 def _too_wide(session: Session) -> list[str]:
-    """Ranges given a width in which the whole body disappears, as by the default for pixels."""
-    wide = [
-        setup
-        for setup in session.sensors
-        if isinstance(setup.sensor, RangeSensor) and setup.extract.sigma > session.body.radius
-    ]
-    if not wide:
-        return []
-    more = f" and {len(wide) - 1} more" if len(wide) > 1 else ""
-    widest = max(wide, key=lambda setup: setup.extract.sigma)
-    sigma, where = widest.extract.sigma, widest.table_of("sigma")
-    return [
-        f"sensor {wide[0].name!r}{more}: sigma = {sigma:g} {session.unit} in {where} is wider than "
-        f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
-        "about what ranges err by"
-    ]
+    """Widths in which the whole body disappears, or all that an image shows of it."""
+    ranges, images = list[SensorSetup](), list[SensorSetup]()
+    for setup in session.sensors:
+        sigma, resolution = setup.extract.sigma, setup.resolution
+        if isinstance(setup.sensor, RangeSensor) and sigma > session.body.radius:
+            ranges.append(setup)
+        elif setup.sensor.dimension == 2 and resolution and sigma > _WIDEST * max(resolution):
+            images.append(setup)
+    radius = f"{session.body.radius:.2g} {session.unit}"
+    whole = f"the body, whose features lie within {radius}: set it to about what ranges err by"
+    part = "a twentieth of the image: set it to several times what features err by, 1.5 px or so"
+    warnings = []
+    for wide, unit, what in ((ranges, session.unit, whole), (images, "px", part)):
+        if not wide:
+            continue
+        more = f" and {len(wide) - 1} more" if len(wide) > 1 else ""
+        widest = max(wide, key=lambda setup: setup.extract.sigma)
+        width, where = f"{widest.extract.sigma:g} {unit}", widest.table_of("sigma")
+        warnings.append(
+            f"sensor {wide[0].name!r}{more}: sigma = {width} in {where} is wider than {what}"
+        )
+    return warnings
 
 
 def _lines_as_points(session: Session) -> list[str]:
