@@ -63,6 +63,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "checking": ("test_check_*.py",),
     "importing": ("test_import*.py",),
     "design": ("test_design.py",),
+    "learning": ("test_learn*.py",),
+    "trajectories": ("test_smooth*.py", "test_align.py", "test_pivot*.py"),
     "runner": ("test_runner_*.py",),
     "density": (
         "test_density_atlas.py",

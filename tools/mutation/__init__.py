@@ -20,6 +20,7 @@ from mutation import (
     proposing,
     recordings,
     searching,
+    trajectories,
 )
 from mutation.mutant import Mutant
 
@@ -41,4 +42,5 @@ MUTANTS: tuple[Mutant, ...] = (
     *files.MUTANTS,
     *edge.MUTANTS,
     *planning.MUTANTS,
+    *trajectories.MUTANTS,
 )

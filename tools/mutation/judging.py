@@ -439,6 +439,22 @@ _JUDGE = (
         "1.0 if",
         "evidence does not tell poses apart",
     ),
+    Mutant(
+        "judgement-all-others-must-miss",
+        "judgement/acceptance.py",
+        "return bool((odds[sees] < -rules.log_doubt).any())",
+        "return bool(sees.sum() > len(odds) - 2 and (odds[sees] < -rules.log_doubt).all())",
+        "one sensor of four is believed where a blind one stands beside two that contradict it",
+        ("test_faults.py",),
+    ),
+    Mutant(
+        "judgement-open-without-end",
+        "judgement/noise.py",
+        "information.flat[:: count + 1] += anywhere[chosen] ** -2.0",
+        "pass",
+        "covariances of what a frame leaves open are no covariances",
+        ("test_judgement_noise.py",),
+    ),
 )
 
 MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)

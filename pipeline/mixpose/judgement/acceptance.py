@@ -108,7 +108,8 @@ class Verdict:
 
     def without(self, what: str) -> Verdict:
         """The same, but for an alternative."""
-        return replace(self, against=tuple([one for one in self.against if one.what != what]))
+        others = tuple([one for one in self.against if one.what != what])
+        return self if len(others) == len(self.against) else replace(self, against=others)
 
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:

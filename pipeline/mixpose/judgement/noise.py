@@ -142,7 +142,8 @@ def noise_of(
         r, rows, fields = (_folded(one, found) for one in (r, rows, fields))
     J = rows[:, chosen]
     markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
-    information, q = J.T @ J + np.diag(anywhere[chosen] ** -2.0), fields.shape[1]
+    information, q = J.T @ J, fields.shape[1]
+    information.flat[:: count + 1] += anywhere[chosen] ** -2.0
     inverse = inverted(information)
     by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
     taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
