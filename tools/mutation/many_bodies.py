@@ -101,8 +101,8 @@ MUTANTS = (
     Mutant(
         "tracking-mirrors-of-the-farther-one",
         "tracking/mirrors.py",
-        "found.append((_told(one, other, E, body), sides[0] > 0))",
-        "found.append((_told(one, other, E, body), sides[0] < 0))",
+        "found.append((_told(one, other, E, body, rules.plane), sides[0] > 0))",
+        "found.append((_told(one, other, E, body, rules.plane), sides[0] < 0))",
         "of a body and its mirror image the image is told",
         (_TWIN,),
     ),

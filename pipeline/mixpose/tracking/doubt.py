@@ -105,8 +105,8 @@ def _alternatives(
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(UNSURE, _of_chance_that_lasts(best, told))
     # of a scene with mirrors nobody knows which side a frame shows
-    mirrored = 0.5 if data.options.mirrors else rules.mistaken
-    likely = [mirrored if one.name == MIRRORED else rules.mistaken for one in mistakes]
+    of_image = 0.5 if data.options.mirrors else rules.mistaken
+    likely = [of_image if one.name == MIRRORED else rules.mistaken for one in mistakes]
     yield from map(Alternative, (one.what for one in mistakes), odds_of_each(mistakes, likely))
     if others_miss(best, _noise_before(data, best), track.agreed, rules, noise):
         yield Alternative(APART)

@@ -30,9 +30,6 @@ from mixpose.records import Floats
 from mixpose.rigid import inverse, perturb, transform
 from mixpose.tracking.frame import Frame
 
-FLAT = 1e-3
-"""Radii, and radians, by which what mirrors, as a polished table, is no plane."""
-
 _STEP = 1e-6  # of differences, radii and radians
 
 
@@ -42,8 +39,8 @@ def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bo
     A second body is as likely as a mirror, before the poses are looked at.
     """
     a, b, found, body = one.T_world_object, other.T_world_object, [], data.body
-    x = transform(a, body.means)
-    for E in _onto_itself(body, data.rules.look_alikes.alike):
+    x, rules = transform(a, body.means), data.rules.look_alikes
+    for E in _onto_itself(body, rules.alike):
         y = transform(b @ E @ inverse(a), x)
         away = (x - y).mean(axis=0)
         if ((x - y) @ away).min() <= 0:  # no body reaches through a mirror, as other tilts would
@@ -52,7 +49,7 @@ def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bo
         sides = [float(view.sensor.towards(middle)[0] @ away) for view in data.views]
         sides = [side for side in sides if side]  # points in space are seen from nowhere
         if sides and (min(sides) > 0 or max(sides) < 0):
-            found.append((_told(one, other, E, body), sides[0] > 0))
+            found.append((_told(one, other, E, body, rules.plane), sides[0] > 0))
     if not found:
         return -math.inf, True
     odds = np.array([told for told, _ in found])
@@ -75,8 +72,11 @@ def _onto_itself(body: Body, alike: float) -> tuple[Floats, ...]:
     return tuple(inverse(T @ S) @ M for T in onto for S in body.symmetries)
 
 
-def _told(one: ScoredPose, other: ScoredPose, E: Floats, body: Body) -> float:
-    """Log odds of a mirror by two poses, where a motion E (4, 4) maps the body onto itself."""
+def _told(one: ScoredPose, other: ScoredPose, E: Floats, body: Body, off: float) -> float:
+    """Log odds of a mirror by two poses, where a motion E (4, 4) maps the body onto itself.
+
+    The mirror is `off` a plane, in radii and radians.
+    """
     steps = _STEP * np.diag(np.repeat([body.radius, 1.0], 3))
     a, b = one.T_world_object[None], other.T_world_object[None]
     still = np.repeat(a, 6, axis=0), np.repeat(b, 6, axis=0)
@@ -85,7 +85,7 @@ def _told(one: ScoredPose, other: ScoredPose, E: Floats, body: Body) -> float:
     seen, apart = _improper(first, second, E, body.means.mean(axis=0))
     J = (seen[1:] - seen[0]).T / np.tile(steps.diagonal(), 2)
     C = J[:, :6] @ one.covariance @ J[:, :6].T + J[:, 6:] @ other.covariance @ J[:, 6:].T
-    C += np.diag(np.square(FLAT * np.array([1.0, body.radius, body.radius])))
+    C += np.diag(np.square(off * np.array([1.0, body.radius, body.radius])))
     squared = float(seen[0] @ np.linalg.solve(C, seen[0]))
     here = -0.5 * (squared + float(np.linalg.slogdet(2 * np.pi * C)[1]))
     return here + math.log(2 * math.pi * math.pi * apart**2)

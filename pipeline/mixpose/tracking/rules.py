@@ -40,6 +40,9 @@ class LookAlikeRules:
     )
     alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
     behind: float = constant(50.0, "nats at σ_ε: rivals gain 25 by narrow blurs; 25 make no odds")
+    plane: float = constant(
+        1e-3, "radii, and radians, by which what mirrors a body, as a polished table, is no plane"
+    )
     tried: int = constant(
         4, "that meet most, of what is likelier clutter: a slip of the body itself"
     )
