@@ -6,7 +6,7 @@ from mutation.mutant import Mutant
 
 MUTANTS = (
     Mutant(
-        "smoothing-floor-by-the-widest-pose",
+        "trajectories-least-by-the-widest-pose",
         "trajectories/track.py",
         "floor = np.where(some, _FLOOR * each[:, None], typical)",
         "floor = np.where(some, _FLOOR * each.max(), typical)",
@@ -14,7 +14,7 @@ MUTANTS = (
         ("test_smooth.py",),
     ),
     Mutant(
-        "smoothing-tells-the-size-of-a-body",
+        "trajectories-tell-the-size-of-a-body",
         "trajectories/smoothing.py",
         "if line.doubt and line.confidence is not None:",
         "if False:",
@@ -30,7 +30,7 @@ MUTANTS = (
         ("test_learn.py",),
     ),
     Mutant(
-        "floor-of-a-body-that-turns",
+        "trajectories-floor-of-a-body-that-turns",
         "trajectories/floor.py",
         "        _require_still(estimates, T)",
         "        pass",
