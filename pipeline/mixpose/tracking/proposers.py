@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import islice, product
+from itertools import product
 from operator import add
 from typing import TypeAlias
 
@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.density import DRAWING
 from mixpose.fit import blur_schedule
-from mixpose.judgement import ScoredPose, is_possible, is_sure
+from mixpose.judgement import ScoredPose, is_sure
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search import (
@@ -145,10 +145,8 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     most = -behind / 2  # what is so much likelier clutter has no look-alike that is not
     # once more, where what is moved is better: two that are as good would take turns for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
-        most, tried = ranked[0].log_evidence + 0.01, None
-        if not is_possible(ranked[0], frame.free):  # which has no rivals, and may be one
-            tried = frame.rules.look_alikes.tried
-        for start in islice(_as_evident(frame, ranked[0]), tried):
+        most = ranked[0].log_evidence + 0.01
+        for start in _as_evident(frame, ranked[0]):
             yield start
             if ranked[0].log_evidence > most + behind:
                 break  # the rest are rivals of what is no rival

@@ -43,9 +43,6 @@ class LookAlikeRules:
     plane: float = constant(
         1e-3, "radii, and radians, by which what mirrors a body, as a polished table, is no plane"
     )
-    tried: int = constant(
-        4, "that meet most, of what is likelier clutter: a slip of the body itself"
-    )
     fewer: float = constant(1.5, "features fewer that a rival may meet: each is e⁴ in odds, or so")
     flat: float = constant(0.15, "thickness by smaller width below which what is met may be tilted")
     by_chance: float = constant(14.0, "coordinates beyond six met by chance: 5 points, 2 cameras")
