@@ -97,7 +97,7 @@ class Tracker(Setup):
         ranked = self.explain(data)
         verdict = decided(data, ranked)
         if verdict.best is not None:
-            verdict = with_second(verdict, data, left_by(verdict.best, data))
+            verdict = with_second(verdict, data, left_by(verdict.best, data), decided)
         after = followed(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 

@@ -9,7 +9,7 @@ those searched in vain before, and every few frames anyway; of a flat body all.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +35,12 @@ def is_flat(data: Setup) -> bool:
     return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
-def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
+def with_second(
+    verdict: Verdict,
+    data: Frame,
+    rest: SeenTogether,
+    decided: Callable[[Frame, Sequence[ScoredPose]], Verdict],
+) -> Verdict:
     """The same; in doubt where what is left of the frame's views shows the body once more.
 
     Either may be it then, whichever was followed so far, unless one is the other's mirror image;
@@ -74,17 +79,15 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     if either <= 0:
         alone = replace(alone, kept=kept, second=Second(second, odds, either, is_told))
         return alone.doubted([Alternative(TWICE, either)])
-    # it is the body, of which the next frame asks what else there may be
-    return Verdict(
-        second,
-        [kept[-1], *kept[:-1]],
-        (Alternative("", -second.log_evidence), Alternative(TWICE)),
-        alone.most,
-        alone.tried,
-        Second(best, odds, -either, is_told),
-        # what was mirrored is its image
-        {name: told for name, told in data.track.mistaken.items() if name != MIRRORED},
-    )
+    # it is the body, by what the other one leaves; what was mirrored is its image
+    mistaken = {name: told for name, told in data.track.mistaken.items() if name != MIRRORED}
+    track = replace(data.track, mistaken=mistaken)
+    seen = data.seen_otherwise(views=rest.views, still=(), starts=(), track=track)
+    told = decided(seen, [second])
+    told = told.without(IN_A_MIRROR) if is_told else told
+    other, own = Second(best, odds, -either, is_told), [kept[-1], *kept[:-1]]
+    told = replace(told, kept=own, second=other, tried=alone.tried)
+    return told.doubted([Alternative(TWICE, -either)])
 
 
 def _by_mirror(
@@ -147,9 +150,11 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     if (used.dimensions != 2).any():
         return False
     rest = np.array([left.get(name, 0) for name in used.names])
-    # as much as fixes a pose, and would cast doubt, by as many sensors
-    most = float(np.minimum(rest, used.met).sum())
-    if 2 * most < np.count_nonzero(data.free) or most < used.met.sum() - _most_missed(data):
+    # as much as fixes a pose, and would cast doubt, by as many sensors; what is seen in a mirror is
+    # told by where it stands, however much of the body is hidden
+    most, is_much = float(np.minimum(rest, used.met).sum()), is_flat(data) and len(left) > 1
+    is_much = is_much or most >= used.met.sum() - _most_missed(data)
+    if 2 * most < np.count_nonzero(data.free) or not is_much:
         return False
     track = data.track
     is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
@@ -179,7 +184,8 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
     likelihood = likelihood_of(alone)
     for start in _starts(alone, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
-        is_likely = _more_missed(best, pose, data) > data.rules.acceptance.log_doubt
+        least = data.rules.acceptance.log_doubt
+        is_likely = _more_missed(best, pose, data) > least or mirrored(data, best, pose)[0] > -least
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
         if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
