@@ -83,7 +83,7 @@ def check_session(request: CheckRequest) -> None:
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
-    report.warnings += keys.shared_source_warnings(session, replaced)
+    shared = keys.shared_source_warnings(session, replaced)
     sizes = {name: each.size for name, each in surveys.items()}
     doubts = geometry.geometry_doubts(session, opened, surveys)
     given = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
@@ -95,8 +95,8 @@ def check_session(request: CheckRequest) -> None:
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what is odd all the same
         report.warnings = [*doubts.warnings, *report.warnings, *given.warnings]
-    # numbers are sure, and what is out of step may look moved
-    report.warnings = [*_pairing_warnings(opened), *report.warnings]
+    # files and numbers are sure, and what is given twice or out of step may look moved
+    report.warnings = [*shared, *_pairing_warnings(opened), *report.warnings]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
     damage = [text for each in surveys.values() for text in each.damage]
