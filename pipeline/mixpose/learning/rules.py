@@ -53,7 +53,7 @@ class LearningRules:
     placements: int = constant(12, "motions of a shape into a frame that are refined, times copies")
     bases: int = constant(12, "triples of a shape by which it is found in a frame")
     many_bases: int = constant(
-        100, "likewise, where it was not found: four markers of ten show one of 12 in 0.35 of cases"
+        100, "likewise, where it was not found: four markers of ten show one of 12 in 0.34 of cases"
     )
     adjusted: int = constant(
         240, "frames that are adjusted together, those that add most information; as in calibrate"
