@@ -14,7 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.twin import MIRRORED as MIRROR_IMAGE
+from mixpose.tracking.mirrors import MIRRORED as MIRROR_IMAGE
 
 Floats = NDArray[np.float64]
 

@@ -14,11 +14,10 @@ from mixpose.fit import EstimatorOptions
 from mixpose.judgement import ScoredPose
 from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector
-from mixpose.tracking import Scene, Tracker
+from mixpose.tracking import TWICE, Scene, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import mirrored
-from mixpose.tracking.twin import IN_A_MIRROR, TWICE
+from mixpose.tracking.mirrors import IN_A_MIRROR, mirrored
 
 FLAT = body("flat", TOOL * [1.0, 1.0, 0.0])
 SOLID = body("solid", TOOL)
@@ -135,6 +134,20 @@ def test_of_a_flat_body_and_its_mirror_image_the_nearer_one_is_it(mirrors: bool)
     assert [one.status for one in found[4:]] == ["ok"] * 6
     for one, T in zip(found[4:], own[4:], strict=True):
         assert off(one, T)[0] < 1.0  # 0.2 px are 0.24 mm across
+
+
+def test_what_lies_between_a_body_and_its_mirror_image_is_no_motion() -> None:
+    scene = Scene((Tracker.create(FLAT, OPTIONS),))
+    tracks, T = scene.begin(), at(-60.0)
+    for frame, poses in enumerate(([in_mirror(T)], [in_mirror(T)], [in_mirror(T), T])):
+        tracks, (found,) = scene.advance(
+            tracks, frame, None, views_of([FLAT] * len(poses), poses, frame)
+        )
+    assert off(found, T)[0] < 1.0
+    body_s, image_s = tracks[0].branches
+    assert body_s.velocity is None
+    assert image_s.velocity is not None
+    assert np.abs(image_s.velocity[:3]).max() < 2.0  # it rests, and is not where the body is
 
 
 def test_a_body_that_is_seen_beside_its_mirror_image_is_known_when_that_is_hidden() -> None:

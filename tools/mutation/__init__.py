@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mutation import (
+    accepting,
     bodies,
     densities,
     edge,
@@ -34,6 +35,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *estimating.MUTANTS,
     *matching.MUTANTS,
     *judging.MUTANTS,
+    *accepting.MUTANTS,
     *mistaken.MUTANTS,
     *following.MUTANTS,
     *proposing.MUTANTS,

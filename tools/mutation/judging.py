@@ -299,102 +299,6 @@ _EVIDENCE = (
     ),
 )
 
-_ACCEPTANCE = (
-    Mutant(
-        "judgement-rivals-never-count",
-        "judgement/acceptance.py",
-        "for odds in (-best.log_evidence, *rivals)]",
-        "for odds in (-best.log_evidence,)]",
-        "of two poses that fit alike one is called sure",
-    ),
-    Mutant(
-        "judgement-clutter-never-counts",
-        "judgement/acceptance.py",
-        "for odds in (-best.log_evidence, *rivals)]",
-        "for odds in rivals]",
-        "a pose that mere clutter explains as well is ok",
-    ),
-    Mutant(
-        "judgement-sure-by-chance",
-        "judgement/acceptance.py",
-        "    confidence: float = constant(0.999,",
-        "    confidence: float = constant(0.99,",
-        "one pose in a hundred is called ok and wrong",
-    ),
-    Mutant(
-        "judgement-the-likeliest-alternative-alone",
-        "judgement/acceptance.py",
-        "float(np.logaddexp.reduce([one.log_odds for one in self.against]))",
-        "float(max([one.log_odds for one in self.against]))",
-        "many poses of which each is unlikely leave a frame ok",
-    ),
-    Mutant(
-        "judgement-open-turns-are-sure",
-        "judgement/acceptance.py",
-        "    if not is_turn_known(best, rules):",
-        "    if False:",
-        "the turn about a line of features is called sure",
-    ),
-    Mutant(
-        "judgement-wide-turns-are-sure",
-        "judgement/acceptance.py",
-        "turns = np.diag(pose.spread[3:] ** 2)",
-        "pass",
-        "ranges that leave the turn open are called sure",
-        ("test_tracking_ranges.py",),
-    ),
-    Mutant(
-        "judgement-too-few-coordinates-fix-a-pose",
-        "judgement/acceptance.py",
-        "return bool(pose.measurements >= np.count_nonzero(free))",
-        "return True",
-        "a pose is told that the data do not fix",
-    ),
-    Mutant(
-        "judgement-symmetric-poses-are-rivals",
-        "judgement/acceptance.py",
-        "T_new = nearest_alike(new.T_world_object, body, old.T_world_object)",
-        "T_new = new.T_world_object",
-        "a symmetric body is its own rival",
-    ),
-    Mutant(
-        "judgement-anything-convinces",
-        "judgement/acceptance.py",
-        "is_sure(pose, free, rules) and share > rules.convincing",
-        "is_sure(pose, free, rules)",
-        "a body that slipped by a step of its grid is not looked for elsewhere",
-    ),
-    Mutant(
-        "judgement-a-covered-sensor-makes-doubt",
-        "judgement/acceptance.py",
-        "if len(agreeing) > 1 else pose.coverage",
-        "if len(agreeing) > 99 else pose.coverage",
-        "a covered camera makes every frame slow",
-    ),
-    Mutant(
-        "judgement-worse-twin-kept",
-        "judgement/acceptance.py",
-        "is_better = _worth(new, rules, 0.01) > _worth(old, rules)",
-        "is_better = _worth(new, rules) < _worth(old, rules)",
-        "of two fits that are one pose the worse is told",
-    ),
-    Mutant(
-        "judgement-twins-are-not-covered",
-        "judgement/acceptance.py",
-        "covariance += apart * away[:, None] * away",
-        "covariance += 0.0",
-        "of two poses about as likely one is told as if there were no other",
-    ),
-    Mutant(
-        "judgement-one-of-two-poses-is-known-as-if-alone",
-        "judgement/acceptance.py",
-        "(1 - belief) * own + belief * beside",
-        "own + 0.0 * beside",
-        "a pose that stands for one known less well is told as sure as by itself",
-        ("test_judgement_acceptance.py",),
-    ),
-)
-
 _JUDGE = (
     Mutant(
         "judgement-left-out-for-free",
@@ -403,49 +307,6 @@ _JUDGE = (
         "seen = replace(seen, weights=seen.weights * used[:, None])",
         "leaving a sensor out makes a pose better",
         ("test_tracking_starts.py",),
-    ),
-    Mutant(
-        "judgement-symmetry-ignored",
-        "judgement/acceptance.py",
-        "if len(body.symmetries) == 1:",
-        "if len(body.symmetries) >= 1:",
-        "a symmetric body jumps between poses that look the same",
-    ),
-    Mutant(
-        "judgement-any-noise-as-likely",
-        "judgement/acceptance.py",
-        "doubt = rules.log_doubt *",
-        "doubt = 0.0 *",
-        "a bent pose is likelier than one that leaves out the spots that are off",
-    ),
-    Mutant(
-        "judgement-clutter-stands-for-a-pose",
-        "judgement/acceptance.py",
-        "return pose.log_evidence > 0, pose.log_density",
-        "return True, pose.log_density",
-        "four spots that are met exactly by chance stand for seven of a body of another size",
-    ),
-    Mutant(
-        "judgement-most-turned-twin",
-        "judgement/acceptance.py",
-        "sum(axis=(1, 2)).argmax())",
-        "sum(axis=(1, 2)).argmin())",
-        "of poses that look the same the farthest is told",
-    ),
-    Mutant(
-        "judgement-all-poses-believed-alike",
-        "judgement/acceptance.py",
-        "math.exp(one.log_density - top) if",
-        "1.0 if",
-        "evidence does not tell poses apart",
-    ),
-    Mutant(
-        "judgement-all-others-must-miss",
-        "judgement/acceptance.py",
-        "return bool((odds[sees] < -rules.log_doubt).any())",
-        "return bool(sees.sum() > len(odds) - 2 and (odds[sees] < -rules.log_doubt).all())",
-        "one sensor of four is believed where a blind one stands beside two that contradict it",
-        ("test_faults.py",),
     ),
     Mutant(
         "judgement-open-without-end",
@@ -457,4 +318,4 @@ _JUDGE = (
     ),
 )
 
-MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
+MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_JUDGE)

@@ -69,7 +69,7 @@ MUTANTS = (
     Mutant(
         "tracking-twin-never-sought",
         "tracking/twin.py",
-        'if best is None or alone.status != "ok":',
+        'if best is None or but_for_mirrors(verdict).status != "ok":',
         "if True:",
         "a mirror image is followed while the body itself is in view",
         (_TWIN,),
@@ -125,8 +125,8 @@ MUTANTS = (
     Mutant(
         "tracking-twin-that-moves-as-the-other-did",
         "tracking/tracker.py",
-        "None if one.proposer == SECOND_POSE else alike",
-        "alike",
+        "is_new = one.proposer == SECOND_POSE",
+        "is_new = False",
         "the body is expected to go on as from its mirror image to itself",
         (_TWIN,),
     ),

@@ -11,7 +11,7 @@ MUTANTS = (
         "floor = np.where(some, _FLOOR * each[:, None], typical)",
         "floor = np.where(some, _FLOOR * each.max(), typical)",
         "a pose that says nothing makes all others say nothing",
-        ("test_smooth.py",),
+        ("test_smooth_choices.py",),
     ),
     Mutant(
         "trajectories-tell-the-size-of-a-body",
@@ -19,7 +19,7 @@ MUTANTS = (
         "if line.doubt and line.confidence is not None:",
         "if False:",
         "a body of another size is ok where it moves smoothly",
-        ("test_smooth.py",),
+        ("test_smooth_choices.py",),
     ),
     Mutant(
         "learning-by-few-triples-alone",

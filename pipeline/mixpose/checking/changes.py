@@ -39,6 +39,7 @@ class Change:
     cost: float = 0.0  # nats that the choice of its values costs
     values: int = 0  # how many are chosen
     feature: int | None = None  # the only one that is changed
+    leads: bool = True  # whether others are tried along with it
 
     def and_also(self, other: Change) -> Change:
         """Both together."""
@@ -66,8 +67,8 @@ def changes(session: Session) -> Iterator[Change]:
     if clouds:
         yield from _of_clouds(clouds)
     if are_points:
-        # a cloud by itself has all but the body in one unit
-        yield from () if len(clouds) == len(session.sensors) else of_units(session.body)
+        if len(clouds) < len(session.sensors):  # beside nothing else it is told of the cloud
+            yield from of_units(session.body)
         yield from _of_the_body(session.body)
     yield from _inversions(cameras)
     for a, b in combinations([setup.name for setup in cameras], 2):
@@ -99,13 +100,9 @@ def changes(session: Session) -> Iterator[Change]:
                 names,
                 lambda view, k=factor: with_sensor(view, scaled(view.sensor, k)),  # type: ignore[misc]
             )
-
-
-def rare_changes(session: Session) -> Iterator[Change]:
-    """Others, that are not tried along with a second one."""
-    cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
     if len(cameras) > 1:  # to one camera that is mirrored, but for a half-turn
-        yield from _flips(cameras, "upside down", "top and bottom", 1)
+        for change in _flips(cameras, "upside down", "top and bottom", 1):
+            yield replace(change, leads=False)
 
 
 def _flips(cameras: Sequence[SensorSetup], what: str, ends: str, axis: int) -> Iterator[Change]:

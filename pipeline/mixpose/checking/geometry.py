@@ -260,15 +260,14 @@ def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Chan
         if not is_odd:
             return []
     given, found = session.sensors[0].extract, list[tuple[Change, Frames]]()
-    polarity = "dark" if given.polarity == "bright" else "bright"
-    other = "blobs" if given.method == "corners" else "corners"
-    words = {"blobs": "spots and no corners", "corners": "corners and no spots"}
-    for key, value, what in (
-        ("polarity", polarity, f"{polarity} in the images"),
-        ("method", other, words[other]),
-    ):
-        if key == "polarity" and given.method == "corners":
-            continue  # which have none
+    if given.method == "corners":
+        ways = [("method", "blobs", "spots and no corners")]
+    else:
+        polarity = "dark" if given.polarity == "bright" else "bright"
+        ways = [("polarity", polarity, f"{polarity} in the images")]
+        ways.append(("method", "corners", "corners and no spots"))
+    anew = list(replace(recording, surveys={}).read(numbers))
+    for key, value, what in ways:
         own = [setup.name for setup in session.sensors if key in setup.own]
         tables = ["[extract]"] if len(own) < len(session.sensors) else []
         tables += [f"[sensor.extract] of {called(own)}"] if own else []
@@ -277,6 +276,5 @@ def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Chan
         option: dict[str, Any] = {key: value}
         setups = [replace(s, extract=replace(s.extract, **option)) for s in session.sensors]
         changed = replace(session, sensors=tuple(setups))
-        anew = replace(recording, surveys={}).read(numbers)
         found.append((change, [(each.number, observe(changed, each)) for each in anew]))
     return found

@@ -18,7 +18,7 @@ import numpy as np
 
 from mixpose.body import of_points
 from mixpose.checking import evidence
-from mixpose.checking.changes import Change, by_cameras_alone, changes, rare_changes, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
 from mixpose.checking.evidence import Explained, Frames, Views, best_pose, evidence_of
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
@@ -53,7 +53,6 @@ class _Runner:
     change: Change
     frames: Frames
     poses: list[ScoredPose | None] = field(default_factory=list)
-    leads: bool = True  # whether others are tried along with it
 
     def advance(self, session: Session, useful: float) -> int:
         """Try the next frame, for a pose of `useful` evidence; the guesses that took."""
@@ -155,7 +154,6 @@ def _without_values(case: _Case, others: Sequence[tuple[Change, Frames]]) -> Ite
     """Changes that explain frames better: a race in which those far behind the best drop out."""
     session, before, runners = case.session, case.before, [_Runner(*each) for each in others]
     runners += [_Runner(change, case.frames) for change in changes(session)]
-    runners += [_Runner(change, case.frames, leads=False) for change in rare_changes(session)]
     rules, left = DiagnosisRules(), DiagnosisRules().all_guesses
     for k in range(len(case.frames)):
         best = 0.0
@@ -188,7 +186,7 @@ def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
         ahead.sort(key=lambda one: -one.gain(case.before))
         if ahead and ahead[0].explains(rules):
             return []
-        return [one for one in ahead if one.leads][: rules.leaders]
+        return [one for one in ahead if one.change.leads][: rules.leaders]
 
     first = [one for one in runners if one.poses and one.explains(rules)]
     if best() or not first:
@@ -198,7 +196,7 @@ def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
     for one in best():
         for change in changes(session):
             both = frozenset([change.what + change.remedy, one.change.what + one.change.remedy])
-            if change.what != one.change.what and both not in known:
+            if change.leads and change.what != one.change.what and both not in known:
                 known.add(both)
                 yield _Runner(change.and_also(one.change), one.frames)
 

@@ -5,7 +5,7 @@ from mixpose.tracking.clouds import (
     plane_views as plane_views,
     with_clouds as with_clouds,
 )
-from mixpose.tracking.doubt import CHANGED as CHANGED
+from mixpose.tracking.doubt import CHANGED as CHANGED, TWICE as TWICE
 from mixpose.tracking.labels import labelled as labelled
 from mixpose.tracking.prediction import Foreseen as Foreseen
 from mixpose.tracking.rules import Rules as Rules
@@ -22,4 +22,3 @@ from mixpose.tracking.track import (
     predict as predict,
 )
 from mixpose.tracking.tracker import Tracker as Tracker, estimate_pose as estimate_pose
-from mixpose.tracking.twin import TWICE as TWICE

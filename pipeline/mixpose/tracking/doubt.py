@@ -36,10 +36,10 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
-from mixpose.tracking.twin import IN_A_MIRROR, MIRRORED, is_flat, seen_beside
 
+TWICE = "the body seems to be there twice: a mirror image, or a second one (`count = 2`)"
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
 CHANGED = "features are met much farther off than in the frames before"
@@ -50,7 +50,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
     verdict = decide(ranked, data.free, data.rules.acceptance)
     if len(verdict.kept) > 1 and (images := _in_mirrors(data, verdict)):
-        own = [one for one in ranked if not any(one is image for image in images)]
+        own = [one for one in ranked if one not in images]
         verdict = decide(own, data.free, data.rules.acceptance)
     best = verdict.best
     if best is None:
@@ -60,7 +60,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     if verdict.status != "ok":
         rivals = [one for one, _ in verdict.kept if one is not best]
         why = reason(data, best, rivals)
-        if why := why or next(filter(None, (seen_beside(best, one) for one in rivals)), ""):
+        if why := why or next(filter(None, (_seen_beside(best, one) for one in rivals)), ""):
             clutter, *others = verdict.against
             named = [one._replace(what=why) for one in others]
             return replace(verdict, against=(clutter, *named))
@@ -82,6 +82,21 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     # what lasts shows in frames like those before; one that is not is a doubled image, or the like
     is_usual = best.residual_ratio <= rules.acceptance.changed
     return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
+
+
+def _seen_beside(a: ScoredPose, b: ScoredPose) -> str:
+    """In words, what two poses are that are likely, and meet detections of their own; else empty.
+
+    What is there twice some sensor sees twice; where each sees one of them, one stands elsewhere.
+    """
+    if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
+        return ""
+    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
+    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
+    met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
+    if shared >= 0.5 * met.sum():
+        return ""
+    return TWICE if np.minimum(met, other).sum() >= 0.5 * other.sum() else APART
 
 
 def _in_mirrors(data: Frame, verdict: Verdict) -> list[ScoredPose]:

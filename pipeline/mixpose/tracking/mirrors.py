@@ -28,9 +28,17 @@ from mixpose.body.symmetry import motions
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.rigid import inverse, perturb, transform
-from mixpose.tracking.frame import Frame
+from mixpose.tracking.frame import Frame, Setup
+
+MIRRORED = "it shows the body's mirror image"
+IN_A_MIRROR = "a flat body looks the same in a mirror, and the session says that there are some"
 
 _STEP = 1e-6  # of differences, radii and radians
+
+
+def is_flat(data: Setup) -> bool:
+    """Whether a turn brings the body onto its mirror image."""
+    return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
 def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bool]:

@@ -32,12 +32,12 @@ from mixpose.sensors import Sensor
 from mixpose.tracking.confusion import taken_for
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.identity import Rivals, identify
+from mixpose.tracking.mirrors import is_flat
 from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track
 from mixpose.tracking.tracker import Tracker, followed
-from mixpose.tracking.twin import is_flat
 
 Box: TypeAlias = tuple[int, int, int, int]
 

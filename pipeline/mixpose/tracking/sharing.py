@@ -52,7 +52,7 @@ class Explanation:
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return with_second(self.alone, self.frame, self.rest, decided)
+        return with_second(self.alone, self.frame, self.rest)
 
 
 @dataclass

@@ -29,7 +29,7 @@ from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
-from mixpose.tracking.twin import SECOND_POSE, left_by, with_second
+from mixpose.tracking.twin import SECOND_POSE, but_for_mirrors, left_by, with_second
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,8 @@ class Tracker(Setup):
         data = self.data(track, frame, time_s, views)
         ranked = self.explain(data)
         verdict = decided(data, ranked)
-        if verdict.best is not None:
-            verdict = with_second(verdict, data, left_by(verdict.best, data), decided)
+        if verdict.best is not None and but_for_mirrors(verdict).status == "ok":
+            verdict = with_second(verdict, data, left_by(verdict.best, data))
         after = followed(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 
@@ -278,8 +278,9 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         elif second and second.told and one is best:
             other = second.either
         branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
-        alike = [each.T_body_other for each in congruent(data, one)]
-        found.append((branch, None if one.proposer == SECOND_POSE else alike))
+        is_new = one.proposer == SECOND_POSE
+        alike = None if is_new else [each.T_body_other for each in congruent(data, one)]
+        found.append((branch, alike))
     used = best.used
     met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1

@@ -9,46 +9,37 @@ those searched in vain before, and every few frames anyway; of a flat body all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit, logit
 
-from mixpose.body import thickness
-from mixpose.judgement import APART, Alternative, ScoredPose, Second, Verdict, is_sure
+from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
-from mixpose.tracking.frame import Frame, Setup, Start
+from mixpose.tracking.doubt import TWICE, decided
+from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
 from mixpose.tracking.proposers import candidates_of
 
-TWICE = "the body seems to be there twice: a mirror image, or a second one (`count = 2`)"
-MIRRORED = "it shows the body's mirror image"
-IN_A_MIRROR = "a flat body looks the same in a mirror, and the session says that there are some"
 SECOND_POSE = "second_pose"
 """What proposes a pose that goes on from none of the frame before."""
 
 
-def is_flat(data: Setup) -> bool:
-    """Whether a turn brings the body onto its mirror image."""
-    return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
+def but_for_mirrors(verdict: Verdict) -> Verdict:
+    """The decision about a frame if neither the body nor what is seen was in a mirror."""
+    return verdict.without(IN_A_MIRROR).without(MIRRORED)
 
 
-def with_second(
-    verdict: Verdict,
-    data: Frame,
-    rest: SeenTogether,
-    decided: Callable[[Frame, Sequence[ScoredPose]], Verdict],
-) -> Verdict:
+def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     """The same; in doubt where what is left of the frame's views shows the body once more.
 
     Either may be it then, whichever was followed so far, unless one is the other's mirror image;
     and the other one goes on to be the other.
     """
     best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
-    alone = verdict.without(IN_A_MIRROR).without(MIRRORED)
-    if best is None or alone.status != "ok":
+    if best is None or but_for_mirrors(verdict).status != "ok":
         return verdict
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
@@ -58,8 +49,7 @@ def with_second(
     is_there = second is not None and is_sure(second, data.free, accepted)
     if not is_there and _is_due(data, best, left):
         most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
-        verdict, alone = (replace(one, tried=most) for one in (verdict, alone))
-        found = _second_pose(data, best, rest)
+        verdict, found = replace(verdict, tried=most), _second_pose(data, best, rest)
         if found is not None:
             second, odds = found, -accepted.log_doubt
     if second is None or odds <= accepted.log_doubt:
@@ -70,24 +60,32 @@ def with_second(
     # of all frames the one counts that tells most
     if known is not None and abs(known) > abs(either):
         either = known
-    of_image = {one.what: one for one in verdict.against if one.what in (MIRRORED, IN_A_MIRROR)}
-    if IN_A_MIRROR in of_image:
-        of_image[IN_A_MIRROR] = Alternative(IN_A_MIRROR, in_mirror)
-    alone = alone.doubted(of_image.values())
-    share, is_told = float(expit(either)), in_mirror < accepted.log_doubt
+    is_told, share = in_mirror < accepted.log_doubt, float(expit(either))
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
-    if either <= 0:
-        alone = replace(alone, kept=kept, second=Second(second, odds, either, is_told))
-        return alone.doubted([Alternative(TWICE, either)])
-    # it is the body, by what the other one leaves; what was mirrored is its image
+    if either > 0:
+        told = _decided_beside(second, data, rest, is_told)
+        own = [kept[-1], *kept[:-1]]
+        told = replace(told, kept=own, second=Second(best, odds, -either, is_told))
+    else:
+        against = [
+            one._replace(log_odds=in_mirror) if one.what == IN_A_MIRROR else one
+            for one in verdict.against
+        ]
+        told = replace(verdict, kept=kept, against=tuple(against))
+        told = replace(told, second=Second(second, odds, either, is_told))
+    return replace(told, tried=verdict.tried).doubted([Alternative(TWICE, -abs(either))])
+
+
+def _decided_beside(second: ScoredPose, data: Frame, rest: SeenTogether, is_told: bool) -> Verdict:
+    """The decision about a second pose that is the body's, by what the other one leaves.
+
+    What was mirrored is the other one, and where that `is_told` this is in no mirror.
+    """
     mistaken = {name: told for name, told in data.track.mistaken.items() if name != MIRRORED}
     track = replace(data.track, mistaken=mistaken)
     seen = data.seen_otherwise(views=rest.views, still=(), starts=(), track=track)
     told = decided(seen, [second])
-    told = told.without(IN_A_MIRROR) if is_told else told
-    other, own = Second(best, odds, -either, is_told), [kept[-1], *kept[:-1]]
-    told = replace(told, kept=own, second=other, tried=alone.tried)
-    return told.doubted([Alternative(TWICE, -either)])
+    return told.without(IN_A_MIRROR) if is_told else told
 
 
 def _by_mirror(
@@ -116,21 +114,6 @@ def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
         if is_left.any():
             rest.append(replace(view, observation=view.observation.only(is_left)))
     return SeenTogether(rest, data.rules.judgement, data.rules.search)
-
-
-def seen_beside(a: ScoredPose, b: ScoredPose) -> str:
-    """In words, what two poses are that are likely, and meet detections of their own; else empty.
-
-    What is there twice some sensor sees twice; where each sees one of them, one stands elsewhere.
-    """
-    if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
-        return ""
-    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
-    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
-    met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
-    if shared >= 0.5 * met.sum():
-        return ""
-    return TWICE if np.minimum(met, other).sum() >= 0.5 * other.sum() else APART
 
 
 def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
