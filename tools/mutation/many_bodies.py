@@ -69,7 +69,7 @@ MUTANTS = (
     Mutant(
         "tracking-twin-never-sought",
         "tracking/twin.py",
-        'if best is None or but_for_mirrors(verdict).status != "ok":',
+        "if best is None or not is_ok_but_for_mirrors(verdict):",
         "if True:",
         "a mirror image is followed while the body itself is in view",
         (_TWIN,),

@@ -106,10 +106,9 @@ class Verdict:
         """The same, with more alternatives."""
         return replace(self, against=(*self.against, *more))
 
-    def without(self, what: str) -> Verdict:
-        """The same, but for an alternative."""
-        others = tuple([one for one in self.against if one.what != what])
-        return self if len(others) == len(self.against) else replace(self, against=others)
+    def without(self, *what: str) -> Verdict:
+        """The same, but for some alternatives."""
+        return replace(self, against=tuple([one for one in self.against if one.what not in what]))
 
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:

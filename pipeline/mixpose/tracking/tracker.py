@@ -29,7 +29,7 @@ from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
-from mixpose.tracking.twin import SECOND_POSE, but_for_mirrors, left_by, with_second
+from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, left_by, with_second
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Tracker(Setup):
         data = self.data(track, frame, time_s, views)
         ranked = self.explain(data)
         verdict = decided(data, ranked)
-        if verdict.best is not None and but_for_mirrors(verdict).status == "ok":
+        if verdict.best is not None and is_ok_but_for_mirrors(verdict):
             verdict = with_second(verdict, data, left_by(verdict.best, data))
         after = followed(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)

@@ -27,9 +27,9 @@ SECOND_POSE = "second_pose"
 """What proposes a pose that goes on from none of the frame before."""
 
 
-def but_for_mirrors(verdict: Verdict) -> Verdict:
-    """The decision about a frame if neither the body nor what is seen was in a mirror."""
-    return verdict.without(IN_A_MIRROR).without(MIRRORED)
+def is_ok_but_for_mirrors(verdict: Verdict) -> bool:
+    """Whether a frame is ok if nothing in it is seen in a mirror."""
+    return verdict.status == "ok" or verdict.without(IN_A_MIRROR, MIRRORED).status == "ok"
 
 
 def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
@@ -39,7 +39,7 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     and the other one goes on to be the other.
     """
     best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
-    if best is None or but_for_mirrors(verdict).status != "ok":
+    if best is None or not is_ok_but_for_mirrors(verdict):
         return verdict
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
