@@ -241,6 +241,43 @@ def test_precise_ranges_need_no_help_of_earlier_frames() -> None:
         assert float(rotation_angle_deg(estimate.T_world_object, T)) < 1.0
 
 
+def test_places_that_have_nothing_to_do_with_each_other_are_found_with_the_right_turn() -> None:
+    """The sum over associations has maxima at wrong turns, 60 nats behind the right one."""
+    options, rng = EstimatorOptions(free=("x", "y", "rz"), fuse=False), np.random.default_rng(7)
+    tracker = Tracker.create(SMALL, options, np.eye(4), rotation_deg=180.0, distance=3.0)
+    track = tracker.begin()
+    for k in range(12):
+        place, turn = rng.uniform(-2.2, 2.2, 2), rng.uniform(-np.pi, np.pi)
+        T = from_rotation_vector([0.0, 0.0, turn], [*place, 0.0])
+        views = views_at(T, rng, SMALL, sigma=0.02)
+        track, estimate = tracker.advance(track, k, None, views)
+        assert estimate.status == "ok"
+        assert not is_wrong(estimate, T)
+
+
+def test_ranges_are_searched_only_where_a_pose_elsewhere_may_be_as_likely() -> None:
+    options, rng = EstimatorOptions(free=("x", "y", "rz")), np.random.default_rng(8)
+    tracker = Tracker.create(TROLLEY, options, next(drive(1))[1])
+    track, searched = tracker.begin(), 0
+    for k, (time_s, T) in enumerate(drive(20)):
+        track, estimate = tracker.advance(track, k, time_s, views_at(T, rng, sigma=0.02))
+        searched += estimate.guesses is not None
+    assert searched <= 5
+    T[:2, 3] *= -1.0  # at the other end of the circle, where nothing lets expect it
+    track, estimate = tracker.advance(track, 20, 2.0, views_at(T, rng, sigma=0.02))
+    assert estimate.guesses is not None
+    assert not is_wrong(estimate, T)
+
+
+def test_exact_ranges_have_the_odds_of_all_features_met_exactly() -> None:
+    T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
+    views = views_at(T, np.random.default_rng(1), sigma=1e-6)
+    found = sum_associations(views, TROLLEY, T[None])
+    # offsets of the range that they err by take half of each
+    assert found.reached[0] == len(ANCHORS) * len(TAGS)
+    assert 0 < found.most[0] - found.log_odds[0] < found.reached[0]
+
+
 def test_second_derivatives_are_differences_of_gradients_at_every_pose_of_a_batch() -> None:
     T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
     views = views_at(T, np.random.default_rng(1))

@@ -33,9 +33,10 @@ def seen(
     cameras: Sequence[PinholeCamera],
     rng: np.random.Generator,
     lost: dict[tuple[int, int], float] | None = None,
+    T: Floats = TRUTH,
 ) -> list[View]:
     """Disks before cameras; of some, by camera and marker, a share of the area is hidden."""
-    at = project_body(tuple(cameras), BODY).project(TRUTH[None])
+    at = project_body(tuple(cameras), BODY).project(T[None])
     views = []
     for k, camera in enumerate(cameras):
         scales = np.sqrt(np.square(at.J[k, 0, :, :, :3]).sum(axis=(1, 2)) / 2)
@@ -182,3 +183,24 @@ def test_a_frame_by_itself_learns_the_size_from_its_pose(
     assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)
     # off by half a radius
     assert deviation > 10 * NOISE
+
+
+def test_a_body_that_is_far_from_where_it_was_expected_is_weighed_where_it_is(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    """Twice as near its spots are twice as large; there they are whole, and not merged."""
+    rng = np.random.default_rng(3)
+    tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    centres = [np.linalg.inv(one.T_sensor_world)[:3, 3] for one in pinhole_cameras]
+    near = TRUTH.copy()
+    near[:3, 3] = (TRUTH[:3, 3] + np.mean(centres, axis=0)) / 2
+    for frame, T in enumerate([TRUTH] * 5 + [near, TRUTH, near]):
+        views = seen(pinhole_cameras, rng, T=T)
+        _, alone = tracker.advance(tracker.begin(), frame, None, views)
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status == "ok", frame
+        assert estimate.covariance is not None
+        assert alone.covariance is not None
+        # frames before tell how exact spots are, which makes it narrower
+        assert np.trace(estimate.covariance[:3, :3]) < 2 * np.trace(alone.covariance[:3, :3])

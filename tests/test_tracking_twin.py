@@ -107,6 +107,31 @@ def test_identical_bodies_that_the_session_counts_are_no_surprise() -> None:
         assert [one.status for one in estimates] == ["ok", "ok"]
 
 
+def test_one_more_than_the_session_counts_makes_all_identical_bodies_ambiguous() -> None:
+    scene = scene_of(SOLID, SOLID)
+    tracks = scene.begin()
+    for frame in range(10):
+        shown = [HERE, THERE, at(10.0, -120.0, turn=-0.5)][: 2 + (frame >= 4)]
+        views = views_of([SOLID] * len(shown), shown, frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        told = [(one.status, one.doubt) for one in estimates]
+        assert told == [("ok", "") if frame < 4 else ("ambiguous", TWICE)] * 2, frame
+
+
+def test_an_identical_body_that_comes_back_leaves_the_other_ok() -> None:
+    scene = scene_of(SOLID, SOLID)
+    tracks = scene.begin()
+    for frame in range(30):
+        other = THERE if frame < 5 else at(10.0, -120.0, turn=-0.5)
+        shown = [HERE, other][: 1 + (not 5 <= frame < 14)]
+        views = views_of([SOLID] * len(shown), shown, frame)[:1]  # it is searched for in turn
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        here = [
+            one for one in estimates if one.T_world_object is not None and off(one, HERE)[0] < 30
+        ]
+        assert [one.status for one in here] == ["ok"], frame
+
+
 def test_where_there_are_mirrors_a_flat_body_by_itself_is_never_ok() -> None:
     options = replace(EstimatorOptions(), mirrors=True)
     found = estimates_of(FLAT, [[HERE]] * 6, options)

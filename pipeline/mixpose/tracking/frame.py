@@ -79,6 +79,7 @@ class Frame(Setup):
     # what searches of the frame cost, and where they go on in the next; the proposer adds to it
     searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
     still: Sequence[View] = ()  # where views are as of the common time: sensors as they stand
+    unweighed: Sequence[View] = ()  # sensors as they stand, before spots were weighed by their size
     beside: Branch | None = None  # where another body lets expect one that is not where it was
     sensors: Sequence[str] = ()  # all that had a frame, also those that saw nothing
 
@@ -197,11 +198,16 @@ class Frame(Setup):
         least = float(own) - gained + (-gained if ahead is None else ahead)
         return Start(T_world_object, wide, least=least, **rest)
 
+    @property
+    def elsewhere(self) -> float:
+        """Log density of a pose where its own track does not expect the body."""
+        surprise = self.rules.motion.surprised(self.track.misses)
+        return self.anywhere[0] + (math.log(surprise) if self.predictions else 0.0)
+
     def expectation(self, poses: Sequence[Floats]) -> Floats:
         """Log densities (K,) of poses (4, 4) by the body's own track, or that it is elsewhere."""
-        logs = np.full(len(poses), self.anywhere[0])
+        logs = np.full(len(poses), self.elsewhere)
         surprise = self.rules.motion.surprised(self.track.misses)
-        logs += math.log(surprise) if self.predictions else 0.0
         for one in self.predictions:
             alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
             there = np.reshape(alike, (-1, 4, 4))
@@ -266,7 +272,8 @@ class Frame(Setup):
 
     def seen_otherwise(self, **changes: Any) -> Frame:
         """With other views or another body, of which nothing is drawn or fitted yet."""
-        return replace(self, drawn=None, together=None, **changes)
+        known = {"unweighed": ()} if "views" in changes else {}
+        return replace(self, drawn=None, together=None, **{**known, **changes})
 
     def alone(self, **changes: Any) -> Frame:
         """With nothing known from the frames before it but the noise, for a quick search."""

@@ -144,7 +144,8 @@ def case_of(frame: Frame, fit: Fit, start: Start) -> Case:
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
     """Whether all sensors gave single ranges, of a body of few points."""
     return (
-        all(view.sensor.dimension == 1 for view in views)
+        len(views) > 0
+        and all(view.sensor.dimension == 1 for view in views)
         and all(view.observation.points is not None for view in views)
         and is_pointlike(body)
         and len(body) <= rules.max_features
@@ -165,6 +166,8 @@ class AssociationSum(NamedTuple):
     information: Floats  # (H, 6, 6), what the ranges would say if their labels were known
     met: Floats  # (H,), expected number of detections that belong to features
     squares: Floats  # (H,), expected sum of their squared offsets, in σ_ε²
+    most: Floats  # (H,), log odds if all features in view were met exactly
+    reached: Floats  # (H,), how many these are
 
 
 def sum_associations(
@@ -191,7 +194,10 @@ def sum_associations(
     missed = expected * np.log(1 - probability) + found * np.log(false / found) + found - false
     error = (noise * sigma)[..., None, None]
     odds = np.exp(-0.5 * (away / error) ** 2) / (np.sqrt(2 * np.pi) * error)
-    odds *= (probability / (1 - probability) * room / false)[..., None, None]
+    ratio = probability / (1 - probability) * room / false
+    reached = np.minimum(expected, found)
+    peak = np.log(ratio / (np.sqrt(2 * np.pi) * noise * sigma))
+    odds *= ratio[..., None, None]
     odds *= at.seen[..., None] & there[:, None, None]
     total, shares = _summed(odds.reshape(-1, *odds.shape[2:]))
     shares = shares.reshape(odds.shape)
@@ -202,6 +208,8 @@ def sum_associations(
         information=np.einsum("lhnj,lhnk,lhnq->hkq", weights, J, J),
         met=shares.sum(axis=(0, 2, 3)),
         squares=noise**2 * (weights * away**2).sum(axis=(0, 2, 3)),
+        most=(missed + reached * peak).sum(axis=0),
+        reached=reached.sum(axis=0),
     )
 
 
@@ -311,6 +319,19 @@ class AssociationLikelihood:
             noise=before.followed(RANGES, noise, before.moments, before.biases, before.fields),
             spread=np.sqrt(np.diag(covariance)),
         )
+
+    def leaves_room(self, pose: ScoredPose) -> bool:
+        """Whether a pose elsewhere, where the body is by surprise alone, may be as likely.
+
+        The sum over associations has maxima at many turns; right poses meet all features, off by
+        the noise.
+        """
+        frame, T = self.frame, pose.T_world_object
+        detection = frame.rules.judgement.detection
+        found = sum_associations(frame.views, frame.body, T[None], self._noise, detection)
+        ahead = float((found.most - found.reached / 2 - found.log_odds)[0])
+        expected = frame.expectation([T])[0] - frame.elsewhere
+        return bool(max(ahead, 0.0) - expected > frame.rules.acceptance.log_doubt)
 
     def density(self, fit: Fit, start: Start, beside: Matches) -> float:
         """As of `MatchedLikelihood`; clutter is as dense for all bodies already."""

@@ -31,6 +31,7 @@ from mixpose.search import (
     sparse,
 )
 from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import AssociationLikelihood, likelihood_of
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -52,9 +53,12 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
     Once it was followed for some frames, a pose convinces that misses no more all at once and that
-    one sensor alone meets no farther off than chance makes it.
+    one sensor alone meets no farther off than chance makes it.  Single ranges of a small body are
+    met about as well at other turns: there it is asked whether a pose elsewhere may be as likely.
     """
-    track, rules = frame.track, frame.rules
+    track, rules, likelihood = frame.track, frame.rules, likelihood_of(frame)
+    if ranked and isinstance(likelihood, AssociationLikelihood):
+        return likelihood.leaves_room(ranked[0])
     if frame.first_is(frame.trusted, ranked):
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):

@@ -28,7 +28,7 @@ from mixpose.tracking.likelihood import MatchedLikelihood, case_of
 from mixpose.tracking.proposers import predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
-from mixpose.tracking.tracker import Tracker, judged_again
+from mixpose.tracking.tracker import Tracker, judged_again, weighed_at
 from mixpose.tracking.twin import with_second
 
 Starts: TypeAlias = tuple[Start, ...]
@@ -82,9 +82,9 @@ class Sharing:
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._judge_again()
         rest = self._rest()
-        # of identical bodies another one is no surprise
-        alone = [k for k in self.claimed if self.bodies[k].instance is None]
-        told = [(k, self.found[k]) for k in alone]
+        # what looks like one of identical bodies may be that of them which is not found
+        lacking = {id(one.body) for k, one in enumerate(self.bodies) if k not in self.claimed}
+        told = [(k, self.found[k]) for k in self.claimed if id(self.bodies[k].body) not in lacking]
         return self.found | {k: replace(one, rest=rest, told=one.alone) for k, one in told}
 
     def _expected(self) -> dict[int, Starts]:
@@ -259,6 +259,7 @@ class Sharing:
                 beside = self._companion(k)
             if is_changed or beside is not one.frame.beside:
                 data = self._frame(k, left, beside=beside, searches=one.frame.searches)
+                data = weighed_at(data, one.ranked[0]) if one.ranked else data
                 self.found[k] = Explanation(
                     data, left, judged_again(data, one.ranked, fitted=are_fitted)
                 )

@@ -24,7 +24,7 @@ from mixpose.constants import constant
 from mixpose.density import DRAWING
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
-from mixpose.records import Floats, Indices, PointPattern
+from mixpose.records import Floats, Indices, Mask, PointPattern
 
 
 @dataclass(frozen=True)
@@ -140,15 +140,20 @@ def _nearest(points: Floats, places: Floats) -> Indices:
     return np.asarray(np.vecdot(away, away).argmin(axis=1))
 
 
-def are_less_exact(views: Sequence[View], known: Sequence[View]) -> bool:
-    """Whether spots of views are known to be cut that were not by themselves."""
-    patterns = [[view.observation.pattern for view in pair] for pair in zip(views, known)]
+def are_cut_otherwise(views: Sequence[View], known: Sequence[View]) -> bool:
+    """Whether other spots of views are known to be cut, or merged, by their sizes."""
     return any(
-        isinstance(by_itself, PointPattern)
-        and isinstance(by_size, PointPattern)
-        and bool((by_size.deviations > by_itself.deviations).any())
-        for by_itself, by_size in patterns
+        bool((_are_cut(one) ^ _are_cut(other)).any())
+        for one, other in zip(views, known, strict=True)
+        if isinstance(one.observation.pattern, PointPattern)
     )
+
+
+def _are_cut(view: View) -> Mask:
+    """Which spots (M,) are likely cut or merged, by their sizes."""
+    pattern = view.observation.pattern
+    assert isinstance(pattern, PointPattern)
+    return np.zeros(pattern.size, bool) if pattern.cut is None else pattern.cut[:, 0] > 0.5
 
 
 def sizes_after(before: Sizes, best: ScoredPose, body: Body, rules: SizeRules) -> Sizes:

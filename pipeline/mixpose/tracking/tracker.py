@@ -27,7 +27,7 @@ from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent, predicted, searched
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
+from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
 from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, left_by, with_second
 
@@ -113,7 +113,7 @@ class Tracker(Setup):
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         reference = self.T_held if self.T_start is None else self.T_start
-        seen = track.delays.applied(seen, time_s)
+        seen = unweighed = track.delays.applied(seen, time_s)
         if predictions:
             T = predictions[0].T_world_object
             seen = weighed_by_size(seen, self.body, T, track.sizes, self.rules.sizes)
@@ -130,11 +130,9 @@ class Tracker(Setup):
             frame=frame,
             time_s=time_s,
             sensors=[view.name for view in views],
+            unweighed=unweighed,
         )
-        if not predictions or not data.is_timed:
-            return data
-        T = predictions[0].T_world_object
-        return data.in_motion(data.expected(T).at(T))
+        return _moving_at(data, predictions[0].T_world_object) if predictions else data
 
     def explain(self, data: Frame, *, quickly: bool = False) -> list[ScoredPose]:
         """Propose, fit and judge poses: distinct ones, the most evident first.
@@ -162,19 +160,8 @@ class Tracker(Setup):
             if quickly and not data.first_is(data.trusted, ranked):
                 break
             quickly = False
-        return ranked if data.track.sizes.count else self._by_size(data, ranked)
-
-    def _by_size(self, data: Frame, ranked: list[ScoredPose]) -> list[ScoredPose]:
-        """Poses judged again where the best shows how large markers are, which was not known."""
-        if not ranked:
-            return ranked
-        best, rules = ranked[0], self.rules.sizes
-        sizes = sizes_after(Sizes(), best, self.body, rules)
-        views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
-        # where no spot is cut by its size, poses are what they are
-        if not are_less_exact(data.views, views):
-            return ranked
-        return judged_again(data.seen_otherwise(views=views), ranked, fitted=True)
+        weighed = weighed_at(data, ranked[0]) if ranked else data
+        return ranked if weighed is data else judged_again(weighed, ranked, fitted=True)
 
     def estimate(
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
@@ -234,6 +221,29 @@ def estimate_pose(
     with one_blas_thread():
         _, estimate = tracker.advance(tracker.begin(), 0, None, views)
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def weighed_at(data: Frame, pose: ScoredPose) -> Frame:
+    """The frame with spots weighed by size where a pose is; the same if that changes none of it.
+
+    Where it was expected they look as if they were cut if they are nearer, or others.  Before the
+    first frame that is ok the pose itself shows how large markers are.
+    """
+    sizes, rules, T = data.track.sizes, data.rules.sizes, pose.T_world_object
+    if not data.unweighed or (sizes.count and not np.count_nonzero(pose.matches.extra)):
+        return data
+    sizes = sizes if sizes.count else sizes_after(sizes, pose, data.body, rules)
+    views = weighed_by_size(data.unweighed, data.body, T, sizes, rules)
+    if not are_cut_otherwise(data.views, views):
+        return data
+    unweighed = data.unweighed
+    return _moving_at(data.seen_otherwise(views=views, still=(), unweighed=unweighed), T)
+
+
+def _moving_at(data: Frame, T_world_object: Floats) -> Frame:
+    """The frame as of the common time, of a body that moves as is expected at a pose."""
+    is_moving = data.predictions and data.is_timed
+    return data.in_motion(data.expected(T_world_object).at(T_world_object)) if is_moving else data
 
 
 def judged_again(
