@@ -55,15 +55,19 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     Once it was followed for some frames, a pose convinces that misses no more all at once and that
     one sensor alone meets no farther off than chance makes it.  Single ranges of a small body are
     met about as well at other turns: there it is asked whether a pose elsewhere may be as likely.
+    Before, what all sensors are farther off than that may be its image in a pane, or another thing.
     """
     track, rules, likelihood = frame.track, frame.rules, likelihood_of(frame)
     if ranked and isinstance(likelihood, AssociationLikelihood):
         return likelihood.leaves_room(ranked[0])
-    if frame.first_is(frame.trusted, ranked):
+    is_new = track.believed < rules.proposals.believed
+    # what one sensor of several is off by is left out already
+    is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
+    if frame.first_is(frame.trusted, ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
-    is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
+    is_new |= len(track.branches) != 1
     before = sum(track.met_before.values())
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
     # what two sensors meet is bent, and not elsewhere
