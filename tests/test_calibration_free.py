@@ -30,7 +30,7 @@ from mixpose.calibration.rig import moved as rig_moved
 from mixpose.calibration.words import free_parameters, in_length, in_world, known_length
 from mixpose.errors import SessionError
 from mixpose.objective.projection import BodyProjection
-from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.rigid import from_parts, from_rotation_vector, inverse, rotation_angle_deg, transform
 from mixpose.sensors import RangeSensor
 
 Floats = np.ndarray
@@ -70,6 +70,35 @@ def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
     assert (told < 3).all()
     assert (np.abs([off[0, 0], off[0, 2], off[1, 2]]) < 3 * told).all()
     assert off[1, 1] == pytest.approx(off[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("tilt", "least", "most"), [(0.0, 100.0, 207.0), (0.5, 0.0, 5.0)], ids=["straight on", "tilted"]
+)
+def test_a_flat_body_tells_the_focal_length_as_far_as_it_is_tilted(
+    tilt: float, least: float, most: float
+) -> None:
+    """The tilts of 0.1 degrees that noise gives its poses are no information about it."""
+    flat, (camera,) = POINTS * [1, 1, 0], cameras(1)
+
+    def pose(time: float) -> Floats:
+        turn = tilt * np.array([np.sin(5 * time), np.cos(4 * time), 0.0])
+        seen = from_rotation_vector(turn, [40 * np.sin(3 * time), 30 * np.cos(4 * time), 800])
+        return inverse(camera.T_sensor_world) @ seen
+
+    def look(sensor: Any, time: float) -> Any:
+        return sensor.project(transform(pose(time), flat))
+
+    frames = recording([camera], 24, 0.1, look=look)
+    believed = replace(camera, camera_matrix=camera.camera_matrix * [[1.03], [1.03], [1]])
+    body = Body("flat", tuple(PointFeature(p) for p in flat))
+    task = task_of([believed], frames, free={0: ("focal",)})
+    task = replace(task, rig=Rig.of(["s0"], [believed], body), body=body)
+    known = alone([believed], frames, pose=lambda number: pose(number / FPS))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=known)
+    assert least < found.deviations[0] < most
+    f = found.after.sensors[0].camera_matrix[0, 0]  # type: ignore[attr-defined]
+    assert abs(f - camera.camera_matrix[0, 0]) < 3 * found.deviations[0]
 
 
 def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> None:

@@ -13,6 +13,7 @@ from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.contradicted import Contradiction, contradiction
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
+from mixpose.calibration.profile import profiled
 from mixpose.calibration.recorded import held_back_with
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
@@ -60,7 +61,8 @@ def calibrate(
             "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
-    return replace(run.found, residuals=run.residuals(), contradicted=run.contradicted())
+    found = run.profiled()
+    return replace(found, residuals=run.residuals(), contradicted=run.contradicted())
 
 
 def _from_cameras(
@@ -153,8 +155,13 @@ class _Run:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
             part = self._with_latecomers(part, late)
             part, adjusted = self._adjusted(part, adjusted.noise)
-        self._part, self._best = part, adjusted
+        self._part, self._best, self._bad = part, adjusted, bad
         return self._told(part, adjusted, bad)
+
+    def profiled(self) -> result.Calibration:
+        """The same, with deviations by how much worse the fit gets."""
+        self._best = profiled(self._bundle(self._part), self._best)
+        return self._told(self._part, self._best, self._bad)
 
     def residuals(self) -> dict[int, result.Residual]:
         """Residuals before and after, and of every frame by a rig that was adjusted without it.

@@ -61,6 +61,12 @@ class CalibrationRules:
         "standard deviation by the size of what is sought (the rig, a focal length, a turn of "
         "1 rad): nothing is known of such a direction",
     )
+    far: float = constant(
+        3.0, "deviations that a lens is moved by, to see whether the fit gets worse"
+    )
+    flat: float = constant(
+        0.5, "of what these mean for the fit, below which a deviation is wider: right ones have 1"
+    )
     widened: tuple[float, ...] = constant(
         (1.0, 2.5, 6.0),
         "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "
