@@ -61,8 +61,8 @@ def calibrate(
             "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
-    found = run.profiled()
-    return replace(found, residuals=run.residuals(), contradicted=run.contradicted())
+    told = run.profiled()
+    return replace(told, residuals=run.residuals(), contradicted=run.contradicted())
 
 
 def _from_cameras(
