@@ -27,6 +27,7 @@ from mixpose.calibration import Rig, SeenFrame, calibrate
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.rig import moved as rig_moved
+from mixpose.calibration.telling import doubts_of, lines_of
 from mixpose.calibration.words import free_parameters, in_length, in_world, known_length
 from mixpose.errors import SessionError
 from mixpose.objective.projection import BodyProjection
@@ -191,6 +192,10 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
         for key, one in alone(true, frames).items()
     }
     found = in_length(calibrate(task, NO_FRAME_HELD_BACK, found=small_poses), f"s0:s1={length}")
+    assert any(line.startswith("scale ") for line in lines_of(found, "mm"))
+    assert doubts_of(found, "mm") == []
+    mistyped = in_length(found, f"s0:s1={1.3 * length}")
+    assert "is it the distance of these two" in doubts_of(mistyped, "mm")[0]
     a, b = (centre_of(sensor) for sensor in found.after.sensors)
     assert np.linalg.norm(b - a) == pytest.approx(length)
     size = np.linalg.norm(found.after.points - found.after.points.mean(axis=0), axis=1)

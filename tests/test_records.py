@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,47 @@ def test_a_single_estimate_refuses_a_start_views_and_a_width_that_cannot_be_mean
         mixpose.estimate_pose([mixpose.View("camera", camera, ranges)], body)
     with pytest.raises(ValueError, match="sigma: found 0"):
         mixpose.Observation(pattern, sigma=0)
+
+
+K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("features", "camera", "said"),
+    [
+        (np.eye(3), {}, "feature 1 of 'wand': found ndarray; allowed: a PointFeature"),
+        ([[0.0, np.nan, 0.0]], {}, "feature 1 of 'wand', its position: found NaN or infinity"),
+        ([[0.0, 1.0]], {}, r"its position: found shape \(2,\); allowed: finite numbers"),
+        (None, {"camera_matrix": np.eye(2)}, r"camera_matrix of its sensor: found shape \(2, 2\)"),
+        (None, {"camera_matrix": K * np.nan}, "camera_matrix of its sensor: found NaN"),
+        (None, {"T_sensor_world": np.diag([1, 1, -1, 1.0])}, "T_sensor_world of its sensor: not a"),
+    ],
+    ids=["no features", "NaN", "two numbers", "2x2", "NaN in a matrix", "mirrored"],
+)
+def test_a_single_estimate_refuses_bodies_and_cameras_that_cannot_be_meant(
+    features: Any, camera: dict[str, Any], said: str
+) -> None:
+    points = 100.0 * np.eye(3) if features is None else features
+    made = points if isinstance(features, np.ndarray) else [PointFeature(one) for one in points]
+    body = Body("wand", tuple(made))
+    sensor = PinholeCamera(**{"camera_matrix": K, **camera})
+    view = mixpose.View(
+        "camera", sensor, mixpose.Observation(PointPattern(POINTS, np.ones(2)), sigma=1.5)
+    )
+    with pytest.raises(ValueError, match=said):
+        mixpose.estimate_pose([view], body)
+
+
+def test_a_single_estimate_refuses_a_view_that_is_given_twice_and_a_variance_below_zero() -> None:
+    view = mixpose.View(
+        "camera", PinholeCamera(K), mixpose.Observation(PointPattern(POINTS, np.ones(2)), sigma=1.5)
+    )
+    body = Body("wand", tuple(PointFeature(point) for point in 100.0 * np.eye(3)))
+    with pytest.raises(ValueError, match="view 'camera': given twice"):
+        mixpose.estimate_pose([view, view], body)
+    below = Body("wand", (*body.features, PointFeature(np.ones(3), np.diag([1.0, -1.0, 1.0]))))
+    with pytest.raises(ValueError, match="feature 4 of 'wand': a covariance with a variance below"):
+        mixpose.estimate_pose([view], below)
 
 
 def test_estimates_that_took_another_time_are_the_same() -> None:

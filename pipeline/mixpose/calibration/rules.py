@@ -67,6 +67,9 @@ class CalibrationRules:
     flat: float = constant(
         0.5, "of what these mean for the fit, below which a deviation is wider: right ones have 1"
     )
+    rescaled: float = constant(
+        0.05, "log of the scale that a known length may give: bodies are known to a few per cent"
+    )
     widened: tuple[float, ...] = constant(
         (1.0, 2.5, 6.0),
         "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "

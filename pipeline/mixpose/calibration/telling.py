@@ -31,6 +31,8 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
             lines += _block_lines(found, block, unit)
     if any(block.kind == "body" for block in found.blocks):
         lines += _body_lines(found, unit)
+    if (scale := found.after.scale) != 1:
+        lines.append(f"{'scale':<28}all lengths, the body's too, are {scale:.5g} times as large")
     lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found)]
     lines += _coverage_lines(found)
     if found.inflation > 1:
@@ -82,6 +84,12 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
             f"{100 * (1 - found.certainty):.0f} % of the matches could as well be others': "
             "detections do not tell features apart, so that the deviations hold only if the start "
             "was right"
+        )
+    scale = found.after.scale
+    if abs(np.log(scale)) > rules.rescaled:
+        told.append(
+            f"by the length that is known the body is {scale:.3g} times as large as the session "
+            "has it: is it the distance of these two, in the session's unit?"
         )
     held = found.contradicted
     if held is not None:

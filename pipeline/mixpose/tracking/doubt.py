@@ -39,7 +39,10 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 
-TWICE = "the body seems to be there twice: a mirror image, or one more (`count`)"
+TWICE = (
+    "the body seems to be there twice: a mirror image, one more (`count`), or another like it, "
+    "which may be an [[object]] of its own"
+)
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
 CHANGED = "features are met much farther off than in the frames before"

@@ -16,9 +16,9 @@ from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
-from mixpose.rigid import is_rigid
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
+from mixpose.tracking.arguments import require_meant
 from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
@@ -205,17 +205,11 @@ def estimate_pose(
 ) -> Estimate:
     """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
 
-    Raises ValueError for a start that is no rigid motion, and for features of a view that have not
-    the dimension of its sensor.
+    Raises ValueError for arrays that cannot be meant: a start or sensor that is no rigid motion,
+    NaN, other shapes, features of a view that have not the dimension of its sensor.
     """
-    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
-        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
-    for view in views:
-        found, allowed = view.observation.dimension, view.sensor.dimension
-        if found != allowed:
-            raise ValueError(
-                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
-            )
+    require_meant(views, model, start)
+    start = None if start is None else np.asarray(start, dtype=np.float64)
     tracker = Tracker.create(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     with one_blas_thread():

@@ -1,0 +1,50 @@
+"""What `estimate_pose` is given by programs: arrays that cannot be meant are told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.objective import View
+from mixpose.rigid import is_rigid
+
+_RIGID = "a rotation and a translation as one 4x4 matrix"
+
+
+def require_meant(views: Sequence[View], model: Body, start: Any) -> None:
+    """Raise a ValueError that says what is allowed, and what of it is not given."""
+    if start is not None and not is_rigid(start):
+        raise ValueError(f"start: not {_RIGID}")
+    for number, feature in enumerate(model.features, 1):
+        where = f"feature {number} of {model.name!r}"
+        if not hasattr(feature, "nodes"):
+            raise ValueError(f"{where}: found {type(feature).__name__}; allowed: a PointFeature")
+        spread = np.asarray(feature.covariance)
+        _require(feature.mean, (3,), f"{where}, its position")
+        _require(spread, (3, 3), f"{where}, its covariance")
+        if np.linalg.eigvalsh(spread)[0] < -1e-9 * np.abs(spread).max():
+            raise ValueError(f"{where}: a covariance with a variance below zero")
+    names = [view.name for view in views]
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"view {min(doubled)!r}: given twice; allowed: a name of its own for each")
+    for view in views:
+        where, sensor = f"view {view.name!r}", view.sensor
+        found, allowed = view.observation.dimension, sensor.dimension
+        if found != allowed:
+            raise ValueError(f"{where}: features of {found} coordinates; its sensor has {allowed}")
+        for name, shape in (("camera_matrix", (3, 3)), ("position", (3,))):
+            if hasattr(sensor, name):
+                _require(getattr(sensor, name), shape, f"{where}, {name} of its sensor")
+        if not is_rigid(getattr(sensor, "T_sensor_world", np.eye(4))):
+            raise ValueError(f"{where}, T_sensor_world of its sensor: not {_RIGID}")
+
+
+def _require(values: Any, shape: tuple[int, ...], what: str) -> None:
+    """Raise a ValueError unless an array is finite and of a shape."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        found = f"shape {array.shape}" if array.shape != shape else "NaN or infinity"
+        raise ValueError(f"{what}: found {found}; allowed: finite numbers of shape {shape}")
