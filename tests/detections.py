@@ -110,12 +110,12 @@ def first_frame(tracker: Tracker, views: list[View]) -> Estimate:
     return tracker.advance(tracker.begin(), 0, None, views)[1]
 
 
-def without(tracker: Tracker, name: str) -> Tracker:
-    """A tracker that does not have one of the proposers or refinements."""
-    names = [one.__name__ for one in tracker.proposers]
-    assert name in [*names, *(one.__name__ for one in tracker.refinements)]
+def without(tracker: Tracker, *names: str) -> Tracker:
+    """A tracker that does not have some of the proposers or refinements."""
+    proposers, refinements = tracker.proposers, tracker.refinements
+    assert {*names} <= {one.__name__ for one in (*proposers, *refinements)}
     return replace(
         tracker,
-        proposers=tuple(one for one in tracker.proposers if one.__name__ != name),
-        refinements=tuple(one for one in tracker.refinements if one.__name__ != name),
+        proposers=tuple(one for one in proposers if one.__name__ not in names),
+        refinements=tuple(one for one in refinements if one.__name__ not in names),
     )

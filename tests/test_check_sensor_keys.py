@@ -41,6 +41,9 @@ def session() -> Session:
     return load_session(SYNTHETIC / "two_cameras" / "session.toml")
 
 
+NORMALS = "or give normals in [object], if the body hides some of them"
+
+
 def test_recorded_calibrations_and_widths_raise_no_doubt(session: Session) -> None:
     assert key_warnings(session) == []
     assert key_warnings(load_session(SYNTHETIC / "range_profiles" / "session.toml")) == []
@@ -161,6 +164,10 @@ def test_a_key_with_which_a_tenth_of_the_features_is_missed_is_not_advised(
     blind = replace(left, extract=replace(left.extract, threshold=250.0))
     assert advice(session, blind, 0, image, 7).endswith("it would be 7")
     assert advice(session, blind, 0, image, 8).startswith("change polarity, threshold")
+    # some are found, and no value finds more: the body may hide the others
+    assert advice(session, left, 0, image, 14).endswith("[extract]; " + NORMALS)
+    told = replace(session, body=replace(session.body, normals=np.tile([0.0, 0.0, 1.0], (7, 1))))
+    assert advice(told, left, 0, image, 14).endswith("[extract]")
 
 
 @pytest.mark.parametrize(

@@ -141,13 +141,14 @@ def test_a_flat_body_followed_at_the_wrong_tilt_is_turned_over() -> None:
     mirrors = np.eye(3) - 2 * np.outer(towards, towards), np.diag([1.0, 1.0, -1.0])
     T_wrong = from_parts(mirrors[0] @ T[:3, :3] @ mirrors[1], T[:3, 3])
     tracker, turned = Tracker.create(PLATE, EstimatorOptions(), T_wrong), []
+    tracker = without(tracker, "multistart", "searched")
     for seed in range(3):
         views = detect([camera], PLATE, T, noise=0.1, seed=seed)
         assert is_right(first_frame(tracker, views), T)
         estimate = first_frame(without(tracker, "look_alikes"), views)
         assert estimate.T_world_object is not None
         turned.append(float(rotation_angle_deg(estimate.T_world_object, T)))
-    # the wrong tilt meets all features, within a pixel or two: now and then nothing else is asked
+    # the wrong tilt meets all features, within a pixel or two: no fit leads away from it
     assert max(turned) > 40
 
 

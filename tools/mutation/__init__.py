@@ -7,6 +7,7 @@ from mutation import (
     bodies,
     densities,
     edge,
+    elsewhere,
     estimating,
     files,
     following,
@@ -43,6 +44,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *many_bodies.MUTANTS,
     *files.MUTANTS,
     *edge.MUTANTS,
+    *elsewhere.MUTANTS,
     *planning.MUTANTS,
     *trajectories.MUTANTS,
 )

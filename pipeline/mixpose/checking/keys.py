@@ -90,7 +90,9 @@ def advice(
     change = keys.get(options.method, usual)
     own = [key for key in re.findall(r"\w+", change) if key in setup.own]
     beside = f", {' and '.join(own)} {_OWN}" if own else ""
-    return f"change {change} {_SHARED}{beside}"
+    is_hidden = before > 0 and session.body.normals is None
+    hidden = "; or give normals in [object], if the body hides some of them" if is_hidden else ""
+    return f"change {change} {_SHARED}{beside}{hidden}"
 
 
 def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
