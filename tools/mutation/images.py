@@ -317,8 +317,8 @@ _SIZES = (
     Mutant(
         "tracking-sizes-not-of-a-first-frame",
         "tracking/tracker.py",
-        "return ranked if data.track.sizes.count else self._by_size(data, ranked)",
-        "return ranked",
+        "sizes = sizes if sizes.count else sizes_after(sizes, pose, data.body, rules)",
+        "sizes = sizes",
         "in the first frame slivers are as exact as disks",
         ("test_tracking_sizes.py",),
     ),
