@@ -73,14 +73,6 @@ MUTANTS = (
         (_FREE,),
     ),
     Mutant(
-        "calibration-deviations-wider-whatever-the-fit",
-        "calibration/profile.py",
-        "if share > bundle.rules.flat or wider >= most:",
-        "if wider >= most:",
-        "what a recording tells of a lens is told as not known",
-        (_FREE,),
-    ),
-    Mutant(
         "calibration-a-length-that-contradicts-the-body-is-believed",
         "calibration/telling.py",
         "if abs(np.log(scale)) > rules.rescaled:",
