@@ -57,9 +57,11 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     met about as well at other turns: there it is asked whether a pose elsewhere may be as likely.
     Before, what all sensors are farther off than that may be its image in a pane, or another thing.
     """
-    track, rules, likelihood = frame.track, frame.rules, likelihood_of(frame)
-    if ranked and isinstance(likelihood, AssociationLikelihood):
-        return likelihood.leaves_room(ranked[0])
+    track, rules = frame.track, frame.rules
+    if ranked and frame.views and frame.views[0].sensor.dimension == 1:
+        likelihood = likelihood_of(frame)
+        if isinstance(likelihood, AssociationLikelihood):
+            return likelihood.leaves_room(ranked[0])
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
