@@ -161,7 +161,12 @@ class Tracker(Setup):
                 break
             quickly = False
         weighed = weighed_at(data, ranked[0]) if ranked else data
-        return ranked if weighed is data else judged_again(weighed, ranked, fitted=True)
+        if weighed is data:
+            return ranked
+        again = judged_again(weighed, ranked, fitted=True)
+        # what refinements found is not looked for again: it stays where that is no better
+        is_better = again[0].log_evidence > ranked[0].log_evidence
+        return again if is_better or not data.track.sizes.count else ranked
 
     def estimate(
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
