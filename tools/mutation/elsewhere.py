@@ -1,4 +1,4 @@
-"""Mutants of what a body is taken for where it is not where it was expected."""
+"""Mutants of poses where nothing lets expect them, deviations of lenses, and what is meant."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ _FREE = "test_calibration_free.py"
 MUTANTS = (
     Mutant(
         "tracking-ranges-leave-no-room",
-        "tracking/likelihood.py",
-        "return bool(max(ahead, 0.0) - expected > frame.rules.acceptance.log_doubt)",
+        "tracking/proposers.py",
+        "return odds > rules.acceptance.log_doubt",
         "return False",
         "a trolley is ok at a wrong turn, as no other is looked at",
         (_RANGES,),
     ),
     Mutant(
         "tracking-ranges-always-leave-room",
-        "tracking/likelihood.py",
-        "return bool(max(ahead, 0.0) - expected > frame.rules.acceptance.log_doubt)",
+        "tracking/proposers.py",
+        "return odds > rules.acceptance.log_doubt",
         "return True",
         "a trolley that is followed is searched for at all turns in each frame",
         (_RANGES,),
@@ -67,9 +67,17 @@ MUTANTS = (
     Mutant(
         "calibration-deviations-by-one-linear-model",
         "calibration/profile.py",
-        "if share > bundle.rules.flat or wider >= most:",
+        "if share > rules.flat or wider >= most:",
         "if True:",
         "the focal length of a camera that sees a board straight on is told to 0.4 %",
+        (_FREE,),
+    ),
+    Mutant(
+        "calibration-what-is-beside-a-lens-stays",
+        "calibration/profile.py",
+        "along = (ends[1][0] - ends[0][0]) / (2 * rules.far * wider)",
+        "along = told",
+        "a second camera is told to know its lens as little as the first",
         (_FREE,),
     ),
     Mutant(

@@ -116,20 +116,6 @@ def _ended(
     return Adjusted(state, noise, covariance, step.unknown, pairs, inflation)
 
 
-def fitted_poses(bundle: Bundle, state: State, noise: Floats) -> float:
-    """How far off all pairs are by the poses that suit a rig best.
-
-    As a squared error that counts, of Cauchy errors.  The bundle has no free parameters of the rig.
-    """
-    for _ in range(bundle.rules.steps):
-        state, _ = _climbed(bundle, state, weighted_at_the_end(bundle, state, noise)[0])
-    tail, total = bundle.rules.tail, 0.0
-    for (rows, _), scale in zip(weighted_at_the_end(bundle, state, noise)[0], noise.tolist()):
-        squared = (rows.residual**2).sum(axis=1) / (tail * scale) ** 2
-        total += tail**2 * float(rows.pairs.share @ np.log1p(squared))
-    return total
-
-
 def _at_the_end(
     bundle: Bundle, state: State, noise: Floats
 ) -> tuple[list[Weighted], list[Floats], Step]:

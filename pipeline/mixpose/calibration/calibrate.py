@@ -155,13 +155,14 @@ class _Run:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
             part = self._with_latecomers(part, late)
             part, adjusted = self._adjusted(part, adjusted.noise)
-        self._part, self._best, self._bad = part, adjusted, bad
+        self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
     def profiled(self) -> result.Calibration:
         """The same, with deviations by how much worse the fit gets."""
         self._best = profiled(self._bundle(self._part), self._best)
-        return self._told(self._part, self._best, self._bad)
+        deviations, _ = _determined(self._blocks, self._best, self._task.rig.names)
+        return replace(self.found, deviations=deviations, covariance=self._best.covariance)
 
     def residuals(self) -> dict[int, result.Residual]:
         """Residuals before and after, and of every frame by a rig that was adjusted without it.
@@ -171,7 +172,7 @@ class _Run:
         part, best = self._part, self._best
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
-        bundle = replace(self._bundle(part), blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
+        bundle = self._bundle(part).of_poses
         before = result.squared_residuals(bundle, self._task.rig, best)
         after = result.squared_residuals(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]

@@ -97,7 +97,15 @@ def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floa
     Poses are fitted to the rig by least squares first, in a bundle without parameters of the rig,
     so that all rigs are held to the same.
     """
-    state, spent = State(rig, adjusted.state.poses), np.inf
+    return fitted(bundle, rig, adjusted)[1]
+
+
+def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
+    """How far a bundle's parameters go (G,) from a rig to suit pairs best, and `squared_residuals`.
+
+    By least squares, together with poses.
+    """
+    state, spent, gone = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
     for _ in range(_CLIMBS):
         rows = list[Weighted]()
         for s, (seen, weight) in enumerate(adjusted.weighted):
@@ -108,8 +116,10 @@ def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floa
         before, spent = spent, sum(float(weight @ each) for (_, weight), each in weighed)
         if before - spent < _CLIMBED * spent or not bundle.pose_free.any():
             break
-        state = stepped(bundle, state, solved(bundle, state, rows, 1e-6))
-    return [np.where(w > 0, each, np.nan) for (_, w), each in zip(rows, squared, strict=True)]
+        step = solved(bundle, state, rows, 1e-6)
+        state, gone = stepped(bundle, state, step), gone + step.rig
+    pairs = zip(rows, squared, strict=True)
+    return gone, [np.where(w > 0, each, np.nan) for (_, w), each in pairs]
 
 
 def rms(squared: Sequence[Floats]) -> float:

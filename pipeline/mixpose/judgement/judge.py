@@ -71,6 +71,8 @@ class ScoredPose:
     # (6, 6) where features are off by all that the body's spreads allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
+    # log odds that there may be a pose elsewhere as well, of single ranges; None: not asked
+    elsewhere: float | None = None
     by_count: float = 0.0  # by how much its evidence is larger as it pays by count, not by volume
     proposer: str = ""  # where the pose came from
     blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted

@@ -272,8 +272,9 @@ class Frame(Setup):
 
     def seen_otherwise(self, **changes: Any) -> Frame:
         """With other views or another body, of which nothing is drawn or fitted yet."""
-        known = {"unweighed": ()} if "views" in changes else {}
-        return replace(self, drawn=None, together=None, **{**known, **changes})
+        if "views" in changes:
+            changes.setdefault("unweighed", ())
+        return replace(self, drawn=None, together=None, **changes)
 
     def alone(self, **changes: Any) -> Frame:
         """With nothing known from the frames before it but the noise, for a quick search."""

@@ -144,8 +144,7 @@ def case_of(frame: Frame, fit: Fit, start: Start) -> Case:
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
     """Whether all sensors gave single ranges, of a body of few points."""
     return (
-        len(views) > 0
-        and all(view.sensor.dimension == 1 for view in views)
+        all(view.sensor.dimension == 1 for view in views)
         and all(view.observation.points is not None for view in views)
         and is_pointlike(body)
         and len(body) <= rules.max_features
@@ -312,26 +311,17 @@ class AssociationLikelihood:
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
         degrees = rules.ranges.stated_degrees + float(known[1, 0])
         covariance *= model.noise.enlargement(degrees)
+        # maxima at other turns: right poses meet all features, off by the noise
+        ahead = float((found.most - found.reached / 2 - found.log_odds)[0])
+        expected = float(frame.expectation([T])[0]) - frame.elsewhere
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,
             log_evidence=float(found.log_odds[0]) + frame.prior(T)[0] + float(volume),
             noise=before.followed(RANGES, noise, before.moments, before.biases, before.fields),
             spread=np.sqrt(np.diag(covariance)),
+            elsewhere=max(ahead, 0.0) - expected,
         )
-
-    def leaves_room(self, pose: ScoredPose) -> bool:
-        """Whether a pose elsewhere, where the body is by surprise alone, may be as likely.
-
-        The sum over associations has maxima at many turns; right poses meet all features, off by
-        the noise.
-        """
-        frame, T = self.frame, pose.T_world_object
-        detection = frame.rules.judgement.detection
-        found = sum_associations(frame.views, frame.body, T[None], self._noise, detection)
-        ahead = float((found.most - found.reached / 2 - found.log_odds)[0])
-        expected = frame.expectation([T])[0] - frame.elsewhere
-        return bool(max(ahead, 0.0) - expected > frame.rules.acceptance.log_doubt)
 
     def density(self, fit: Fit, start: Start, beside: Matches) -> float:
         """As of `MatchedLikelihood`; clutter is as dense for all bodies already."""

@@ -31,7 +31,6 @@ from mixpose.search import (
     sparse,
 )
 from mixpose.tracking.frame import Frame, Start
-from mixpose.tracking.likelihood import AssociationLikelihood, likelihood_of
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -58,10 +57,8 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     Before, what all sensors are farther off than that may be its image in a pane, or another thing.
     """
     track, rules = frame.track, frame.rules
-    if ranked and frame.views and frame.views[0].sensor.dimension == 1:
-        likelihood = likelihood_of(frame)
-        if isinstance(likelihood, AssociationLikelihood):
-            return likelihood.leaves_room(ranked[0])
+    if ranked and (odds := ranked[0].elsewhere) is not None:
+        return odds > rules.acceptance.log_doubt
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
