@@ -69,6 +69,22 @@ def test_grey_values_are_as_wide_as_their_spots_and_sigma_together(ranges: Sessi
     assert seen.sigma == 3.0  # a detection has no spot any more
 
 
+@pytest.mark.parametrize(
+    ("given", "error", "said"),
+    [
+        ({"selection": Selection(start=0.5)}, SessionError, "start: found 0.5, allowed is a whole"),  # type: ignore[arg-type]
+        ({"T_start": np.eye(3)}, ValueError, "start: not a rotation and a translation"),
+        ({"T_start": {"tool": np.eye(4)}}, SessionError, "no body 'tool'; allowed: tracker"),
+    ],
+    ids=["half a frame", "3x3", "another body"],
+)
+def test_a_run_refuses_frames_and_starts_that_cannot_be_meant(
+    session: Session, given: dict[str, Any], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error, match=said):
+        mixpose.run(session, **given)
+
+
 def test_a_source_of_the_session_is_beside_it_and_one_given_instead_is_not(
     session: Session, ranges: Session
 ) -> None:

@@ -116,7 +116,10 @@ def run(
     Raises
     ------
     SessionError
-        If the session names no source for a sensor.
+        If the session names no source for a sensor or no body that `T_start` does, or frames are
+        selected by other than whole numbers.
+    ValueError
+        If `T_start` is no rotation and translation.
     RecordingError
         At once, if a recording cannot be opened or its table of times lacks rows; else in place
         of the first frame that cannot be read.
@@ -131,6 +134,9 @@ def run(
         starts = T_start or {}
     else:
         starts = {session.labels[0]: T_start}
+    if unknown := sorted(set(starts) - set(session.labels)):
+        allowed = ", ".join(session.labels)
+        raise SessionError(f"T_start: no body {unknown[0]!r}; allowed: {allowed}")
     scene = scene_of(session, starts)
     frames = pair(opened, selection.start, selection.stop, selection.step)
     begun = Memory(scene.begin()) if memory is None else memory

@@ -81,9 +81,8 @@ def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
     cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
     if request.relative_to in cameras:
         return np.asarray(cameras[request.relative_to].T_sensor_world)  # type: ignore[attr-defined]
-    raise SessionError(
-        f"--relative-to {request.relative_to}: no such camera, allowed: {', '.join(cameras)}"
-    )
+    allowed = f"allowed: {', '.join(cameras)}" if cameras else "the session has none"
+    raise SessionError(f"--relative-to {request.relative_to}: no such camera, {allowed}")
 
 
 def _format(request: ConvertRequest) -> str:

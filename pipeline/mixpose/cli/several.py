@@ -94,8 +94,9 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     for option, value in alone.items():
         if value or value == "":  # the usual port, or an option without a value
             shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
+            found = ", ".join([*map(str, sessions[:3]), *["..."][: len(sessions) > 3]])
             raise SessionError(
-                f"{option}{shown}: found {len(sessions)} sessions, allowed with one only"
+                f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
             )
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
-from typing import Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 from mixpose.errors import SessionError
 from mixpose.records import RawFrame
@@ -86,8 +87,12 @@ class Source(Protocol):
 def selection(start: int | None, stop: int | None, step: int, first: int | None) -> range:
     """Frame numbers to read, as by `range`; without `start` from the first, without `stop` all.
 
-    Raises SessionError if `step` is less than 1.
+    Raises SessionError if one is no whole number, or `step` less than 1.
     """
+    given: dict[str, Any] = {"start": start, "stop": stop, "step": step}
+    for name, value in given.items():
+        if value is not None and not isinstance(value, Integral):
+            raise SessionError(f"{name}: found {value!r}, allowed is a whole number")
     if step < 1:
         raise SessionError(f"step: found {step}, allowed is a whole number from 1")
     if start is None:

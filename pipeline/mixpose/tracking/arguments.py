@@ -1,4 +1,4 @@
-"""What `estimate_pose` is given by programs: arrays that cannot be meant are told."""
+"""What programs give: arrays that cannot be meant are told."""
 
 from __future__ import annotations
 
@@ -9,15 +9,24 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.objective import View
+from mixpose.records import Floats
 from mixpose.rigid import is_rigid
 
 _RIGID = "a rotation and a translation as one 4x4 matrix"
 
 
-def require_meant(views: Sequence[View], model: Body, start: Any) -> None:
-    """Raise a ValueError that says what is allowed, and what of it is not given."""
-    if start is not None and not is_rigid(start):
+def pose_meant(start: Any) -> Floats | None:
+    """A pose (4, 4) to start at, if any; a ValueError if it is none."""
+    if start is None:
+        return None
+    T = np.asarray(start, dtype=np.float64)
+    if not is_rigid(T):
         raise ValueError(f"start: not {_RIGID}")
+    return T
+
+
+def require_meant(views: Sequence[View], model: Body) -> None:
+    """Raise a ValueError that says what is allowed, and what of it is not given."""
     for number, feature in enumerate(model.features, 1):
         where = f"feature {number} of {model.name!r}"
         if not hasattr(feature, "nodes"):

@@ -18,7 +18,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.arguments import require_meant
+from mixpose.tracking.arguments import pose_meant, require_meant
 from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
@@ -55,7 +55,10 @@ class Tracker(Setup):
         instance: int | None = None,
         T_held: Floats | None = None,
     ) -> Tracker:
-        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
+        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules.
+
+        Raises ValueError if T_start is no rotation and translation.
+        """
         start = per_kind(body, rules.motion.start)
         if distance is not None:
             start[:3] = distance
@@ -70,7 +73,7 @@ class Tracker(Setup):
             body.sample(options.samples, seed=options.seed),
             start,
             rules,
-            T_start,
+            pose_meant(T_start),
             instance=instance,
             T_held=T_held,
         )
@@ -213,8 +216,7 @@ def estimate_pose(
     Raises ValueError for arrays that cannot be meant: a start or sensor that is no rigid motion,
     NaN, other shapes, features of a view that have not the dimension of its sensor.
     """
-    require_meant(views, model, start)
-    start = None if start is None else np.asarray(start, dtype=np.float64)
+    require_meant(views, model)
     tracker = Tracker.create(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     with one_blas_thread():
