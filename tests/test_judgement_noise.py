@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from mixpose.judgement import NoiseModel, RememberedNoise, noise
+from mixpose.judgement.fields import Fields, of_each
 from mixpose.judgement.noise import noise_of
 from mixpose.matching import ErrorRules
 
@@ -264,14 +265,15 @@ def test_sums_over_markers_are_those_over_pairs_of_markers() -> None:
     for i in range(N):
         P[:, i, :, i] = by_place.reshape(L, N, 2, 3)[:, i]
     P = np.concatenate([fields, P.reshape(2 * L * N, 3 * N)], axis=1)
-    A, kinds = J.T @ J, noise.kinds_of(L, N)
-    gram = P.T @ P - P.T @ J @ np.linalg.inv(A) @ J.T @ P
+    A, kinds = J.T @ J, np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * N)]
+    inverse = np.asarray(np.linalg.inv(A), dtype=np.float64)
+    gram = P.T @ P - P.T @ J @ inverse @ J.T @ P
     exact = kinds.T @ gram**2 @ kinds
     exact[0] = exact[:, 0] = gram.diagonal() @ kinds
-    left = fields - J @ np.linalg.inv(A) @ J.T @ fields
-    markers, taken = noise.of_each(by_place, seen), J.T @ P
-    given = fields, left, noise.of_each(left, seen), markers, taken, np.linalg.inv(A) @ taken
-    np.testing.assert_allclose(noise.expected_squares(*given, kinds), exact, rtol=1e-9, atol=1e-9)
+    left = fields - J @ inverse @ J.T @ fields
+    r, markers, taken = np.zeros(len(J)), of_each(by_place, seen), J.T @ P
+    at = Fields(r, J, fields, markers, kinds, A, inverse, taken, inverse @ taken, left)
+    np.testing.assert_allclose(at.expected_squares(seen), exact, rtol=1e-9, atol=1e-9)
 
 
 def test_what_a_frame_leaves_open_is_no_wider_than_anywhere() -> None:

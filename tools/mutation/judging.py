@@ -80,7 +80,7 @@ _NOISE = (
 _FIELDS = (
     Mutant(
         "judgement-pairs-of-markers-forgotten",
-        "judgement/noise.py",
+        "judgement/fields.py",
         "max(float(pairs - np.vdot(both, both)), 0.0)",
         "0.0",
         "markers that are off seem to be seen more surely than they are",
@@ -88,8 +88,8 @@ _FIELDS = (
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "variances[0] * inverse + (drawn * (kinds @ variances)) @ drawn.T",
-        "variances[0] * inverse",
+        "variances[0] * at.inverse + (drawn * (kinds @ variances)) @ drawn.T",
+        "variances[0] * at.inverse",
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
@@ -109,8 +109,8 @@ _FIELDS = (
     Mutant(
         "judgement-markers-off-are-noise",
         "judgement/noise.py",
-        "pulls**2 @ kinds[:, 1:]",
-        "pulls**2 @ kinds[:, 1:] * [1, 1, 0]",
+        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:]",
+        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:] * [1, 1, 0]",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
@@ -123,7 +123,7 @@ _FIELDS = (
     ),
     Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
-        "judgement/noise.py",
+        "judgement/fields.py",
         "left = fields - J @ (drawn :=",
         "left = fields - 0 * J @ (drawn :=",
         "offsets that a pose takes for its own are thought to be small",
@@ -310,7 +310,7 @@ _JUDGE = (
     ),
     Mutant(
         "judgement-open-without-end",
-        "judgement/noise.py",
+        "judgement/fields.py",
         "information.flat[:: count + 1] += anywhere[chosen] ** -2.0",
         "pass",
         "covariances of what a frame leaves open are no covariances",

@@ -29,9 +29,10 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from mixpose.body import Body
+from mixpose.judgement.fields import fields_of_sensors
 from mixpose.judgement.information import inverted
 from mixpose.judgement.judge import ScoredPose
-from mixpose.judgement.noise import NoiseModel, fields_of_sensors
+from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform

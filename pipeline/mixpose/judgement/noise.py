@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -32,6 +31,7 @@ from scipy.special import expit, logit
 
 from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
+from mixpose.judgement.fields import Fields, fields_at
 from mixpose.judgement.information import inverted, unit
 from mixpose.matching import (
     ErrorRules,
@@ -134,35 +134,21 @@ def noise_of(
     is_off, noise = model.errors.are_off(found, wide), np.sqrt(scale)
     counted = found.shares * found.each_part[:, None] * scale[:, None] / wide
     met = (shares := np.where(is_off, 0.0, counted)).sum(axis=1)
-    # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
-    r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    fields = fields_of_sensors(found, shares, met)
-    if found.owners is not None:
-        r, rows, fields = (_folded(one, found) for one in (r, rows, fields))
-    J = rows[:, chosen]
-    markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
-    information, q = J.T @ J, fields.shape[1]
-    information.flat[:: count + 1] += anywhere[chosen] ** -2.0
-    inverse = inverted(information)
-    by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
-    taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
-    # by how much fields move the pose, and what it leaves of those of sensors, which may last
-    left = fields - J @ (drawn := inverse @ taken)[:, :q]
-    lasting = left / (sizes := noise.repeat(q // len(noise)))
-    biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
-    rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
-    by_markers = of_each(r[:, None], found).swapaxes(1, 2) @ markers
-    pulls = np.concatenate([rest @ fields, by_markers.ravel()])
-    moved = drawn[:, :q] / sizes
+    at = fields_at(found, shares, roots, chosen, anywhere)
+    # those of sensors may last
+    q = at.left.shape[1]
+    lasting = at.left / (sizes := noise.repeat(q // len(noise)))
+    biases, mean, second = _lasting(before.biases, found.names, lasting, at.r, model)
+    rest, (covariance, steady) = at.r - lasting @ mean, np.zeros((2, 6, 6))
+    moved = at.drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
     spare = float(met @ found.dimensions) - count
     own = np.zeros((4, 5))
     if spare > 0:
-        own[:, :4] = expected_squares(
-            fields, left, of_each(left, found), markers, taken, drawn, kinds
-        )
-        own[0, 0], own[0, 4], own[1:, 4] = spare, rest @ rest, pulls**2 @ kinds[:, 1:]
+        own[:, :4] = at.expected_squares(found)
+        own[0, 0], own[0, 4] = spare, rest @ rest
+        own[1:, 4] = at.pulls(rest, found) ** 2 @ at.kinds[:, 1:]
     moments = model.memory * before.moments + own
     usual = model.usual**2 / float(scale.mean())
     most = sum(found.met.tolist()) / len(found.names)
@@ -174,12 +160,13 @@ def noise_of(
     by_kind[0] = (counts * by_kind[0] + own[0, 4]) / (counts + spare)
     # fields last: a further frame shows no more of them
     known_to = np.maximum([degrees, *of_fields], model.fewest_degrees)
-    covariance[inner], larger = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
-    given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
-    spread, needed = with_cut_spots(*given, float(known_to[0]))
+    covariance[inner], larger = _of_all_kinds(by_kind, known_to, at, model)
+    given = found, at.J, at.r, at.information, known[chosen], wide, model.errors
+    spread, needed = with_cut_spots(*given, 1 - model.by_chance, float(known_to[0]))
     covariance[inner] = max(larger, needed) * (covariance[inner] + spread)
     if found.by_calibration is not None:
-        pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
+        by_calibration = roots[:, None] * found.by_calibration.reshape(len(roots), -1)
+        pulled = at.inverse @ (at.J.T @ by_calibration)
         covariance[inner] += pulled @ pulled.T
     after = before.followed(found.names, sums, moments, biases, share)
     return variances, covariance + steady, steady, after, ratio, rarity
@@ -188,19 +175,18 @@ def noise_of(
 def _of_all_kinds(
     variances: Floats,  # (4,) of independent errors and of fields
     degrees: Floats,  # (4,) of freedom that they are known to
-    inverse: Floats,  # (k, k) covariance by unit errors
-    drawn: Floats,  # (k, q + 3 N) what a field of unit size moves a pose by
-    kinds: Floats,
+    at: Fields,
     model: NoiseModel,
 ) -> tuple[Floats, float]:
     """The covariance (k, k) by all kinds of errors, and by what it is larger as they are not known.
 
     Their shares are of all directions together.
     """
-    covariance = variances[0] * inverse + (drawn * (kinds @ variances)) @ drawn.T
+    drawn, kinds = at.drawn, at.kinds
+    covariance = variances[0] * at.inverse + (drawn * (kinds @ variances)) @ drawn.T
     B = inverted(covariance)
     shares = variances * (np.vecdot(drawn.T, (B @ drawn).T) @ kinds)
-    shares[0] = variances[0] * np.vdot(B, inverse)
+    shares[0] = variances[0] * np.vdot(B, at.inverse)
     shares /= max(float(shares.sum()), 1e-300)
     return covariance, float(model.enlargement(1 / float(shares**2 @ (1 / degrees))))
 
@@ -257,68 +243,6 @@ def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, f
     return at * pooled(ratios, rules, nu, deviation=1.0), rarity
 
 
-def _folded(rows: Floats, found: Matches) -> Floats:
-    """Rows (R, ...) of all sensors, with each coordinate of a cloud in one image instead of two.
-
-    The second coordinate of an image is the first of the next: they err alike, as one.
-    """
-    folded = rows.reshape(*found.shares.shape, 2, -1).copy()
-    for number in np.flatnonzero(found.images > 1):
-        own = np.flatnonzero(found.owner == number)
-        first, second = folded[np.roll(own, -1), :, 0], folded[own, :, 1]
-        folded[own, :, 0], folded[own, :, 1] = 0.0, (first + second) / math.sqrt(2)
-    return folded.reshape(rows.shape)
-
-
-def of_each(rows: Floats, found: Matches) -> Floats:
-    """Rows (R, k) of all sensors by marker (N, 2 L, k)."""
-    L, N = found.shares.shape
-    return rows.reshape(L, N, 2, -1).swapaxes(0, 1).reshape(N, 2 * L, -1)
-
-
-def _by_marker(found: Matches, by_place: Floats) -> Floats:
-    """Fields (N, 2 L, 3) of each marker: what it is off by along the axes of the world.
-
-    Of weighted Jacobians (R, 3) by its place; a field is nothing in the rows of other markers.
-    """
-    # in units of how features move with the body, the root mean square of those in view
-    counts = 3 * (found.weights > 0).sum(axis=1) @ (found.dimensions * found.each_part)
-    moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
-    return of_each(by_place, found) / max(moved, 1e-6)
-
-
-def fields_of_sensors(found: Matches, shares: Floats, met: Floats) -> Floats:
-    """Fields (R, q) of sensors, weighted by shares (L, N), of which they met (L,).
-
-    Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
-    about their middle (kind 2).
-    """
-    L, N = shares.shape
-    total = np.maximum(met, 1e-6)[:, None]
-    away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
-    spread = np.vecdot(shares, np.vecdot(away, away))
-    size = np.sqrt(spread / (found.dimensions * total[:, 0]))
-    by_feature, roots = np.empty((L, N, 3)), np.sqrt(shares)
-    by_feature[..., 0] = roots
-    by_feature[..., 1:] = away * (roots / np.maximum(size, 1e-6)[:, None])[..., None]
-    of_sensors = by_feature[:, :, None, None, None] * _of_sensors(tuple(found.dimensions.tolist()))
-    return np.asarray(of_sensors.reshape(2 * L * N, -1))
-
-
-@lru_cache(maxsize=64)
-def _of_sensors(dimensions: tuple[int, ...]) -> Floats:
-    """Which rows (L, 1, 2, L, 2, 1) the columns of sensors are of."""
-    axes = np.arange(2) < np.array(dimensions)[:, None]
-    own = np.einsum("lk,ij,li->likj", np.eye(len(dimensions)), np.eye(2), axes)
-    return np.asarray(own[:, None, ..., None])
-
-
-@lru_cache(maxsize=64)
-def kinds_of(sensors: int, markers: int) -> Floats:
-    """The kinds (q + 3 N, 4) of all fields, as ones: those of sensors, then those of markers."""
-    return np.eye(4)[[1, 2, 2] * (2 * sensors) + [3] * (3 * markers)]
-
-
 def _lasting(
     before: Biases, names: tuple[str, ...], fields: Floats, r: Floats, model: NoiseModel
 ) -> tuple[Biases, Floats, Floats]:
@@ -351,36 +275,6 @@ def _log_density(A: Floats, v: Floats, d: float) -> float:
     """The log of the density of v with fields of deviation d, over that without."""
     factor, mean, _ = dposv(A + unit(len(v)) / d**2, v)
     return 0.5 * float(v @ mean) - float(np.log(d * factor.diagonal()).sum())
-
-
-def expected_squares(
-    fields: Floats,
-    left: Floats,
-    left_by_marker: Floats,
-    markers: Floats,
-    taken: Floats,
-    drawn: Floats,
-    kinds: Floats,
-) -> Floats:
-    """What independent errors and fields of each kind add to squares, (4, 4), but for tr R.
-
-    `left` (R, q) is what a pose leaves of `fields` of sensors, also by marker (N, 2 L, q); A⁻¹ of
-    `taken` = JᵀWP (k, q + 3 N) is `drawn`.  What a pose leaves of two markers' fields is of the
-    rank of the pose: sums over pairs of markers are sums over markers.
-    """
-    q, count, N = fields.shape[1], len(taken), len(markers)
-    beside = (left_by_marker.swapaxes(1, 2) @ markers).swapaxes(0, 1).reshape(q, 3 * N)
-    gram = np.concatenate([fields.T @ left, beside], axis=1)
-    U, W = (one[:, q:].reshape(count, N, 3).transpose(1, 0, 2) for one in (taken, drawn))
-    both = U.swapaxes(1, 2) @ W
-    own = markers.swapaxes(1, 2) @ markers - both
-    pairs = np.vdot(taken[:, q:] @ taken[:, q:].T, drawn[:, q:] @ drawn[:, q:].T)
-    expected = kinds[:q].T @ gram**2 @ kinds
-    expected[3, 3] = np.vdot(own, own) + max(float(pairs - np.vdot(both, both)), 0.0)
-    expected[3, :3] = expected[:3, 3]
-    diagonals = gram.diagonal(), own.diagonal(axis1=1, axis2=2).ravel()
-    expected[0] = expected[:, 0] = np.concatenate(diagonals) @ kinds
-    return np.asarray(expected)
 
 
 def _variances(
