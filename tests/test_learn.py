@@ -200,7 +200,9 @@ def test_a_body_that_shows_four_of_nine_markers_for_a_while_is_one_body() -> Non
 
 def test_a_body_that_never_moves_is_refused_with_what_is_missing() -> None:
     points, poses = moving(5, 3)
-    with pytest.raises(RecordingError, match=r"9 of which never move; .*turn it by 30 degrees"):
+    with pytest.raises(
+        RecordingError, match=r"and 9 places that never move; .*turn it by 30 degrees"
+    ):
         lesson_of([(points, np.repeat(poses[:1], SHORT.frames, axis=0))])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import command
+from command_line import assert_one_line, command
 from pose_lines import covariance_of, lines_of, measured, write_poses
 from scipy.signal import lfilter
 from scipy.stats import chi2
@@ -171,6 +171,15 @@ def test_turns_that_are_missing_are_named(tilt_deg: float, spin_deg: float, said
         find_tip(run_of(1, tilt_deg=tilt_deg, spin_deg=spin_deg))
 
 
+def test_wrong_poses_make_no_turns_that_are_missing() -> None:
+    for seed in range(8):
+        pivoting, rng = run_of(seed, tilt_deg=0.0), np.random.default_rng(seed)
+        poses, wrong = pivoting.poses.copy(), rng.choice(100, 6, replace=False)
+        poses[wrong, :3, :3] = rigid.rotation_matrix(rng.uniform(-3, 3, (6, 3)))
+        with pytest.raises(RecordingError, match=r"not determined along .* -?1.00\) of the body"):
+            find_tip(pivoting._replace(poses=poses))
+
+
 def test_a_tip_is_written_into_the_session_and_told_with_each_pose(tmp_path: Path) -> None:
     # a recording of a body that turns about the middle of its markers, which simulation knows and
     # the session does not say: (20, -21, 91) / 7
@@ -221,6 +230,17 @@ def test_options_that_name_nothing_are_refused(tmp_path: Path) -> None:
     assert "--reference base" in done.stderr
     assert command("pivot", path, "--reference", "tool").returncode == 2
     assert command("pivot", path, "--into", tmp_path / "none.toml").returncode == 2
+
+
+def test_a_frame_that_stands_twice_and_poses_without_a_covariance_are_refused(
+    tmp_path: Path,
+) -> None:
+    pivoting = run_of(1)
+    path, lines = tmp_path / "poses.jsonl", lines_of(pivoting.poses, pivoting.covariances[0])
+    write_poses(path, [*lines, replace(lines[-1], frame=lines[3].frame)])
+    assert_one_line(command("pivot", path), 3, f"frame {lines[3].frame} of 'tool' stands twice")
+    write_poses(path, [*lines[:5], replace(lines[5], covariance=np.zeros((6, 6))), *lines[6:]])
+    assert_one_line(command("pivot", path), 3, "line 7: the pose of 'tool'", "has no covariance")
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])

@@ -59,6 +59,7 @@ def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
         ("ros2://tool?bridge=a..b:9090", "host: found 'a..b'; allowed"),
         ("tcp://there:9870?only=good", "only: found good; allowed: ok"),
         ("osc://there:9870?rate=3", "option: found rate; allowed: only"),
+        ("osc://there:9870/a*", "found '*' in the path; allowed: printable ASCII but for space"),
         ("lsl://", "found no name; allowed: lsl://tracker"),
         ("ros2://my body", "topic: found my body; allowed: words of letters"),
         ("ros2://tool?bridge=there", "bridge: found there; allowed: host:port"),

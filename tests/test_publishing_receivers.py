@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from published_pose import HEADER
 
 from mixpose.publishing import Publishing
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.ws import _Client
+from mixpose.publishing.ws import _Client, _Line
 from mixpose.records import Estimate, FrameSet, Moment, RawFrame, SensorReport
 
 CLIP = Path(__file__).parents[1] / "data" / "synthetic" / "one_camera_video" / "camera.avi"
@@ -243,6 +244,8 @@ def test_receivers_that_never_read_cost_a_run_next_to_nothing(
     for line in said:
         assert "poses" in line
         assert int(line.split(" dropped")[0].split()[-1]) > 500, line
+        # each pose is counted once
+        assert sum(map(int, re.findall(r"(\d+) (?:poses?|more|dropped)", line))) == 1400, line
     assert len(said) == 4
 
 
@@ -252,6 +255,7 @@ def test_a_browser_is_stuck_from_a_quarter_of_a_second_in_one_send(
 ) -> None:
     async def told() -> bool:
         now = asyncio.get_running_loop().time()
-        return _Client(MagicMock(), began=None if since_s is None else now - since_s).is_stuck()
+        line = None if since_s is None else _Line("", 1)
+        return _Client(MagicMock(), sending=line, began=now - (since_s or 0.0)).is_stuck()
 
     assert asyncio.run(told()) == is_stuck

@@ -16,6 +16,7 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.session import load_session
 from mixpose.session.rewriting import document_of, objects_of, plain, put, text_of
+from mixpose.trajectories.lines import require_covariances, require_frames_once
 from mixpose.trajectories.pivot import Pivoting, PivotRules, Tip, find_tip, fixed_in, fixed_in_world
 
 _DIGITS = 8
@@ -31,8 +32,8 @@ def pivot_poses(request: PivotRequest) -> None:
     path = request.poses
     poses = read_poses(path)
     tool = _tool(poses, request)
-    pivoting = _pivoting(poses, tool, request.reference)
     try:
+        pivoting = _pivoting(poses, tool, request.reference)
         tip = find_tip(pivoting)
     except RecordingError as error:
         raise RecordingError(f"{path}: {tool}: {error}") from error
@@ -78,13 +79,10 @@ def _pivoting(poses: PoseFile, tool: str, reference: str | None) -> Pivoting:
 
 
 def _known(poses: PoseFile, label: str) -> dict[int, PoseLine]:
-    lines = [line for line in poses.poses if line.label == label and line.status == "ok"]
-    for line in lines:
-        if line.covariance is None:
-            raise RecordingError(
-                f"{poses.path}:{line.line}: the pose has no covariance; allowed: poses as mixpose "
-                "run writes them"
-            )
+    own = [line for line in poses.poses if line.label == label]
+    require_frames_once(sorted(own, key=lambda line: line.frame))
+    lines = [line for line in own if line.status == "ok"]
+    require_covariances(lines)
     return {line.frame: line for line in lines}
 
 

@@ -33,8 +33,8 @@ class Fields(NamedTuple):
     left: Floats  # (R, q) what the pose leaves of those of sensors
 
     def pulls(self, rest: Floats, found: Matches) -> Floats:
-        """PᵀWr (q + 3 N) of residuals (R,)."""
-        by_markers = of_each(rest[:, None], found).swapaxes(1, 2) @ self.of_markers
+        """PᵀWr (q + 3 N): of sensors by what their lasting fields leave (R,), of markers by all."""
+        by_markers = of_each(self.r[:, None], found).swapaxes(1, 2) @ self.of_markers
         return np.concatenate([rest @ self.of_sensors, by_markers.ravel()])
 
     def expected_squares(self, found: Matches) -> Floats:

@@ -130,8 +130,8 @@ def _nothing_moves(
     )
     if left < 3 <= seen or (still and left < len(still)):
         return (
-            f"{name}: learn: found {seen:.0f} points in space in most frames, {len(still)} of "
-            f"which never move; what moves and turns is missing, or frames are of different "
+            f"{name}: learn: found {seen:.0f} points in space in most frames, and {len(still)} "
+            f"places that never move; what moves and turns is missing, or frames are of different "
             f"moments: {wanted}"
         )
     if seen < 3:

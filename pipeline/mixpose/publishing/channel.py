@@ -135,8 +135,9 @@ class Channel:
 
     def text(self) -> str:
         """One line: how many poses were sent, dropped, and how late they were."""
-        dropped = self._backlog.dropped + self._sender.dropped
-        text = f"published to {self._address.text}: {self._sent} pose{'s' * (self._sent != 1)}"
+        dropped, sent = self._backlog.dropped, self._sent - self._sender.dropped
+        dropped += self._sender.dropped
+        text = f"published to {self._address.text}: {sent} pose{'s' * (sent != 1)}"
         text += f", {self._unheard} more while nobody listened" if self._unheard else ""
         text += f", {dropped} dropped: the receiver was away or too slow" if dropped else ""
         text += f", {self._too_large} dropped: too large" if self._too_large else ""

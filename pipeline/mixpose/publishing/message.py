@@ -82,7 +82,7 @@ class Sender:
     receiver can get this pose.
     """
 
-    dropped = 0  # poses that some receiver did not get because it is slower than others
+    dropped = 0  # of the poses that were handed to it those that no receiver got
 
     def connect(self) -> None:
         """Reach the receiver, where it does not come by itself; again after it was away."""

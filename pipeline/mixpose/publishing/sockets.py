@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import socket
 import time
 from contextlib import suppress
@@ -16,6 +17,9 @@ from mixpose.publishing.message import Message, Sender, TooLargeError, header_te
 
 HEADER_S = 1.0
 """The header, which says the unit, is repeated so often: nobody knows who listens since when."""
+
+_NO_OSC = re.compile(r"[^!-~]|[#*,?\[\]{}]")
+"""What may stand in no address of Open Sound Control 1.0."""
 
 _BY_TCP = "publish to tcp:// or ws://, which carry any size"
 
@@ -136,6 +140,11 @@ class OscSender(Datagrams):
         address.needs("pythonosc", "osc")
         super().__init__(address.place("osc://127.0.0.1:9000"))
         prefix = f"/{address.path or 'mixpose'}"
+        if found := _NO_OSC.search(prefix):
+            raise address.error(
+                f"found {found[0]!r} in the path; allowed: printable ASCII but for space # * , ? "
+                "[ ] { }"
+            )
         words = path_words(header.labels)
         self._paths = {label: f"{prefix}/{word}" for label, word in words.items()}
 

@@ -26,19 +26,29 @@ _QUIET = logging.Logger("mixpose", logging.CRITICAL)  # who connects and then do
 
 
 @dataclass(eq=False)
+class _Line:
+    """A pose, and what became of it."""
+
+    text: str
+    waiting: int  # clients that it waits for
+    has_arrived: bool = False  # at any of them
+
+
+@dataclass(eq=False)
 class _Client:
     """What waits for one browser."""
 
     connection: ServerConnection
-    waiting: deque[str] = field(default_factory=deque)
+    waiting: deque[_Line] = field(default_factory=deque)
+    sending: _Line | None = None
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     has_gone: bool = False
-    began: float | None = None  # when the send began that goes on
+    began: float = 0.0  # when the send began that goes on
 
     def is_stuck(self) -> bool:
         """Whether it does not read."""
         now = asyncio.get_running_loop().time()
-        return self.began is not None and now - self.began > PublishingRules.stuck_s
+        return self.sending is not None and now - self.began > PublishingRules.stuck_s
 
 
 class WebSocketSender(Sender):
@@ -82,12 +92,18 @@ class WebSocketSender(Sender):
         self._thread.join(2 * PublishingRules.farewell_s)
 
     def _hand_out(self, text: str) -> None:
+        line = _Line(text, len(self._clients))
+        self.dropped += not line.waiting  # all have gone meanwhile
         for client in self._clients:
             if len(client.waiting) == PublishingRules.waiting:
-                client.waiting.popleft()
-                self.dropped += 1
-            client.waiting.append(text)
+                self._let_go(client.waiting.popleft())
+            client.waiting.append(line)
             client.changed.set()
+
+    def _let_go(self, line: _Line) -> None:
+        """One client less has a line to come; it is dropped if it came to none."""
+        line.waiting -= 1
+        self.dropped += not (line.waiting or line.has_arrived)
 
     def _run(self) -> None:
         self._loop.run_until_complete(self._serve())
@@ -108,11 +124,10 @@ class WebSocketSender(Sender):
             deadline = self._loop.time() + PublishingRules.farewell_s
             # for what is still to be sent to those who read
             while self._loop.time() < deadline and any(
-                one.waiting or one.began is not None for one in self._clients if not one.is_stuck()
+                one.waiting or one.sending for one in self._clients if not one.is_stuck()
             ):
                 await asyncio.sleep(0.01)
             for client in self._clients:
-                self.dropped += len(client.waiting) + (client.began is not None)
                 if client.is_stuck():
                     client.connection.transport.abort()
 
@@ -135,13 +150,18 @@ class WebSocketSender(Sender):
                 await client.changed.wait()
                 client.changed.clear()
                 while client.waiting:
-                    client.began = self._loop.time()
-                    await connection.send(client.waiting.popleft())
-                    client.began = None
+                    client.began, client.sending = self._loop.time(), client.waiting.popleft()
+                    await connection.send(client.sending.text)
+                    client.sending.has_arrived = True
+                    self._let_go(client.sending)
+                    client.sending = None
         except ConnectionClosed:
             return
         finally:
             self._clients.discard(client)
+            for line in (client.sending, *client.waiting):
+                if line is not None:
+                    self._let_go(line)
             reading.cancel()
 
 

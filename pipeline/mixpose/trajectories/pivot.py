@@ -93,8 +93,7 @@ def find_tip(pivoting: Pivoting) -> Tip:
             f"found {len(pivoting.poses)} poses that are ok; allowed: at least {rules.fewest}, in "
             "which the tool turns about its tip"
         )
-    turns, directions = turns_seen(pivoting)
-    _require_turns(pivoting, turns, directions, 1.0, rules)
+    _require_turns(pivoting, 1.0, rules)
     kept = _alike(pivoting, rules)
     for turn in range(10):
         x, information, squared = _solved(pivoting, kept, rules)
@@ -110,7 +109,8 @@ def find_tip(pivoting: Pivoting) -> Tip:
     expected = _covariances(some, by_poses)
     scale = float(squared[kept].sum() / (3 * len(rest) - 6))
     told = max(1.0, scale)
-    _require_turns(pivoting, turns, directions, told, rules)
+    # of those that count: what a wrong pose turns by tells nothing
+    turns, directions = _require_turns(some, told, rules)
     covariance = told * _of_tip(information[kept])
     held_out, lasting, by_few = _held_out(some, x[:3], information[kept], told, rules)
     return Tip(
@@ -129,7 +129,7 @@ def find_tip(pivoting: Pivoting) -> Tip:
     )
 
 
-def turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
+def _turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
     """By how much directions of the body swing, RMS in radians (3,), least first, and these (3, 3).
 
     The tip along a direction that does not swing may be anywhere.
@@ -140,10 +140,9 @@ def turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
     return np.sqrt(np.maximum(values, 0.0)), vectors.T
 
 
-def _require_turns(
-    pivoting: Pivoting, turns: Floats, directions: Floats, scale: float, rules: PivotRules
-) -> None:
-    """Raise a RecordingError where a direction swings no more than errors make it."""
+def _require_turns(pivoting: Pivoting, scale: float, rules: PivotRules) -> tuple[Floats, Floats]:
+    """As `_turns_seen`; a RecordingError where a direction swings no more than errors make it."""
+    turns, directions = _turns_seen(pivoting)
     both = scale * (pivoting.covariances + pivoting.reference_covariances)[:, 3:, 3:]
     d = pivoting.poses[:, :3, :3] @ directions.T
     # a turn by w moves a direction by w × d
@@ -151,7 +150,7 @@ def _require_turns(
     noise = np.sqrt((np.trace(both, axis1=1, axis2=2)[:, None] - along).mean(axis=0))
     swings = turns > rules.turned * noise
     if swings[0]:
-        return
+        return turns, directions
     least, found = np.degrees(rules.turned * noise), np.degrees(turns)
     if not swings[1]:
         raise RecordingError(

@@ -27,6 +27,7 @@ from mixpose.trajectories.intensity import (
     logs_of_wrong,
     smooth_with_sudden_motion,
 )
+from mixpose.trajectories.lines import require_covariances, require_frames_once
 from mixpose.trajectories.track import (
     MotionModel,
     SmoothedTrack,
@@ -88,7 +89,7 @@ def smooth_body(
     at = np.array([line.frame for line in ordered], float) if times is None else times
     ordered = unfolded(ordered, symmetries)
     posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
-    _require_covariances([ordered[k] for k in posed])
+    require_covariances([ordered[k] for k in posed])
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
@@ -141,24 +142,10 @@ def _possible(label: str) -> Iterator[dict[int, Estimate]]:
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
     """Of all lines; None where one has none, or they do not ascend."""
-    frames = [line.frame for line in lines]
-    for before, frame in pairwise(frames):
-        if before == frame:
-            raise RecordingError(
-                f"frame {frame} of {lines[0].label!r} stands twice; allowed: a line per frame"
-            )
+    require_frames_once(lines)
     found = [line.time_s for line in lines if line.time_s is not None]
     times = np.array(found, dtype=np.float64)
     return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
-
-
-def _require_covariances(lines: Sequence[PoseLine]) -> None:
-    for line in lines:
-        if line.covariance is None or not line.covariance.any():
-            raise RecordingError(
-                f"line {line.line}: the pose of {line.label!r} in frame {line.frame} has no "
-                "covariance; allowed: poses as mixpose run writes them"
-            )
 
 
 def _track(lines: Sequence[PoseLine], times: Floats) -> Track:
