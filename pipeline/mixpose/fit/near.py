@@ -266,7 +266,7 @@ def _to_the_noise(
         is_end = is_end and (are_right or best is not None)
         straight, is_clear = np.inf, are_right and not others
         if not is_end and (best is None or is_clear):
-            moved, shift = _moved(matches, free, end, variances)
+            moved, shift, _ = _moved(matches, free, end, variances)
             is_end = best is None and moved < rules.moved**2
             # as narrow as features are off by then at once, if nothing else pulls them
             straight = shift if is_clear else np.inf
@@ -275,8 +275,13 @@ def _to_the_noise(
         likelihood = np.inf if is_only else float(log_likelihood(narrow, matches, count, errors))
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit
-        if is_end or likeliest < least:
+        if is_end:
             return best
+        if likeliest < least:  # how likely may it become?
+            *_, there = _moved(matches, free, end, variances)
+            narrow = errors_seen(there, count, known, errors)[2]
+            if log_likelihood(narrow, there, count, errors) < least:
+                return best
         likeliest = -np.inf if is_rough else likeliest
         if not is_noise:
             blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]
@@ -328,10 +333,10 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
 
 def _moved(
     matches: Matches, free: Mask, narrower: Floats, variances: Floats
-) -> tuple[float, float]:
+) -> tuple[float, float, Matches]:
     """About how far narrower blurs (L,) move the pose, in squared standard deviations.
 
-    And by how much any feature that is met, in σ_ε.
+    And by how much any feature that is met, in σ_ε; and how that leaves what is met.
     """
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])
@@ -344,4 +349,4 @@ def _moved(
         offsets = matches.offsets - (J @ twist).reshape(offsets.shape)
     away = matches.offsets - offsets
     shift = np.sqrt(np.vecdot(away, away).max(initial=0.0, where=matches.shares > 0))
-    return float(twist @ information @ twist), float(shift)
+    return float(twist @ information @ twist), float(shift), replace(matches, offsets=offsets)

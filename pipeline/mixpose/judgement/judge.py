@@ -100,6 +100,11 @@ class ScoredPose:
         """Number of sensor coordinates that are met."""
         return float(sum(self.used.measurements.tolist()))
 
+    @property
+    def gained(self) -> float:
+        """Log evidence per coordinate that is met."""
+        return self.log_evidence / max(self.measurements, 1.0)
+
     @cached_property
     def features(self) -> tuple[int, int]:
         """Numbers of features that some sensor meets, and that some sensor has in view."""

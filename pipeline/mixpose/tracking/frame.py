@@ -322,19 +322,22 @@ class Frame(Setup):
         return branch.course.expected(moved if is_there else None, elapsed)
 
 
-def _least_moved(
-    T_before: Floats, T_world_object: Floats, body: Body, alike: Sequence[Floats]
+def _moved(
+    parent: Branch, expected: Branch, T_world_object: Floats, frame: Frame, alike: Sequence[Floats]
 ) -> tuple[Floats, bool]:
-    """The least twist (6,) to a pose, if that before was right, or a look-alike of what was right.
+    """The twist (6,) to a pose, from that before, or from a look-alike of that.
 
-    And whether it was one.
+    And whether it is the latter: by where the body was expected, as now and then another one is
+    taken for it.
     """
-    if not alike:
-        return twist_between(T_before, T_world_object), False
-    before = np.concatenate([T_before[None], T_before @ inverse(np.array(alike))])
-    moved = twist_between(before, T_world_object)
-    least = int(np.linalg.norm(moved / np.repeat([body.radius, 1.0], 3), axis=1).argmin())
-    return moved[least], least > 0
+    T_before, chosen = parent.T_world_object, 0
+    if alike:
+        like = np.concatenate([T_world_object[None], T_world_object @ np.array(alike)])
+        logs = expected.log_density(like, frame.free, frame.rules.motion)
+        logs[1:] += math.log(frame.rules.motion.surprise)
+        if chosen := int(logs.argmax()):
+            T_before = T_before @ inverse(alike[chosen - 1])
+    return twist_between(T_before, T_world_object), chosen > 0
 
 
 def given(frame: Frame, T_world_object: Floats) -> float:
@@ -364,7 +367,12 @@ def follow(
         velocity, course, uncertainty = None, None, rules.unsteady * steady
         parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
         if parent is not None and alike is not None:
-            moved, is_other = _least_moved(parent.T_world_object, T, body, alike)
+            (expected,) = (
+                there
+                for one, there in zip(track.branches, frame.predictions, strict=True)
+                if one is parent
+            )
+            moved, is_other = _moved(parent, expected, T, frame, alike)
             parent = replace(parent, velocity=None, course=None) if is_other else parent
             if one.spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)

@@ -62,6 +62,8 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
+    # nor as evident as before by what it meets
+    is_far |= any(one.gained < rules.proposals.fallen * track.gained for one in ranked[:1])
     if frame.first_is(frame.trusted, ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
@@ -71,7 +73,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
-    return bool(is_new or track.misses or track.doubted or misses_more or is_off)
+    return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:

@@ -138,6 +138,7 @@ class Track:
     doubted: bool = False  # whether another body may have what the last pose meets
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
+    gained: float = 0.0  # log evidence of the last of them per coordinate that it met
     shape: Shape | None = None  # what frames of which none was ok told of it
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain

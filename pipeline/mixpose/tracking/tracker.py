@@ -314,6 +314,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         known=is_ok
         or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
+        gained=best.gained if is_ok else track.gained,
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
