@@ -175,7 +175,7 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         sigmas = np.array([view.observation.sigma for view in views])
         matches = matched(objective, ascent.states[0])
         _, variances, blurs, _ = errors_seen(matches, 6, known, errors)
-        expected, shift = near._moved(matches, ALL_FREE, blurs, variances)
+        expected, shift, _ = near._moved(matches, ALL_FREE, blurs, variances)
         narrow = matched_objective(views, body, (blurs * sigmas).tolist())
         end = ascend(narrow, ascent.states, perturb, ALL_FREE, FitRules().sharp).states[0]
         unit = float(np.sqrt(variances.mean())) * 1.5 / NOISE_PX

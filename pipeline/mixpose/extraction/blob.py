@@ -64,6 +64,7 @@ class Blob(NamedTuple):
     rim: Rim | None = None
     off: float | None = None  # px by which its centre may be off, where its grey values tell
     carries: bool = False  # whether it has something far brighter on it: features, or a highlight
+    size: float | None = None  # px at half of its height, of what has no rim
 
 
 def usually_off(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> float:

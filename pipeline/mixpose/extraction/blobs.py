@@ -70,7 +70,8 @@ def extract_all(
     usual = usually_off(list(chain(*found)), rules)
     for blobs, (_, _, window) in zip(found, images, strict=True):
         points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
-        radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
+        areas = np.array([blob.size or blob.area for blob in blobs], dtype=np.float64)
+        radii = np.sqrt(areas / math.pi)
         deviations = deviations_of(blobs, usual, rules)
         patterns.append(PointPattern(points + window[:2], np.ones(len(points)), deviations, radii))
     return patterns
@@ -198,7 +199,8 @@ def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> N
     found = all_spots(scene, contours, areas, levels, rules.spots)
     for part, spots in zip(small, found, strict=True):
         shape = length_by_width(part.contour) if len(spots) == 1 else (1.0, 0.0)
-        part.found = [Blob(u, v, part.area / len(spots), *shape, off=off) for u, v, off in spots]
+        share = part.area / len(spots) if spots else 0.0
+        part.found = [Blob(u, v, share, *shape, off=off, size=size) for u, v, off, size in spots]
 
 
 def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:

@@ -58,6 +58,18 @@ def centroids(weights: NDArray[np.float32] | NDArray[np.uint8]) -> tuple[Floats,
     return np.stack([u, v], axis=1), off
 
 
+def areas_at_half(signal: NDArray[np.float32], base: Floats, peak: Floats) -> Floats:
+    """How large spots (K, h, w) are at half of their height, px (K,), as rims of disks are.
+
+    Pixels from a quarter to three quarters of it count in part.
+    """
+    height = np.maximum(peak - base, np.finfo(np.float32).tiny).astype(np.float32)
+    share = (signal - base.astype(np.float32)[:, None, None]) * (2 / height)[:, None, None]
+    share -= np.float32(0.5)
+    np.clip(share, 0, 1, out=share)
+    return np.asarray(share.sum(axis=(1, 2)), dtype=np.float64)
+
+
 @lru_cache(maxsize=SHAPES)
 def _monomials(rows: int, columns: int) -> Floats:
     """1, z, |z|², z² and z³ of the pixels of a patch (8, rows * columns), complex ones as two."""

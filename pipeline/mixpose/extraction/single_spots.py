@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.shape import Patches, centroids
+from mixpose.extraction.shape import Patches, areas_at_half, centroids
 from mixpose.extraction.spots import SpotRules, find_spots, is_long
 from mixpose.extraction.threshold import Foreground
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 
 FEWEST = 3  # for which it pays
 WIDEST_PX = 15
 
-Spots = list[tuple[float, float, float]]
+Spots = list[tuple[float, float, float, float]]
 
 
 def all_spots(
@@ -37,14 +37,14 @@ def all_spots(
     bright, usual = _bright(scene, contours, levels, rules)
     if len(usual) >= FEWEST and float(levels.min()) > 0:
         own, boxes = (np.array(one) for one in zip(*usual, strict=True))
-        centres, off, sure, clear = _together(scene, boxes, areas[own], levels[own], rules)
-        told = (one[sure].tolist() for one in (own, centres, off, clear))
-        for k, centre, apart, stands_out in zip(*told, strict=True):
+        *seen, sure = _together(scene, boxes, areas[own], levels[own], rules)
+        told = (one[sure].tolist() for one in (own, *seen))
+        for k, centre, apart, size, stands_out in zip(*told, strict=True):
             if not stands_out:
                 bright.remove(k)
             elif not (scene.judged and is_long(contours[k], rules)):
                 bright.remove(k)
-                found[k] = [(centre[0], centre[1], apart)]
+                found[k] = [(centre[0], centre[1], apart, size)]
     for k in bright:
         found[k] = find_spots(scene, contours[k], areas[k], float(levels[k]), rules)
     return found
@@ -75,8 +75,8 @@ def _bright(
 
 def _together(
     scene: Foreground, boxes: NDArray[np.intp], areas: Floats, levels: Floats, rules: SpotRules
-) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Centres (K, 2), how far they may be off, which need no mask, and which stand out."""
+) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+    """Centres (K, 2), how far they may be off, areas, which stand out, and which need no mask."""
     signal, corners, base, peak = Patches.about(scene, boxes, rules.margin)
     level = levels.astype(np.float32)[:, None, None]
     alone = (signal > level).reshape(len(boxes), -1).sum(axis=1) == areas
@@ -84,8 +84,9 @@ def _together(
     if scene.judged:
         bright = (peak - base >= rules.min_step * peak) & (peak - levels >= rules.prominence * peak)
     base = np.minimum(base, levels)
+    sizes = areas_at_half(signal, base, peak)
     cut = np.maximum(levels, base + rules.centroid * (peak - base)).astype(np.float32)
     weights = np.maximum(signal - cut[:, None, None], 0)
     centres, off = centroids(weights)
     alone &= np.isfinite(off)
-    return centres + corners, off, alone, bright
+    return centres + corners, off, sizes, bright, alone

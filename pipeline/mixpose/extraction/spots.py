@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.contours import Contour, filled, on_border, signal_about
-from mixpose.extraction.shape import background, centroids
+from mixpose.extraction.shape import areas_at_half, background, centroids
 from mixpose.extraction.threshold import Foreground, above
 
 
@@ -43,10 +43,10 @@ def find_spots(
     area: float,
     level: float,
     rules: SpotRules = SpotRules(),
-) -> list[tuple[float, float, float]]:
+) -> list[tuple[float, float, float, float]]:
     """Centre (u, v) of a small blob, px of the window, or the centres of blobs that touch in it.
 
-    Each with how far it may be off.
+    Each with how far it may be off, and how large it is at half of its height, px.
 
     The contour encloses `area` px that are above the level.  There is none if the border of the
     window cuts the blob or it does not stand out.
@@ -69,6 +69,8 @@ def find_spots(
         return []
     base = min(base, level)
     parts = come_apart(scene, contour, patch, inside, level, rules)
+    own = patch if inside is None else patch * inside
+    size = float(areas_at_half(own[None], np.array([base]), np.array([peak]))[0])
     centres = []
     whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or whole:
@@ -81,7 +83,9 @@ def find_spots(
             # Nothing but rounding above the cut: all of its pixels alike.
             weights = above(patch, level) if part is None else part
         (centre,), (off,) = (one.tolist() for one in centroids(weights[None]))
-        centres.append((corner[0] + centre[0], corner[1] + centre[1], off))
+        centres.append(
+            (corner[0] + centre[0], corner[1] + centre[1], off, size / max(len(parts), 1))
+        )
     return centres
 
 

@@ -181,8 +181,8 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
     if not isinstance(pattern, PointPattern) or not expected.unexplained.any():
         return []
     # of several bodies these are what the others leave, and not all blobs of the image
-    peaks = [
-        float(light.raw[around(place, radius, light.raw.shape)].max())
+    regions = [
+        around(place, radius, light.raw.shape)
         for place, radius in zip(pattern.points, pattern.radii.tolist(), strict=True)
     ]
     extra = expected.unexplained
@@ -192,8 +192,9 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
         # what looks like clutter may be the markers
         where = "shows more of the body" if expected.sure else "is ok"
         return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
-    size, peak = np.pi * pattern.radii**2, np.array(peaks)
-    own = ~extra
+    labels, areas = light.pieces
+    size = np.array([areas[labels[one]].max() for one in regions], dtype=np.float64)
+    peak, own = np.array([light.raw[one].max() for one in regions]), ~extra
     if size[extra].max() < 0.8 * size[own].min():
         middle = np.sqrt(size[extra].max() * size[own].min())
         return [f"{text}, all smaller than those that do: raise min_area to {middle:.0f}"]

@@ -28,7 +28,8 @@ class ProposalRules:
     )
     seconds: int = constant(3, "candidates for a second pose: of clutter the best is the likeliest")
     fallen: float = constant(
-        0.5, "of the log evidence per coordinate of the pose before: offsets are seven times as large"
+        0.5,
+        "of the log evidence per coordinate of the pose before: offsets are seven times as large",
     )
     static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
     believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")

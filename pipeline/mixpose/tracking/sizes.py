@@ -1,9 +1,10 @@
 """How large markers look, and so which spots are cut, merged or something else.
 
-A marker of radius R in an image whose scale is s (pixels per length at the feature) has a spot of
-radius sR.  What hides a part of it leaves r² of (sR)² of the area, and moves the centroid by what
-is lost of the whole disk's moment: by sR (1 − r²/s²R²) where what is lost lies at the rim, and
-as far where only a part at the rim is left.  What is larger is merged, with the roles exchanged.
+A marker of radius R in an image whose scale is s (pixels per length at the feature, of a disk
+along its plane) has a spot of radius sR.  What hides a part of it leaves r² of (sR)² of the area,
+and moves the centroid by what is lost of the whole disk's moment: by sR (1 − r²/s²R²) where what is
+lost lies at the rim, and as far where only a part at the rim is left.  What is larger is merged,
+with the roles exchanged.
 
 Whole spots scatter about their size by a deviation τ of its logarithm; cut ones have any size.
 What glows has the size of the optics in each image: in logarithms a sensor's R is off the common
@@ -111,7 +112,7 @@ def weighed_by_size(
         return list(views)
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
     seen_otherwise, scatter = list(views), sizes.scatter(rules)
-    every = _scales(at.J[:, 0]) * _by_radius(body.node_radii)
+    every = _scales(at.J[:, 0], T_world_object, body) * _by_radius(body.node_radii)
     centres = sizes.centres([view.name for view in views], rules)
     for k, (view, centre) in enumerate(zip(views, centres, strict=True)):
         pattern = view.observation.pattern
@@ -164,7 +165,8 @@ def sizes_after(before: Sizes, best: ScoredPose, body: Body, rules: SizeRules) -
         met &= used.extra < best.variances[:, None]  # of no shape that is odd
     if not np.count_nonzero(met):
         return before
-    scales = _scales(used.J * used.sigmas[:, None, None, None]) * _by_radius(body.node_radii)
+    scales = _scales(used.J * used.sigmas[:, None, None, None], best.T_world_object, body)
+    scales *= _by_radius(body.node_radii)
     logs = {
         name: np.log(radii[own] / scale[own])
         for name, radii, scale, own in zip(used.names, used.radii, scales, met)
@@ -179,6 +181,14 @@ def _by_radius(radii: Floats | None) -> Floats | float:
     return np.asarray(radii / np.exp(np.log(radii).mean()))
 
 
-def _scales(J: Floats) -> Floats:
-    """Pixels per length (...,) by Jacobians (..., 2, 6) of places by the pose."""
-    return np.asarray(np.sqrt(np.square(J[..., :3]).sum(axis=(-2, -1)) / 2))
+def _scales(J: Floats, T_world_object: Floats, body: Body) -> Floats:
+    """Pixels per length (..., N) by Jacobians (..., N, 2, 6) of places by the pose.
+
+    Roots of areas: of a disk of its own plane, of anything else across the line of sight.
+    """
+    across = np.cross(J[..., 0, :3], J[..., 1, :3])
+    if body.shape == "disk" and body.node_normals is not None:
+        areas = np.abs(np.vecdot(across, body.node_normals @ T_world_object[:3, :3].T))
+    else:
+        areas = np.linalg.norm(across, axis=-1)
+    return np.asarray(np.sqrt(np.maximum(areas, np.finfo(np.float64).tiny)))
