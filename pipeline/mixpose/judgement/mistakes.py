@@ -34,7 +34,7 @@ from mixpose.judgement.information import inverted
 from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import Matches
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, by_lenses
 
@@ -87,6 +87,30 @@ def possible_mistakes(
         yield Mistake(name, APART, before[name], -math.inf)
     noise = pose.variances[:, None]
     shares = found.shares * found.each_part[:, None] * noise / (noise + found.extra)
+    is_off = model.errors.are_off(found, noise + found.extra)
+    if not np.count_nonzero(is_off):
+        yield from _mistakes(pose, body, chosen, model, sensors, before, names, shares)
+        return
+    # what a pose does not follow tells where sensors stand, and nothing of bodies and lenses
+    followed = np.where(is_off, 0.0, shares)
+    for asked, some in ((names[1:-1], shares), ([SIZE, LENS], followed)):
+        yield from _mistakes(pose, body, chosen, model, sensors, before, asked, some)
+
+
+def _mistakes(
+    pose: ScoredPose,
+    body: Body,
+    chosen: Indices,  # directions that are free
+    model: NoiseModel,
+    sensors: Mapping[str, Sensor],
+    before: Mapping[str, float],
+    asked: Sequence[str],
+    shares: Floats,  # (L, N) that features count
+) -> Iterator[Mistake]:
+    """Those that are asked for, as features show them."""
+    found = pose.used
+    firsts = np.unique(found.owner, return_index=True)[1].tolist()
+    names = [SIZE, *[found.names[k] for k in firsts], LENS]
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
     seen, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
@@ -102,7 +126,7 @@ def possible_mistakes(
     told, *odds = evidence_of(_beside(left, stated), *given)[0].tolist()
     known = [before.get(name, 0.0) for name in names]
     # what is not likelier by itself is not likelier beside fields
-    likelier = [k for k, one in enumerate(odds) if one + known[k] > told]
+    likelier = [k for k, one in enumerate(odds) if one + known[k] > told and names[k] in asked]
     if not likelier:
         return
     fields = _fields(found, shares, columns[1, :, :1])
@@ -119,12 +143,12 @@ def possible_mistakes(
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         is_sensor = names[k] not in (SIZE, LENS)
-        asked = slice(len(usual) // 2 if is_sensor else None)
-        logs, means, spreads = evidence_of(_beside(usual[asked], left[k + 1]), *given)
+        some = slice(len(usual) // 2 if is_sensor else None)
+        logs, means, spreads = evidence_of(_beside(usual[some], left[k + 1]), *given)
         best, moved, width = logs.argmax(), moves[k + 1], columns.shape[2]
         off = is_sensor * there - moved @ means[best, -width:]
         by_mistake = moved @ spreads[best, -width:, -width:] @ moved.T + np.outer(off, off)
-        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[asked]))
+        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[some]))
         outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
         what = APART if is_sensor else names[k]
         yield Mistake(names[k], what, known[k] + gained, outside[is_sensor])
