@@ -23,7 +23,15 @@ from mixpose.rigid import inverse, rotation_angle_deg
 from mixpose.sensors import CloudPlane, CloudSensor, FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
 
-_UNITS = ((1000.0, "1000 times as large"), (0.001, "a thousandth as large"))
+# of mm, cm and m
+_UNITS = (
+    (1000.0, "1000 times as large"),
+    (0.001, "a thousandth as large"),
+    (10.0, "10 times as large"),
+    (0.1, "a tenth as large"),
+    (100.0, "100 times as large"),
+    (0.01, "a hundredth as large"),
+)
 _OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
 
 
@@ -174,7 +182,7 @@ def _of_the_body(body: Body) -> Iterator[Change]:
 
 
 def of_units(body: Body) -> Iterator[Change]:
-    """Points in metres for millimetres, and the reverse."""
+    """Points in another unit than all else: metres for millimetres, say."""
     for factor, where in _UNITS:
         yield Change(
             "points and translations {are} in two units of length",

@@ -73,7 +73,8 @@ def geometry_doubts(
     frames = [(each.number, observe(session, each)) for each in recording.shared(count)]
     if not frames:
         return Doubts()
-    others = _otherwise(recording, [number for number, _ in frames])
+    chosen = [number for number, _ in frames]
+    others = _otherwise(recording, chosen)
     seen = [views for each in (frames, *(changed for _, changed in others)) for _, views in each]
     if not any(can_tell(views, len(session.body)) for views in seen):
         return _at_the_start(recording)
@@ -84,6 +85,9 @@ def geometry_doubts(
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
     found = diagnosis(session, frames, others, further)
+    if not (found.likeliest or found.good or others):  # though there are as many features
+        others = _otherwise(recording, chosen, are_odd=False)
+        found = diagnosis(session, frames, others, further) if others else found
     if (told := _told(recording, frames, found)) is not None:
         return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()
@@ -246,18 +250,18 @@ def _by_some(estimate: Estimate) -> str:
     )
 
 
-def _otherwise(recording: _Recording, numbers: Sequence[int]) -> list[tuple[Change, Frames]]:
-    """Other polarity, and spots for corners, where images hold too few features or too many."""
+def _otherwise(
+    recording: _Recording, numbers: Sequence[int], *, are_odd: bool = True
+) -> list[tuple[Change, Frames]]:
+    """Other polarity, and spots for corners, of images; where they hold too few or too many."""
     session, surveys = recording.session, recording.surveys
     for setup in session.sensors:
         counts, expected = surveys[setup.name].counts, expected_count(setup, session)
-        is_odd = (
-            counts
-            and surveys[setup.name].size is not None
-            and setup.extract.method in ("blobs", "log", "corners")
-            and judge(float(np.median(counts)), expected, fewest_count(setup, session)) is not None
-        )
-        if not is_odd:
+        in_images = setup.extract.method in ("blobs", "log", "corners")
+        if not (counts and in_images) or surveys[setup.name].size is None:
+            return []
+        usual = judge(float(np.median(counts)), expected, fewest_count(setup, session))
+        if are_odd and usual is None:
             return []
     given, found = session.sensors[0].extract, list[tuple[Change, Frames]]()
     if given.method == "corners":

@@ -10,17 +10,19 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import median
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.body import ASIDE
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, FrameSet, Image
+from mixpose.records import Estimate, Floats, FrameSet, PointPattern, RawFrame
 from mixpose.session import Session
-from mixpose.tracking import CHANGED, TWICE, plane_views
+from mixpose.tracking import CHANGED, OUT_OF_STEP, TWICE, plane_views
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -110,7 +112,7 @@ class Findings:
             setup.name: "px" if setup.sensor.unit == "px" else session.unit
             for setup in session.sensors
         }
-        self._images: dict[str, Image] = {}
+        self._shown: dict[str, NDArray[Any]] = {}
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
         self._doubted = Stretches()  # for whatever reason
@@ -140,11 +142,11 @@ class Findings:
                 self._no_frame[name].add(frame_set.number, place)
             elif name not in seen and name not in flooded:
                 self._no_feature[name].add(frame_set.number, place)
-            data = None if frame is None else frame.data
-            if isinstance(data, np.ndarray):
-                if name in seen and _is_same(self._images.get(name), data):
+            shown = None if frame is None else _shown(frame)
+            if shown is not None:
+                if name in seen and _is_same(self._shown.get(name), shown):
                     self._again.add(name)
-                self._images[name] = data
+                self._shown[name] = shown
         is_lost = estimate.status == "lost"
         tells = (bool(seen) and not flooded) if is_lost else len(seen) > 1
         if estimate.status != "ok" and len(self._frames) < _KEPT and tells:
@@ -166,17 +168,24 @@ class Findings:
             self._places += 1
         self._ok += estimate.status == "ok"
         self._lost += estimate.status == "lost"
+        self._add_repeats(estimate)
         if estimate.doubt:
             self._doubts.setdefault(estimate.doubt, Stretches()).add(estimate.frame, self._places)
             self._doubted.add(estimate.frame, self._places)
-            for name in self._again:
-                self._same[name].add(estimate.frame, self._places)
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
             self._add_markers(estimate)
             if estimate.label in self._sizes:
                 self._sizes[estimate.label].add(estimate)
+
+    def _add_repeats(self, estimate: Estimate) -> None:
+        """What shows the same as before, where that contradicts others, once for all bodies."""
+        out = {name for name, one in estimate.sensors.items() if one.why == OUT_OF_STEP}
+        again = self._again if estimate.doubt else self._again & out
+        for name in again:
+            self._same[name].add(estimate.frame, self._places)
+        self._again = self._again - again
 
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
@@ -251,7 +260,7 @@ class Findings:
         for name, each in self._same.items():
             if each.count:
                 lines.append(
-                    f"sensor {name!r} shows the image of the frame before in frames {each.text()}, "
+                    f"sensor {name!r} shows the same as the frame before in frames {each.text()}, "
                     "which contradicts the others: frozen, or frames doubled?"
                 )
         for name, each in self._far.items():
@@ -381,7 +390,14 @@ def _about(marker: _Marker, typical: float, unit: str) -> list[str]:
     return []
 
 
-def _is_same(before: Image | None, now: Image) -> bool:
+def _shown(frame: RawFrame) -> NDArray[Any] | None:
+    """What tells whether a sensor shows the same again: an image, or what was detected."""
+    if isinstance(frame.data, PointPattern):
+        return frame.data.points
+    return frame.data if isinstance(frame.data, np.ndarray) else None
+
+
+def _is_same(before: NDArray[Any] | None, now: NDArray[Any]) -> bool:
     if before is None or before.shape != now.shape:
         return False
     few = np.array_equal(before[::_PIXELS, ::_PIXELS], now[::_PIXELS, ::_PIXELS])
