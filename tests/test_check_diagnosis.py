@@ -58,12 +58,13 @@ def test_a_right_session_has_nothing_wrong(right: Session) -> None:
     [
         (lambda s: with_points(s, s.body.means * [1, -1, 1]), "the body of [object] is mirrored: "),
         (lambda s: with_points(s, s.body.means / 1000), "with points 1000 times as large"),
+        (lambda s: with_points(s, s.body.means / 10), "with points 10 times as large"),
         (lambda s: with_points(s, s.body.means * 1.02), "with points 0.98 times as large"),
         (lambda s: with_cameras(s, inverted), "T_sensor_world of 'left' and 'right' are inverted"),
         (lambda s: with_cameras(s, enlarged), "'left' and 'right' is that of images half as large"),
         (lambda s: with_cameras(s, bare), "distortion of 'left' and 'right' is left out: "),
     ],
-    ids=["mirrored", "metres", "too large", "inverted", "half the matrix", "no distortion"],
+    ids=["mirrored", "metres", "cm", "too large", "inverted", "half the matrix", "no distortion"],
 )
 def test_what_a_session_says_wrong_all_along_is_told(
     right: Session, fault: Callable[[Session], Session], said: str

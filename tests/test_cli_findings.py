@@ -22,7 +22,7 @@ from mixpose.records import (
 )
 from mixpose.runner import observation_of
 from mixpose.session import load_session
-from mixpose.tracking import TWICE
+from mixpose.tracking import OUT_OF_STEP, TWICE
 
 SESSION = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
 
@@ -66,6 +66,31 @@ def test_features_by_the_hundred_are_told_where_frames_are_not_ok(
     for line in warnings:
         assert line.startswith("sensor 'right' found up to 700 features, where 7 are expected, in")
         assert "[extract]" in line
+
+
+@pytest.mark.parametrize("why", [OUT_OF_STEP, None])
+def test_a_table_that_repeats_itself_is_told_where_it_is_out_of_step(why: str | None) -> None:
+    session = load_session(SESSION)
+    findings, label = Findings(session), session.labels[0]
+    rng = np.random.default_rng(0)
+    frozen = PointPattern(rng.uniform(0, 400, (7, 2)), np.ones(7))
+    for frame in range(6):
+        moving = PointPattern(rng.uniform(0, 400, (7, 2)), np.ones(7))
+        seen = {"left": moving, "right": frozen if frame > 1 else moving}
+        views = [
+            View(one.name, one.sensor, Observation(seen[one.name], 1.0)) for one in session.sensors
+        ]
+        reports = {"left": SensorReport(True), "right": SensorReport(why is None, why=why)}
+        pose = np.eye(4)
+        estimate = Estimate(frame, None, label, "ok", pose, np.eye(6), 1.0, reports)
+        pictures = {name: RawFrame(frame, None, data) for name, data in seen.items()}
+        findings.watch(FrameSet(frame, None, pictures), views, estimate)
+        findings.add(estimate)
+    told = [line for line in findings.of_sensors() if "frame before" in line]
+    # a body that rests shows the same to all
+    assert len(told) == (why is not None)
+    for line in told:
+        assert line.startswith("sensor 'right' shows the same as the frame before in frames 3 to 5")
 
 
 def test_a_flooded_image_is_told_as_such_though_nothing_of_it_is_used() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from detections import TRUTH
@@ -15,11 +16,11 @@ from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View, project_body
 from mixpose.records import PointPattern
-from mixpose.rigid import rotation_angle_deg
+from mixpose.rigid import rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.sizes import SizeRules, Sizes, sizes_after, weighed_by_size
+from mixpose.tracking.sizes import SizeRules, Sizes, _scales, sizes_after, weighed_by_size
 
 Floats = NDArray[np.float64]
 
@@ -107,6 +108,29 @@ def test_markers_told_to_be_of_several_sizes_are_whole_at_their_own(
     (alike, _) = weighed_by_size(views, BODY, TRUTH, Sizes(200.0, np.log(RADIUS), 0.02), RULES)
     assert isinstance(alike.observation.pattern, PointPattern)
     assert alike.observation.pattern.deviations.max() > 1.0
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 50.0, 75.0])
+def test_disks_are_as_large_as_they_are_turned(
+    pinhole_cameras: list[PinholeCamera], tilt_deg: float
+) -> None:
+    points, turn = np.array([one.mean for one in BODY.features]), np.radians(tilt_deg)
+    eye = pinhole_cameras[0]
+    towards = eye.T_sensor_world[2, :3] @ TRUTH[:3, :3]
+    across = np.cross(towards, [1.0, 0.0, 0.0])
+    normal = -np.cos(turn) * towards + np.sin(turn) * across / np.linalg.norm(across)
+    normals = np.tile(normal, (len(points), 1))
+    radii = np.full(len(points), RADIUS)
+    body = replace(BODY, shape="disk", radii=radii, normals=normals)
+    at = project_body((eye,), body).project(TRUTH[None])
+    scale = _scales(at.J[0, 0], TRUTH, body)
+    # against the areas of polygons on the rims
+    u, v = np.linalg.svd(normal[None])[2][1:]
+    angles = np.linspace(0, 2 * np.pi, 100, endpoint=False)[:, None]
+    rim = points[:, None] + RADIUS * (np.cos(angles) * u + np.sin(angles) * v)
+    y, _ = eye.project(transform(TRUTH, rim.reshape(-1, 3)))
+    areas = [cv2.contourArea(one.astype(np.float32)) for one in y.reshape(len(points), -1, 2)]
+    np.testing.assert_allclose(np.pi * (RADIUS * scale) ** 2, areas, rtol=0.01)
 
 
 def test_sizes_that_scatter_tell_nothing() -> None:

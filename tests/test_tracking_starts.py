@@ -105,6 +105,25 @@ def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
     assert not list(look_alikes(data, [judged_here(data, TRUTH)]))
 
 
+@pytest.mark.parametrize("step", [8.0, 25.0, 40.0])
+def test_a_grid_that_moves_by_more_than_half_a_step_is_expected_where_it_goes(
+    pinhole_cameras: list[PinholeCamera], step: float
+) -> None:
+    """A row less may be met, and the grid be a step aside; it was not, where it was expected."""
+    board = grid(8, 5)
+    tracker, one = Tracker.create(board, EstimatorOptions(), TRUTH), pinhole_cameras[:1]
+    track, along = tracker.begin(), TRUTH[:3, 0]
+    for frame in range(6):
+        T = TRUTH.copy()
+        T[:3, 3] += (frame - 2) * step * along
+        if frame > 2:
+            (expected,) = tracker.predictions(track, frame, None)
+            assert np.linalg.norm(expected.T_world_object[:3, 3] - T[:3, 3]) < 2
+        views = detect(one, board, T, noise=0.05, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status == "ok"
+
+
 def test_of_places_of_a_slipped_grid_the_best_is_tried_first_and_then_only_its_own_rivals(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
