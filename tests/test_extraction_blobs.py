@@ -450,5 +450,5 @@ def test_small_spots_and_disks_with_rims_are_equally_large_for_their_size() -> N
     assert isinstance(found, PointPattern)
     assert found.size == 2 * len(sizes)
     true = sizes[(found.points[:, 0] // 40).astype(int)]
-    # disks of so few pixels are drawn to 3 %; the jump was 17 % at about 5 px, and dark ones 8 % off
+    # disks of so few pixels are drawn to 3 %; there was a jump by 17 % at about 5 px
     np.testing.assert_allclose(found.radii, true, rtol=0.06)

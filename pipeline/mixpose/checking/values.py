@@ -292,8 +292,11 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
         return replace(_bent(sensor, v[3:]), camera_matrix=matrix(sensor.camera_matrix, v))
 
     def remedy(v: Floats) -> str:
-        K = matrix(given, v)
-        return f"with about fx = {K[0, 0]:.5g}, cx = {K[0, 2]:.4g}, cy = {K[1, 2]:.4g}"
+        K, k = matrix(given, v), other(name, camera, v).distortion[:2]
+        return (
+            f"with about fx = {K[0, 0]:.5g}, cx = {K[0, 2]:.4g}, cy = {K[1, 2]:.4g}, "
+            f"k1 = {k[0]:.2g}, k2 = {k[1]:.2g}"
+        )
 
     copied = f", but that of {twins[0]!r}" if twins else ""
     return Unknown(

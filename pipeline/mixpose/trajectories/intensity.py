@@ -6,7 +6,8 @@ models at once as are compared.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +36,9 @@ class SmoothingRules:
     fewest: int = constant(8, "poses that tell a motion; of fewer none is smoothed")
     surely: float = constant(
         10.83, "twice the log likelihood, χ² of 99.9 %, by which a covariance is not all white"
+    )
+    off: float = constant(
+        0.2, "logarithm of that share, at least: where it is 1 sudden motion puts it at 0.9 to 1.05"
     )
     tail: float = constant(
         3.0,
@@ -87,13 +91,37 @@ def fitted_model(
     likely, order, shared = best
     if not np.isfinite(likely):
         raise OverflowError("no motion has a likelihood")
-    x = shared * [1.0, 1.0, 0.0]
     for width, points in _FINE:
-        x, likely = _along(blocks, order, x, width, points, _EACH, rules)
-        shared, likelier = _along(blocks, order, shared, width, points, (*_SHARE, *_EACH), rules)
-    if 2 * (likelier - likely) > rules.surely:
-        x = shared
-    return MotionModel(order, _intensities(track, order, x[None, :2])[0], float(np.exp(x[2])))
+        shared, _ = _along(blocks, order, shared, width, points, (*_SHARE, *_EACH), rules)
+    intensities = _intensities(track, order, shared[None, :2])[0]
+    model = MotionModel(order, intensities, float(np.exp(shared[2])))
+    return replace(model, white=_white(blocks, model, rules))
+
+
+def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -> float:
+    """The share of covariances that is white, of which poses are likeliest; 1 unless surely not.
+
+    Among sudden motion: what is steady takes the jumps of a body that rests in between for noise.
+    """
+    found = dict[float, float]()
+    logs = [np.zeros((len(one) - 1, 2)) for one in blocks]
+
+    def likely(x: float) -> float:
+        if x not in found:
+            total = -0.5 * (x / rules.believed) ** 2
+            for k, one in enumerate(blocks):
+                at = replace(model, white=float(np.exp(x)))
+                _, each, logs[k] = _among_sudden(one, at, rules, logs[k])
+                total += float(each.sum())
+            found[x] = total
+        return found[x]
+
+    best = max((0.0, float(np.log(model.white))), key=likely)
+    for step in _SHARES:
+        while likely(x := max((best - step, best + step), key=likely)) > likely(best):
+            best = x
+    is_sure = abs(best) > rules.off and 2 * (likely(best) - likely(0.0)) > rules.surely
+    return float(np.exp(best)) if is_sure else 1.0
 
 
 def smooth_with_sudden_motion(
@@ -108,7 +136,13 @@ def smooth_with_sudden_motion(
     point λ = (λ bᵀQb + ν μ) / (tr NQ + ν).  μ is what is usual, 1 where all of the motion is; the
     model was fitted to sudden motion as well.  d log p / d log μ = 0 where the mean of μ/λ is 1.
     """
-    logs = np.zeros((len(track) - 1, 2))  # of λ
+    return _among_sudden(track, model, rules, np.zeros((len(track) - 1, 2)))[:2]
+
+
+def _among_sudden(
+    track: Track, model: MotionModel, rules: SmoothingRules, logs: Floats
+) -> tuple[SmoothedTrack, Floats, Floats]:
+    """The same, and the logarithms of λ (N - 1, 2), which begin at some."""
     for _ in range(rules.passes):
         before, logs = logs, _fixed_point(track, model, logs, rules)
         if np.abs(logs - before).max(initial=0.0) < rules.settled:
@@ -116,7 +150,7 @@ def smooth_with_sudden_motion(
     result = smooth_track(track, model, np.exp(logs))
     share = _usual(logs) / np.exp(logs)
     prior = 0.5 * rules.tail * (np.log(share) - share).sum(axis=1)
-    return result, result.logs + np.append(0.0, prior)
+    return result, result.logs + np.append(0.0, prior), logs
 
 
 def _fixed_point(track: Track, model: MotionModel, logs: Floats, rules: SmoothingRules) -> Floats:
@@ -175,6 +209,7 @@ _COARSE = (
     (0.8, 5, (*_EACH, *_SHARE)),
 )
 _FINE = ((0.5, 5), (0.15, 3))
+_SHARES = (0.7, 0.3, 0.1)  # steps of the share's logarithm, among sudden motion
 
 
 def _along(
