@@ -214,6 +214,7 @@ def test_one_function_differentiates_a_projection_by_the_pose() -> None:
         "search/three_points.py:_halves",
         "tracking/motion.py:expected",  # turns per second, of the logarithm of a turn
         "tracking/motion.py:followed",
+        "tracking/sizes.py:_scales",  # areas of what is seen
     }
     chained = {name for name, node in FUNCTIONS if "pose_jacobian" in called(node)}
     # frames of which the poses err show one side of the body: it is taken from there again

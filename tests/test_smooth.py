@@ -148,6 +148,19 @@ def zigzag(frames: int, every: int) -> tuple[Floats, list[int]]:
     return poses, list(range(every, frames - 1, every))
 
 
+def test_a_body_that_is_put_elsewhere_at_times_shows_what_its_poses_err_by() -> None:
+    """Jumps make steady motion so wild that poses seem to scatter by nothing else."""
+    rng, covariance = np.random.default_rng(0), covariance_of(0.1, 0.001)
+    shifts, turns = rng.uniform(-80, 80, (4, 3)), rng.uniform(-0.5, 0.5, (4, 3))
+    truth = rigid.from_rotation_vector(turns, shifts)[np.arange(80) // 20]
+    poses = measured(truth, covariance, 1, scale=2.0)
+    smooth = smooth_body(lines_of(poses, covariance), motion="acceleration", rules=QUICK)
+    assert smooth.model is not None
+    # known to 15 % from 40 frames; by steady motion alone it is 1
+    assert smooth.model.white == pytest.approx(4.0, rel=0.35)
+    assert 0.5 < squared_errors(truth, smooth.estimates).mean() < 1.3
+
+
 def test_corners_of_a_path_are_not_overshot() -> None:
     truth, turns = zigzag(100, 25)
     covariance = covariance_of(0.1, 0.001)
