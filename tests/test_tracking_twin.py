@@ -87,6 +87,17 @@ def test_what_stood_beside_the_body_is_not_it_when_the_body_goes() -> None:
     assert off(found[-1], HERE)[0] < 2.0
 
 
+@pytest.mark.parametrize(("off_mm", "status"), [(0.0, "ambiguous"), (1.5, "ok")])
+def test_what_looks_like_the_body_as_closely_as_it_errs_is_a_second_one(
+    off_mm: float, status: str
+) -> None:
+    other = body("other", TOOL + off_mm * np.random.default_rng(1).standard_normal(TOOL.shape))
+    found = estimates_of(SOLID, [[HERE]] * 4 + [[HERE, THERE]] * 4, there=other)
+    assert {one.status for one in found[4:]} == {status}
+    for one in found[4:]:
+        assert status == "ambiguous" or off(one, HERE)[0] < 1.0
+
+
 def test_as_many_other_spots_are_no_second_body() -> None:
     other = body("other", OTHER)
     scene = Scene((Tracker.create(SOLID, EstimatorOptions()),))

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
+from mixpose.matching import log_likelihood
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.doubt import TWICE, decided
 from mixpose.tracking.frame import Frame, Start
@@ -56,6 +57,7 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
         against = [] if known is None else [Alternative(TWICE, known)]
         return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
     either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
+    either += min(_farther_off(best, second, data), 0.0)
     either, in_mirror = _by_mirror(either, best, second, data)
     # of all frames the one counts that tells most
     if known is not None and abs(known) > abs(either):
@@ -125,6 +127,19 @@ def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     met = [dict(zip(one.used.names, one.used.met.tolist())) for one in (best, second)]
     more: float = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
     return -more * _log_odds_of_one(data)
+
+
+def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+    """Log odds for the second pose by its offsets, as detections err as they do at the first."""
+    errors, count = data.rules.judgement.noise.errors, int(np.count_nonzero(data.free))
+    noise = dict(zip(best.used.names, best.variances.tolist()))
+    pairs = zip(second.used.names, second.variances.tolist(), strict=True)
+    known = np.array([noise.get(name, own) for name, own in pairs])
+    likely, most = (
+        log_likelihood(errors.blur * np.sqrt(one), second.used, count, errors)
+        for one in (known, second.variances)
+    )
+    return float(likely - most)
 
 
 def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
