@@ -88,11 +88,13 @@ def possible_mistakes(
     noise = pose.variances[:, None]
     shares = found.shares * found.each_part[:, None] * noise / (noise + found.extra)
     is_off = model.errors.are_off(found, noise + found.extra)
-    if not np.count_nonzero(is_off):
+    # what a pose does not follow tells where sensors stand, and nothing of bodies and lenses, if
+    # other sensors do not see it so, too
+    is_alone = is_off & (is_off.sum(axis=0) < 2)
+    if not np.count_nonzero(is_alone):
         yield from _mistakes(pose, body, chosen, model, sensors, before, names, shares)
         return
-    # what a pose does not follow tells where sensors stand, and nothing of bodies and lenses
-    followed = np.where(is_off, 0.0, shares)
+    followed = np.where(is_alone, 0.0, shares)
     for asked, some in ((names[1:-1], shares), ([SIZE, LENS], followed)):
         yield from _mistakes(pose, body, chosen, model, sensors, before, asked, some)
 
