@@ -63,7 +63,7 @@ SHOWN_BY = {
     "no searched": "2 parallel 6/0/0",
     "static clutter searched alike": "enters among 10 lamps",
     "no merged_pair": "fast",
-    "no agreed": "few among others",
+    "no agreed": "spots that touch",
     "sizes tell nothing": "two_cameras",
     "no without_sensor": "a knocked camera",
     "nothing merged": "fast",
@@ -85,7 +85,7 @@ SHOWN_BY = {
     "misfit taken for noise": DEFORMED,
     "blurs always": "two_cameras",
     "blurs never": "fast",
-    "not looked elsewhere": "fast board",
+    "not looked elsewhere": "a knocked camera",
     "nothing doubted": "flat and small",
 }
 SHOWN_BY_REAL = {"no fusion of ranges": "uwb_trolley", "any turn sure": "uwb_trolley"}
