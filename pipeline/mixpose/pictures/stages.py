@@ -181,8 +181,8 @@ def _mark(picture: Picture, part: Part, finding: Finding) -> None:
     reach = min(_MARK_PX * thin, max(0.45 * zoom * float(np.median(gaps)), 3.0))
     pattern = None if finding.view is None else finding.view.observation.pattern
     radii = pattern.radii if isinstance(pattern, PointPattern) else np.zeros(len(points))
-    # three pixels more than at half of its height, and half of a line
-    spots = zoom * (1.1 * radii + 3.0) + 1.5 * thin
+    # three pixels more than at half of its height, one where nobody knows, and half of a line
+    spots = zoom * (1.1 * radii + np.where(radii > 0, 3.0, 1.0)) + 1.5 * thin
     for place, spot, gap in zip(part.places(points), spots, zoom * gaps, strict=True):
         inner = spot if reach / 3 < spot < reach else reach / 3
         outer = min(inner + 2 * reach / 3, max(gap - spot, inner + 2.0))
