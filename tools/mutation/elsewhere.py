@@ -73,14 +73,6 @@ MUTANTS = (
         (_FREE,),
     ),
     Mutant(
-        "calibration-what-is-beside-a-lens-stays",
-        "calibration/profile.py",
-        "along = (ends[1][0] - ends[0][0]) / (2 * rules.far * wider)",
-        "along = told",
-        "a second camera is told to know its lens as little as the first",
-        (_FREE,),
-    ),
-    Mutant(
         "calibration-a-length-that-contradicts-the-body-is-believed",
         "calibration/telling.py",
         "if abs(np.log(scale)) > rules.rescaled:",
