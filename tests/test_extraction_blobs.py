@@ -434,21 +434,3 @@ def test_disks_found_together_are_those_found_one_by_one() -> None:
     np.testing.assert_allclose(
         np.sort(together, axis=0), np.sort(np.concatenate(alone), axis=0), atol=1e-6
     )
-
-
-def test_small_spots_and_disks_with_rims_are_equally_large_for_their_size() -> None:
-    """Up to 100 px above the level grey values tell, above that the rim."""
-    sizes = np.arange(2.5, 8.1, 0.25)
-    image = np.full((120, 40 * len(sizes)), 20.0)
-    rows, columns = np.indices(image.shape)
-    for k, radius in enumerate(sizes):
-        for row, bright in ((30, 200.0), (90, 80.0)):
-            inside = np.hypot(columns - (40 * k + 20.3), rows - row - 0.2) < radius
-            image[inside] = bright
-    image = gaussian_filter(image, 0.8) + np.random.default_rng(0).normal(0, 1, image.shape)
-    found = extract(image.clip(0, 255).astype(np.uint8), ExtractOptions(method="blobs"))
-    assert isinstance(found, PointPattern)
-    assert found.size == 2 * len(sizes)
-    true = sizes[(found.points[:, 0] // 40).astype(int)]
-    # disks of so few pixels are drawn to 3 %; there was a jump by 17 % at about 5 px
-    np.testing.assert_allclose(found.radii, true, rtol=0.06)

@@ -110,7 +110,7 @@ MUTANTS = (
         "[blob.size or blob.area for blob in blobs]",
         "[blob.area for blob in blobs]",
         "spheres that come nearer seem cut as they get a rim",
-        ("test_extraction_blobs.py",),
+        ("test_extraction_shape.py",),
     ),
     Mutant(
         "judgement-one-sensor-off-tells-of-lenses",

@@ -260,8 +260,8 @@ def _otherwise(
         in_images = setup.extract.method in ("blobs", "log", "corners")
         if not (counts and in_images) or surveys[setup.name].size is None:
             return []
-        usual = judge(float(np.median(counts)), expected, fewest_count(setup, session))
-        if are_odd and usual is None:
+        odd = judge(float(np.median(counts)), expected, fewest_count(setup, session))
+        if are_odd and odd is None:
             return []
     given, found = session.sensors[0].extract, list[tuple[Change, Frames]]()
     if given.method == "corners":

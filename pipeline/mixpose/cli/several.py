@@ -94,7 +94,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     for option, value in alone.items():
         if value or value == "":  # the usual port, or an option without a value
             shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
-            found = ", ".join([*map(str, sessions[:3]), *["..."][: len(sessions) > 3]])
+            found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
             raise SessionError(
                 f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
             )

@@ -199,8 +199,10 @@ def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> N
     found = all_spots(scene, contours, areas, levels, rules.spots)
     for part, spots in zip(small, found, strict=True):
         shape = length_by_width(part.contour) if len(spots) == 1 else (1.0, 0.0)
-        share = part.area / len(spots) if spots else 0.0
-        part.found = [Blob(u, v, share, *shape, off=off, size=size) for u, v, off, size in spots]
+        part.found = [
+            Blob(one.u, one.v, part.area / len(spots), *shape, off=one.off, size=one.size)
+            for one in spots
+        ]
 
 
 def _blobs_of(parts: Sequence[Part], rules: BlobRules) -> list[Blob]:

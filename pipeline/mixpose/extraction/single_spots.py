@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.shape import Patches, areas_at_half, centroids
-from mixpose.extraction.spots import SpotRules, find_spots, is_long
+from mixpose.extraction.spots import Spot, SpotRules, find_spots, is_long
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats, Mask
 
 FEWEST = 3  # for which it pays
 WIDEST_PX = 15
-
-Spots = list[tuple[float, float, float, float]]
 
 
 def all_spots(
@@ -31,9 +29,9 @@ def all_spots(
     areas: Floats,
     levels: Floats,
     rules: SpotRules = SpotRules(),
-) -> list[Spots]:
+) -> list[list[Spot]]:
     """What `find_spots` gives for each of several small blobs, of areas (K,) above levels (K,)."""
-    found: list[Spots] = [[] for _ in contours]
+    found: list[list[Spot]] = [[] for _ in contours]
     bright, usual = _bright(scene, contours, levels, rules)
     if len(usual) >= FEWEST and float(levels.min()) > 0:
         own, boxes = (np.array(one) for one in zip(*usual, strict=True))
@@ -44,7 +42,7 @@ def all_spots(
                 bright.remove(k)
             elif not (scene.judged and is_long(contours[k], rules)):
                 bright.remove(k)
-                found[k] = [(centre[0], centre[1], apart, size)]
+                found[k] = [Spot(centre[0], centre[1], apart, size)]
     for k in bright:
         found[k] = find_spots(scene, contours[k], areas[k], float(levels[k]), rules)
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,16 +38,23 @@ class SpotRules:
     prominence_noise_factor: float = constant(4.0, "the same, of the noise")
 
 
+class Spot(NamedTuple):
+    """What is found of a small blob."""
+
+    u: float  # centre, px of the window
+    v: float
+    off: float  # px by which that may be off
+    size: float  # px at half of its height
+
+
 def find_spots(
     scene: Foreground,
     contour: Contour,
     area: float,
     level: float,
     rules: SpotRules = SpotRules(),
-) -> list[tuple[float, float, float, float]]:
-    """Centre (u, v) of a small blob, px of the window, or the centres of blobs that touch in it.
-
-    Each with how far it may be off, and how large it is at half of its height, px.
+) -> list[Spot]:
+    """The spot of a small blob, or those of blobs that touch in it.
 
     The contour encloses `area` px that are above the level.  There is none if the border of the
     window cuts the blob or it does not stand out.
@@ -71,7 +79,7 @@ def find_spots(
     parts = come_apart(scene, contour, patch, inside, level, rules)
     own = patch if inside is None else patch * inside
     size = float(areas_at_half(own[None], np.array([base]), np.array([peak]))[0])
-    centres = []
+    spots = []
     whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or whole:
         top = cv2.minMaxLoc(patch, part)[1] if parts else peak
@@ -83,10 +91,9 @@ def find_spots(
             # Nothing but rounding above the cut: all of its pixels alike.
             weights = above(patch, level) if part is None else part
         (centre,), (off,) = (one.tolist() for one in centroids(weights[None]))
-        centres.append(
-            (corner[0] + centre[0], corner[1] + centre[1], off, size / max(len(parts), 1))
-        )
-    return centres
+        u, v = corner[0] + centre[0], corner[1] + centre[1]
+        spots.append(Spot(u, v, off, size / max(len(parts), 1)))
+    return spots
 
 
 def come_apart(

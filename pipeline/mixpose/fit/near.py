@@ -264,9 +264,9 @@ def _to_the_noise(
         are_right = not is_rough and bool(unlike.min() > rules.narrower**2 * unlike.max())
         is_end = is_noise or bool((end > rules.narrower * blurs).all())
         is_end = is_end and (are_right or best is not None)
-        straight, is_clear = np.inf, are_right and not others
+        straight, is_clear, ahead = np.inf, are_right and not others, None
         if not is_end and (best is None or is_clear):
-            moved, shift, _ = _moved(matches, free, end, variances)
+            moved, shift, _ = ahead = _moved(matches, free, end, variances)
             is_end = best is None and moved < rules.moved**2
             # as narrow as features are off by then at once, if nothing else pulls them
             straight = shift if is_clear else np.inf
@@ -278,7 +278,8 @@ def _to_the_noise(
         if is_end:
             return best
         if likeliest < least:  # how likely may it become?
-            *_, there = _moved(matches, free, end, variances)
+            *_, offsets = ahead or _moved(matches, free, end, variances)
+            there = replace(matches, offsets=offsets)
             narrow = errors_seen(there, count, known, errors)[2]
             if log_likelihood(narrow, there, count, errors) < least:
                 return best
@@ -333,10 +334,10 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
 
 def _moved(
     matches: Matches, free: Mask, narrower: Floats, variances: Floats
-) -> tuple[float, float, Matches]:
+) -> tuple[float, float, Floats]:
     """About how far narrower blurs (L,) move the pose, in squared standard deviations.
 
-    And by how much any feature that is met, in σ_ε; and how that leaves what is met.
+    And by how much any feature that is met, in σ_ε; and the offsets (L, N, m) that this leaves.
     """
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])
@@ -349,4 +350,4 @@ def _moved(
         offsets = matches.offsets - (J @ twist).reshape(offsets.shape)
     away = matches.offsets - offsets
     shift = np.sqrt(np.vecdot(away, away).max(initial=0.0, where=matches.shares > 0))
-    return float(twist @ information @ twist), float(shift), replace(matches, offsets=offsets)
+    return float(twist @ information @ twist), float(shift), offsets

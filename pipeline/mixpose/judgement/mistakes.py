@@ -81,8 +81,7 @@ def possible_mistakes(
     # one sensor has the world stand as it does, and bodies as large as they are far
     if not len(chosen) or (len(found.names) < 2 and not before):
         return
-    firsts = np.unique(found.owner, return_index=True)[1].tolist()
-    names = [SIZE, *[found.names[k] for k in firsts], LENS]
+    names = _names_of(found)
     for name in before.keys() - {*names}:
         yield Mistake(name, APART, before[name], -math.inf)
     noise = pose.variances[:, None]
@@ -110,9 +109,7 @@ def _mistakes(
     shares: Floats,  # (L, N) that features count
 ) -> Iterator[Mistake]:
     """Those that are asked for, as features show them."""
-    found = pose.used
-    firsts = np.unique(found.owner, return_index=True)[1].tolist()
-    names = [SIZE, *[found.names[k] for k in firsts], LENS]
+    found, names = pose.used, _names_of(pose.used)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
     seen, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
@@ -125,10 +122,12 @@ def _mistakes(
     lenses = roots * _by_lenses(pose, body, model, sensors)
     columns = _widened(columns, lenses)
     left, stated = columns - J @ (drawn @ columns), stated - J @ (drawn @ stated)
-    told, *odds = evidence_of(_beside(left, stated), *given)[0].tolist()
+    which = [k for k, name in enumerate(names) if name in asked]
+    some = left[[0, *(k + 1 for k in which)]]
+    told, *odds = evidence_of(_beside(some, stated), *given)[0].tolist()
     known = [before.get(name, 0.0) for name in names]
     # what is not likelier by itself is not likelier beside fields
-    likelier = [k for k, one in enumerate(odds) if one + known[k] > told and names[k] in asked]
+    likelier = [k for k, one in zip(which, odds, strict=True) if one + known[k] > told]
     if not likelier:
         return
     fields = _fields(found, shares, columns[1, :, :1])
@@ -145,15 +144,21 @@ def _mistakes(
     for k in likelier:
         # a sensor that stands otherwise takes up what its lens is usually off by
         is_sensor = names[k] not in (SIZE, LENS)
-        some = slice(len(usual) // 2 if is_sensor else None)
-        logs, means, spreads = evidence_of(_beside(usual[some], left[k + 1]), *given)
+        layers = slice(len(usual) // 2 if is_sensor else None)
+        logs, means, spreads = evidence_of(_beside(usual[layers], left[k + 1]), *given)
         best, moved, width = logs.argmax(), moves[k + 1], columns.shape[2]
         off = is_sensor * there - moved @ means[best, -width:]
         by_mistake = moved @ spreads[best, -width:, -width:] @ moved.T + np.outer(off, off)
-        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[some]))
+        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(others[layers]))
         outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
         what = APART if is_sensor else names[k]
         yield Mistake(names[k], what, known[k] + gained, outside[is_sensor])
+
+
+def _names_of(found: Matches) -> list[str]:
+    """What mistakes are of, in the order of `_columns`: a size, each sensor, and lenses."""
+    firsts = np.unique(found.owner, return_index=True)[1].tolist()
+    return [SIZE, *[found.names[k] for k in firsts], LENS]
 
 
 def _outside(squared: float, directions: int, chance: float) -> tuple[float, float]:

@@ -135,8 +135,8 @@ class Channel:
 
     def text(self) -> str:
         """One line: how many poses were sent, dropped, and how late they were."""
-        dropped, sent = self._backlog.dropped, self._sent - self._sender.dropped
-        dropped += self._sender.dropped
+        lost = self._sender.dropped
+        dropped, sent = self._backlog.dropped + lost, self._sent - lost
         text = f"published to {self._address.text}: {sent} pose{'s' * (sent != 1)}"
         text += f", {self._unheard} more while nobody listened" if self._unheard else ""
         text += f", {dropped} dropped: the receiver was away or too slow" if dropped else ""

@@ -367,11 +367,8 @@ def follow(
         velocity, course, uncertainty = None, None, rules.unsteady * steady
         parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
         if parent is not None and alike is not None:
-            (expected,) = (
-                there
-                for one, there in zip(track.branches, frame.predictions, strict=True)
-                if one is parent
-            )
+            ahead = zip(track.branches, frame.predictions, strict=True)
+            expected = next(there for one, there in ahead if one is parent)
             moved, is_other = _moved(parent, expected, T, frame, alike)
             parent = replace(parent, velocity=None, course=None) if is_other else parent
             if one.spread is not None and not branches:

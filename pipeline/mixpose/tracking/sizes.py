@@ -26,6 +26,7 @@ from mixpose.density import DRAWING
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask, PointPattern
+from mixpose.rigid import cross
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,8 @@ def _scales(J: Floats, T_world_object: Floats, body: Body) -> Floats:
 
     Roots of areas: of a disk of its own plane, of anything else across the line of sight.
     """
-    across = np.cross(J[..., 0, :3], J[..., 1, :3])
+    u, v = np.moveaxis(J[..., :3], (-2, -1), (0, 1))
+    across = np.moveaxis(cross(u, v), 0, -1)
     if body.shape == "disk" and body.node_normals is not None:
         areas = np.abs(np.vecdot(across, body.node_normals @ T_world_object[:3, :3].T))
     else:
