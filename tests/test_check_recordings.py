@@ -204,6 +204,27 @@ def test_sensors_whose_numbers_do_not_pair_are_told(
 
 
 @pytest.mark.parametrize(
+    ("times", "off"),
+    # 8 frames a 0.04 s: median of n / 25 - n / 50; 2.5 frames later; half a frame, as of cameras
+    # that nothing triggers together
+    [("fps = 50", "0.07"), ('times = "later.csv"', "0.1"), ('times = "half.csv"', None)],
+)
+def test_frames_of_other_moments_by_their_times_are_told(
+    recording: Path, capsys: pytest.CaptureFixture[str], times: str, off: str | None
+) -> None:
+    for name, delay in {"later": 0.1, "half": 0.02}.items():
+        rows = [f"{n},{n / 25 + delay}" for n in range(8)]
+        (recording / f"{name}.csv").write_text("\n".join(["frame,time_s", *rows, ""]))
+    path = recording / "session.toml"
+    first, second = path.read_text().split('name = "right"')
+    path.write_text(f'{first}name = "right"{second.replace("fps = 25", times)}')
+    report = report_on(path, capsys)
+    said = f"'right': its frames are {off} s from those of 'left' with the same number, and 'left'"
+    assert (f"{said} has one every 0.04 s: is fps" in report) == (off is not None)
+    assert ("warnings  none" in report) == (off is None)
+
+
+@pytest.mark.parametrize(
     ("line", "hint"),
     [
         ("min_area = 400", "with min_area = 3 in [extract]"),

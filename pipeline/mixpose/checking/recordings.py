@@ -43,6 +43,7 @@ class Survey:
     damage: tuple[str, ...] = ()  # why a frame could not be read, a line each
     damaged: tuple[int, ...] = ()  # their numbers, as far as known
     is_whole: bool = True  # whether all frames were looked at
+    times: Mapping[int, float] = field(default_factory=dict)  # of frames that have one, in s
     # frames that were counted, with the points found in place of an image; none where too many
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
@@ -74,10 +75,13 @@ def survey(
     damage: Damage = []
     counts: dict[int, int | None] = {}
     numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
+    times = dict[int, float]()
     size: tuple[int, int] | None = None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
             numbers.append(frame.number)
+            if frame.time_s is not None:
+                times[frame.number] = frame.time_s
             if isinstance(frame.data, np.ndarray):
                 size = (frame.data.shape[1], frame.data.shape[0])
                 if looked_at is not None and frame.number not in looked_at:
@@ -106,6 +110,7 @@ def survey(
         damage=tuple(text for _, text in damage),
         damaged=tuple(number for number, _ in damage if number is not None),
         is_whole=not quick,
+        times=times,
         found=found,
     )
 

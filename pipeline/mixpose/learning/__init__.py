@@ -6,7 +6,7 @@ detections  →  points in space of each frame, ghosts among them  →  without 
 """
 
 from mixpose.learning.adjusting import Eyes as Eyes, Learnt as Learnt
-from mixpose.learning.axes import Likeness as Likeness, body_of as body_of
+from mixpose.learning.axes import Likeness as Likeness
 from mixpose.learning.axes import by_markers as by_markers, like as like
 from mixpose.learning.learn import Lesson as Lesson, learn as learn, learn_from as learn_from
 from mixpose.learning.rules import LearningRules as LearningRules

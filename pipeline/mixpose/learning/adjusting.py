@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.body import Body, PointFeature, symmetries
+from mixpose.body import like_features, symmetries
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame
 from mixpose.calibration.adjust import Adjusted, adjust
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import State, blocks_of
-from mixpose.learning.growing import Found, only_once, usual_reach
-from mixpose.learning.placing import FEWEST
+from mixpose.learning.growing import Found, Places, only_once, usual_reach
+from mixpose.learning.placing import FEWEST, body_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats, Indices
@@ -148,13 +148,28 @@ def _frames_of(
             own = clouds[k].detections[one.there]
             taken.setdefault(k, []).append((one, own))
     frames, poses = list[SeenFrame](), dict[int, Floats]()
-    for k, one in body.places:
+    for k, one in _told_apart(body, clouds, rules):
         others = [own for owner, own in taken[k] if owner is not one]
         frame = _left(clouds[k].seen, others, timed=body.count == 1)
         frames.append(frame)
         poses[id(frame)] = one.T_world_shape
     chosen = informative(frames, len(eyes.sigmas), rules.adjusted, runs=eyes.rig.is_late)
     return chosen, np.array([poses[id(frame)] for frame in chosen])
+
+
+def _told_apart(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> Places:
+    """Placements whose points lie like no others of the shape; all, where these are too few.
+
+    Of the others nobody knows how the body is turned.
+    """
+    model = body_of("", body.shape.points)
+    off = rules.gate * usual_reach(body.places, clouds)
+    told = [
+        (k, one)
+        for k, one in body.places
+        if not like_features(model, frozenset(one.own.tolist()), model, off)
+    ]
+    return told if len(told) >= rules.least_frames else body.places
 
 
 def _left(seen: SeenFrame, others: Sequence[Indices], *, timed: bool) -> SeenFrame:
@@ -171,7 +186,7 @@ def _left(seen: SeenFrame, others: Sequence[Indices], *, timed: bool) -> SeenFra
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
     rules = CalibrationRules()
-    rig = replace(eyes.rig, points=points, body=Body("", tuple(map(PointFeature, points))))
+    rig = replace(eyes.rig, points=points, body=body_of("", points))
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
     free = np.ones(6, dtype=np.bool_)
     state = State(rig, poses)

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.body import Body, PointFeature, congruent_parts, tolerance_of
+from mixpose.body import congruent_parts, tolerance_of
 from mixpose.errors import SessionError
 from mixpose.learning.adjusting import Learnt
+from mixpose.learning.placing import body_of
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 
@@ -19,11 +20,6 @@ ALIKE = 0.1
 """Of the radius: how far markers of an older body may be off, as where a ruler measured them."""
 _SAME = 0.6  # of the markers of the smaller body that must be alike in both
 _SYMMETRIC = 1e-3  # of the cubed size: less skew tells no direction of an axis
-
-
-def body_of(name: str, points: Floats, names: Sequence[str] = ()) -> Body:
-    """A body of points without spread."""
-    return Body(name, tuple(PointFeature(point) for point in points), names=tuple(names))
 
 
 def in_principal_axes(learnt: Learnt) -> Learnt:

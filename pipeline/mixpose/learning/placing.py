@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mixpose.body import Body, PointFeature
 from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
@@ -56,6 +58,11 @@ class Placement:
     def count(self) -> int:
         """How many points are met."""
         return len(self.own)
+
+
+def body_of(name: str, points: Floats, names: Sequence[str] = ()) -> Body:
+    """A body of points without spread."""
+    return Body(name, tuple(PointFeature(point) for point in points), names=tuple(names))
 
 
 def triples_of(points: Floats, reach: Floats) -> Indices:

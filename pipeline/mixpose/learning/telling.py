@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.axes import body_of
+from mixpose.learning.placing import body_of
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats
 from mixpose.session.marker_files import LEARNT_COLUMNS
