@@ -90,7 +90,9 @@ def test_every_pose_is_looked_up_in_drawn_densities_by_remap(name: str, spy: Spy
             if len(atlas.per_unit) == len(views):
                 places = spy.places_in(atlas)
                 around += len(places)
-                at_pose += sum(np.array_equal(one, y) for one in places)
+                # but for rounding: it was estimated of the middle of the body
+                same = [one.shape == y.shape and np.abs(one - y).max() < 1e-8 for one in places]
+                at_pose += sum(same)
         looked_up.append((at_pose, around))
         spy.forget()
 

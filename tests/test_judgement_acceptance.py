@@ -79,7 +79,7 @@ def test_a_rival_of_more_than_one_in_a_thousand_makes_a_frame_ambiguous(
 ) -> None:
     odds = np.log(belief / (1 - belief))
     rival = replace(SURE, T_world_object=ELSEWHERE, log_evidence=50.0 + odds)
-    assert beliefs([SURE, rival])[1] == pytest.approx(belief)
+    assert beliefs([SURE.log_density, rival.log_density])[1] == pytest.approx(belief)
     assert status(SURE, rival) == expected
 
 
@@ -237,7 +237,7 @@ def test_of_poses_that_look_the_same_the_one_turned_least_is_told() -> None:
 
 def test_belief_goes_by_the_odds() -> None:
     rival = replace(SURE, log_evidence=50.0 - np.log(3))
-    assert beliefs([SURE, rival]) == pytest.approx([0.75, 0.25])
+    assert beliefs([SURE.log_density, rival.log_density]) == pytest.approx([0.75, 0.25])
 
 
 def test_a_rival_that_pays_by_count_is_as_far_from_what_was_expected() -> None:

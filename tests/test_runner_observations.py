@@ -16,7 +16,7 @@ import mixpose
 from mixpose import runner
 from mixpose.errors import SessionError
 from mixpose.records import FrameSet, GridPattern, PointPattern, RawFrame
-from mixpose.rigid import from_rotation_vector
+from mixpose.rigid import from_parts, from_rotation_vector
 from mixpose.selection import Selection
 from mixpose.session import Session
 
@@ -115,16 +115,17 @@ def test_a_run_that_goes_on_begins_at_its_own_pose_and_not_at_start(session: Ses
 def test_the_start_of_identical_bodies_is_that_of_the_first(session: Session) -> None:
     assert session.start is not None
     T = session.start.T_world_object
+    middle = from_parts(np.eye(3), session.body.means.mean(axis=0))
     (alone,) = runner.scene_of(session).bodies
-    np.testing.assert_array_equal(alone.T_start, T)
+    np.testing.assert_array_equal(alone.T_start, T @ middle)
     pair = replace(session, count=2)
     first, second = runner.scene_of(pair).bodies
-    np.testing.assert_array_equal(first.T_start, T)
+    np.testing.assert_array_equal(first.T_start, T @ middle)
     assert second.T_start is None  # two bodies are not at one place
     T_second = from_rotation_vector([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
     first, second = runner.scene_of(pair, {pair.labels[1]: T_second}).bodies
-    np.testing.assert_array_equal(first.T_start, T)
-    np.testing.assert_array_equal(second.T_start, T_second)
+    np.testing.assert_array_equal(first.T_start, T @ middle)
+    np.testing.assert_array_equal(second.T_start, T_second @ middle)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -150,34 +150,34 @@ def scene_of(session: Session, starts: Starts | None = None) -> Scene:
         for instance, label in zip(one.instances, one.labels, strict=True):
             start, T_start = one.start if not instance else None, (starts or {}).get(label)
             held = None if one.start is None else one.start.T_world_object
-            bodies.append(_tracker(session, one.body, start, T_start, instance, held))
+            given = session, one.body, start, T_start
+            bodies.append(_tracker(Tracker.about_centre, *given, instance=instance, T_held=held))
     return Scene(tuple(bodies))
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
     """The tracker of a session's first body, and its track before the first frame."""
-    tracker = _tracker(session, session.body, session.start, T_start)
+    tracker = _tracker(Tracker.create, session, session.body, session.start, T_start)
     return tracker, tracker.begin()
 
 
 def _tracker(
+    make: Callable[..., Tracker],
     session: Session,
     body: Body,
     start: Start | None,
     T_start: Floats | None,
-    instance: int | None = None,
-    T_held: Floats | None = None,
+    **rest: Any,
 ) -> Tracker:
     if T_start is None and start is not None:
         T_start = start.T_world_object
-    return Tracker.create(
+    return make(
         body,
         session.estimator,
         T_start,
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
-        instance=instance,
-        T_held=T_held,
+        **rest,
     )
 
 

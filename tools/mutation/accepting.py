@@ -8,15 +8,15 @@ MUTANTS = (
     Mutant(
         "judgement-rivals-never-count",
         "judgement/acceptance.py",
-        "for odds in (-best.log_evidence, *rivals)]",
-        "for odds in (-best.log_evidence,)]",
+        "for each in (-best.log_evidence, *rivals)]",
+        "for each in (-best.log_evidence,)]",
         "of two poses that fit alike one is called sure",
     ),
     Mutant(
         "judgement-clutter-never-counts",
         "judgement/acceptance.py",
-        "for odds in (-best.log_evidence, *rivals)]",
-        "for odds in rivals]",
+        "for each in (-best.log_evidence, *rivals)]",
+        "for each in rivals]",
         "a pose that mere clutter explains as well is ok",
     ),
     Mutant(
@@ -129,7 +129,7 @@ MUTANTS = (
     Mutant(
         "judgement-all-poses-believed-alike",
         "judgement/acceptance.py",
-        "math.exp(one.log_density - top) if",
+        "math.exp(each - top) if",
         "1.0 if",
         "evidence does not tell poses apart",
     ),

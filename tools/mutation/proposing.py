@@ -173,7 +173,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers.py",
-        "yield frame.rival(best, poses[1 + few[k]], frame.close, T_moved=moved)",
+        "yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)",
         "yield Start(poses[0], frame.close, T_moved=moved)",
         "a chessboard is followed a square off",
         (_STARTS,),

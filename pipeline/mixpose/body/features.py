@@ -7,7 +7,7 @@ class with these members.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -41,6 +41,10 @@ class Feature(Protocol):
 
     def nodes(self) -> tuple[Floats, Floats]:
         """Points (K, 3) and weights (K,), summing to 1, that carry the spread."""
+        ...
+
+    def shifted(self, by: Floats) -> Feature:
+        """The same elsewhere, by a shift (3,)."""
         ...
 
     def sample(self, uniforms: Floats) -> Floats:
@@ -77,6 +81,10 @@ class PointFeature:
         """The position itself."""
         return self.position[None], np.ones(1)
 
+    def shifted(self, by: Floats) -> PointFeature:
+        """The same elsewhere."""
+        return replace(self, position=self.position + by)
+
     def sample(self, uniforms: Floats) -> Floats:
         """Samples (R, 3) of the density from uniform numbers (R, 5)."""
         return self.position + offsets(uniforms, self.covariance, self.spread)
@@ -106,6 +114,10 @@ class SegmentFeature:
         along = (np.arange(SEGMENT_NODES) + 0.5)[:, None] / SEGMENT_NODES
         weights = np.full(SEGMENT_NODES, 1.0 / SEGMENT_NODES)
         return self.start + along * (self.end - self.start), weights
+
+    def shifted(self, by: Floats) -> SegmentFeature:
+        """The same elsewhere."""
+        return replace(self, start=self.start + by, end=self.end + by)
 
     def sample(self, uniforms: Floats) -> Floats:
         """Samples (R, 3) from uniform numbers (R, 5); the fourth runs along the line."""

@@ -115,6 +115,8 @@ def like_features(
             if known is None or part.turn_deg < known.turn_deg:
                 found[pairs] = part
     if body is other:
+        for part in _a_step_aside(body, chosen, tolerance):
+            found.setdefault(_modulo_symmetry(body, part), part)
         found = {pairs: part for pairs, part in found.items() if not _is_symmetry(part)}
     return tuple(found.values())
 
@@ -278,6 +280,17 @@ def _kept(
         part = _fitted(body, other, chosen[keep], own[keep])
         if part.off <= tolerance and len(set(part.partners)) >= least:
             yield part
+
+
+def _a_step_aside(body: Body, chosen: NDArray[np.intp], tolerance: float) -> Iterable[LookAlike]:
+    """Steps of a body's grid that leave half of the chosen features: of small ones few do more."""
+    steps = np.tile(np.eye(4), (len(body.grid_steps), 1, 1))
+    steps[:, :3, 3] = body.grid_steps
+    for own, near in zip(*_partners(body, chosen, body, steps, 2 * tolerance), strict=True):
+        if np.count_nonzero(near) > max(len(chosen) // 2, FEWEST):
+            part = _fitted(body, body, chosen[near], own[near])
+            if part.off <= tolerance:
+                yield part
 
 
 def _partners(

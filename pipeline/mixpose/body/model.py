@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -158,6 +158,12 @@ class Body:
         """Which of the symmetries leaves the body as it is."""
         away = np.abs(self.symmetries - np.eye(4)).max(axis=(1, 2))
         return int(away.argmin())
+
+    @cached_property
+    def centred(self) -> Body:
+        """The same body with its origin in the middle of its features, and no tip."""
+        by = -self.means.mean(axis=0)
+        return replace(self, features=tuple(one.shifted(by) for one in self.features), tip=None)
 
     @cached_property
     def grid_steps(self) -> Floats:

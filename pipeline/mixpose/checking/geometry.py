@@ -23,7 +23,7 @@ from mixpose.checking.keys import judge
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.trials import IN_A_ROW, Diagnosis, diagnosis, late_sensor
+from mixpose.checking.trials import IN_A_ROW, Diagnosis, Otherwise, diagnosis, late_sensor
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
@@ -84,10 +84,11 @@ def geometry_doubts(
         more = recording.shared(2 * count, {number for number, _ in frames})
         return [(each.number, observe(session, each)) for each in islice(more, count)]
 
-    found = diagnosis(session, frames, others, further)
-    if not (found.likeliest or found.good or others):  # though there are as many features
-        others = _otherwise(recording, chosen, are_odd=False)
-        found = diagnosis(session, frames, others, further) if others else found
+    def otherwise() -> Otherwise:
+        """Though there are as many features as there should be."""
+        return others or _otherwise(recording, chosen, are_odd=False)
+
+    found = diagnosis(session, frames, others, further, otherwise)
     if (told := _told(recording, frames, found)) is not None:
         return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()
@@ -250,9 +251,7 @@ def _by_some(estimate: Estimate) -> str:
     )
 
 
-def _otherwise(
-    recording: _Recording, numbers: Sequence[int], *, are_odd: bool = True
-) -> list[tuple[Change, Frames]]:
+def _otherwise(recording: _Recording, numbers: Sequence[int], *, are_odd: bool = True) -> Otherwise:
     """Other polarity, and spots for corners, of images; where they hold too few or too many."""
     session, surveys = recording.session, recording.surveys
     for setup in session.sensors:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise, takewhile
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unkn
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.session import Session
+
+Otherwise: TypeAlias = Sequence[tuple[Change, Frames]]
+"""Changes of how features are extracted, with the frames as they are found then."""
 
 IN_A_ROW = 3
 """Frames by which a sensor is told to be late."""
@@ -93,14 +96,16 @@ class Tried(NamedTuple):
 def diagnosis(
     session: Session,
     frames: Frames,
-    others: Sequence[tuple[Change, Frames]] = (),
+    others: Otherwise = (),
     further: Callable[[], Frames] = lambda: (),
+    otherwise: Callable[[], Otherwise] = lambda: (),
 ) -> Diagnosis:
     """What is most likely wrong with a session of one body, by frames of its recording.
 
     Frames are by number, those that show most first. `others` are changes of how features are
-    extracted, with what is extracted then; `further` frames are looked at, too, where these leave a
-    change by values undecided.
+    extracted, with what is extracted then; where no frame is explained as it is, what `otherwise`
+    gives in their place. `further` frames are looked at, too, where these leave a change by values
+    undecided.
     """
     session, rules = evidence.anywhere(session), DiagnosisRules()
     before = _as_it_is(session, frames)
@@ -109,7 +114,7 @@ def diagnosis(
     is_good = sum(evidence.is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        tried += _without_values(case, others)
+        tried += _without_values(case, others if before.good(rules) else otherwise() or others)
     # values only follow the noise where all frames are explained to within it without any
     if not any(
         all(evidence.is_well_explained(pose, rules) for pose in one.explained.poses)
@@ -150,7 +155,7 @@ def _as_it_is(session: Session, frames: Frames) -> Explained:
     return Explained(tuple(poses))
 
 
-def _without_values(case: _Case, others: Sequence[tuple[Change, Frames]]) -> Iterator[Tried]:
+def _without_values(case: _Case, others: Otherwise) -> Iterator[Tried]:
     """Changes that explain frames better: a race in which those far behind the best drop out."""
     session, before, runners = case.session, case.before, [_Runner(*each) for each in others]
     runners += [_Runner(change, case.frames) for change in changes(session)]

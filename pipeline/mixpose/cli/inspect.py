@@ -55,7 +55,7 @@ def inspect_frame(request: InspectRequest) -> None:
         _, estimates = scene.advance(scene.begin(), number, frame_set.time_s, views)
     else:
         estimates = _from_file(file, session, number)
-    bodies = [tracked.body for tracked in scene.bodies]
+    bodies = [one.body for one in session.objects for _ in one.instances]
     clouds = clouds_of(session)
     estimates = [with_clouds(one, clouds) for one in estimates]
     drawn = tuple(setup for setup in session.sensors if setup.name not in clouds)

@@ -5,6 +5,7 @@ from mixpose.judgement.acceptance import (
     Alternative as Alternative,
     Second as Second,
     Verdict as Verdict,
+    ahead as ahead,
     beliefs as beliefs,
     convinces as convinces,
     decide as decide,
@@ -13,6 +14,7 @@ from mixpose.judgement.acceptance import (
     is_open as is_open,
     is_possible as is_possible,
     is_sure as is_sure,
+    met_by_one as met_by_one,
     nearest_alike as nearest_alike,
     others_miss as others_miss,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -136,18 +136,30 @@ def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
     return is_sure(pose, free, rules) and share > rules.convincing
 
 
-def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> Verdict:
+def ahead(one: ScoredPose, other: ScoredPose) -> float:
+    """Log odds of one pose of a body against another."""
+    return one.log_density - other.log_density
+
+
+def decide(
+    ranked: Sequence[ScoredPose],
+    free: Mask,
+    rules: AcceptanceRules,
+    ahead_of: Callable[[ScoredPose, ScoredPose], float] = ahead,
+) -> Verdict:
     """Decide about a frame from all its poses, the most evident first.
 
-    Against the best there is clutter, then the others: what is not possible by itself still casts
-    doubt.
+    Against the best there is clutter, then the others, by log odds of them: what is not possible by
+    itself still casts doubt.
     """
     told = [one for one in ranked if is_possible(one, free)]
     if not told:
         return Verdict(None, [])
-    best, weights = told[0], beliefs(ranked)
-    rivals = [one.log_density - best.log_density for one in ranked if one is not best]
-    against = [Alternative("", odds) for odds in (-best.log_evidence, *rivals)]
+    best = max(told, key=lambda one: 0.0 if one is told[0] else ahead_of(one, told[0]))
+    odds = [0.0 if one is best else ahead_of(one, best) for one in ranked]
+    weights = beliefs(odds)
+    rivals = [each for one, each in zip(ranked, odds, strict=True) if one is not best]
+    against = [Alternative("", each) for each in (-best.log_evidence, *rivals)]
     if not is_turn_known(best, rules):
         against.append(Alternative(""))
     kept = [
@@ -155,6 +167,7 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
         for one, weight in zip(ranked, weights, strict=True)
         if one is best or (weight >= 1 - rules.confidence and is_fixed(one, free))
     ]
+    kept.sort(key=lambda each: each[0] is not best)
     return Verdict(best, kept, tuple(against), rules.log_doubt)
 
 
@@ -208,7 +221,7 @@ def insert(
             # of two as good the later says more
             is_better = _worth(new, rules, 0.01) > _worth(old, rules)
             told, other = (new, old) if is_better else (old, new)
-            belief = beliefs([told, other])[1]
+            belief = beliefs([told.log_density, other.log_density])[1]
             if told.spread is None and belief > 1 - rules.confidence:
                 told = _with_moments_of(told, other, belief, max(belief, 1 / limit), away)
             ranked[k] = told
@@ -255,6 +268,14 @@ def _are_one(
     # those of a likelihood may be drawn to different priors; tilts of a flat body are two
     turned = math.hypot(*away[3:].tolist())
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
+
+
+def met_by_one(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
+    """Sensors that a pose is not of, where one alone meets most of the body; else none."""
+    coverage = judged.matches.coverage.tolist()
+    known = dict(zip(judged.matches.names, coverage, strict=True))
+    of = [k for k, each in known.items() if each >= rules.agreeing and k not in judged.left_out]
+    return [name for name in known if name not in of] if len(of) == 1 else []
 
 
 def others_miss(
@@ -323,8 +344,8 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     return T_world_object if nearest == body.identity else T_world_object @ body.symmetries[nearest]
 
 
-def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
-    """Share of belief of each pose among its rivals; even where none meets anything."""
-    top = max([one.log_density for one in judged], default=0.0)
-    odds = [math.exp(one.log_density - top) if top > -math.inf else 1.0 for one in judged]
-    return [one / sum(odds) for one in odds]
+def beliefs(logs: Sequence[float]) -> list[float]:
+    """Share of each among rivals, by their log odds against anything; even where none has any."""
+    top = max(logs, default=0.0)
+    odds = [math.exp(each - top) if top > -math.inf else 1.0 for each in logs]
+    return [each / sum(odds) for each in odds]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -38,6 +39,7 @@ from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
+from mixpose.tracking.rivals import odds_beside
 
 TWICE = (
     "the body seems to be there twice: a mirror image, one more (`count`), or another like it, "
@@ -51,10 +53,10 @@ OPEN = "features that would fix it are hidden or cut"
 
 def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
-    verdict = decide(ranked, data.free, data.rules.acceptance)
+    given = data.free, data.rules.acceptance, partial(odds_beside, data)
+    verdict = decide(ranked, *given)
     if len(verdict.kept) > 1 and (images := _in_mirrors(data, verdict)):
-        own = [one for one in ranked if one not in images]
-        verdict = decide(own, data.free, data.rules.acceptance)
+        verdict = decide([one for one in ranked if one not in images], *given)
     best = verdict.best
     if best is None:
         return verdict
@@ -72,8 +74,8 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
         return verdict
     rules, sensors = data.rules, {view.name: view.sensor for view in data.still or data.views}
     before = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
-    given = rules.judgement.noise, sensors, before
-    mistakes = [*possible_mistakes(best, data.body, data.free, *given), of_reflection(data, best)]
+    known = rules.judgement.noise, sensors, before
+    mistakes = [*possible_mistakes(best, data.body, data.free, *known), of_reflection(data, best)]
     # one frame in as many as there are sessions with a mistake may be of another kind
     most = _most_told(data)
     mistaken = {

@@ -328,13 +328,15 @@ def _moved(
     """The twist (6,) to a pose, from that before, or from a look-alike of that.
 
     And whether it is the latter: by where the body was expected, as now and then another one is
-    taken for it.
+    taken for it; of a frame that was ok as seldom as that is wrong.
     """
     T_before, chosen = parent.T_world_object, 0
     if alike:
         like = np.concatenate([T_world_object[None], T_world_object @ np.array(alike)])
         logs = expected.log_density(like, frame.free, frame.rules.motion)
-        logs[1:] += math.log(frame.rules.motion.surprise)
+        is_unsure = frame.track.doubted or not frame.track.believed
+        rules = frame.rules
+        logs[1:] += math.log(rules.motion.surprise) if is_unsure else rules.acceptance.log_doubt
         if chosen := int(logs.argmax()):
             T_before = T_before @ inverse(alike[chosen - 1])
     return twist_between(T_before, T_world_object), chosen > 0
@@ -362,13 +364,16 @@ def follow(
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
     steady, branches = per_kind(body, rules.steady), list[Branch]()
     is_timed = track.is_timed_as(frame.time_s)
-    for one, alike in found:
-        T, deviation = one.T_world_object, one.deviation
+    for there, alike in found:
+        one, T, deviation = there, there.T_world_object, there.deviation
         velocity, course, uncertainty = None, None, rules.unsteady * steady
         parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
+        if parent is not None:  # of poses that look the same, the one that it goes on from
+            T = nearest_alike(T, body, parent.T_world_object)
+            one = replace(one, T_world_object=T)
         if parent is not None and alike is not None:
             ahead = zip(track.branches, frame.predictions, strict=True)
-            expected = next(there for one, there in ahead if one is parent)
+            expected = next(after for before, after in ahead if before is parent)
             moved, is_other = _moved(parent, expected, T, frame, alike)
             parent = replace(parent, velocity=None, course=None) if is_other else parent
             if one.spread is not None and not branches:

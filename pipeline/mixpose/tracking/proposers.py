@@ -218,7 +218,8 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     for k in np.argsort(fewer, kind="stable").tolist():  # the best first
         if fewer[k] < least[few[k]]:
             moved = _moves_alike(frame, T) if alike[few[k]].is_step else None
-            yield frame.rival(best, poses[1 + few[k]], frame.close, T_moved=moved)
+            there, out = poses[1 + few[k]], best.left_out
+            yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)
 
 
 def _near_any(frame: Frame, poses: Floats) -> Floats:

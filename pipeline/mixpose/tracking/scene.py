@@ -28,6 +28,7 @@ from mixpose.constants import constant
 from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
+from mixpose.rigid import transform
 from mixpose.sensors import Sensor
 from mixpose.tracking.confusion import taken_for
 from mixpose.tracking.frame import Frame
@@ -74,7 +75,7 @@ class Scene:
                 before = Distances.unknown(len(group), radius, motion)
             given, exchanged = identify(group, found, before)
             finders, rivals = finders | given, rivals | exchanged
-            places = _places([found[given[k]] for k in group])
+            places = _places([found[given[k]] for k in group], self.bodies[group[0]].origin)
             apart[group[0]] = before.after(places, motion)
         told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
         frames = {k: _seen_by(one.frame, found[finders[k]].frame) for k, one in found.items()}
@@ -89,16 +90,16 @@ class Scene:
                 verdict, told[k] = verdict.doubted(against), told[k].doubted(against)
             after.append(replace(followed(data, verdict), distances=apart.get(k), alike=odds))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
-        return self._acquainted(after, estimates), estimates
+        return self._acquainted(after, told), estimates
 
     def _acquainted(
-        self, tracks: Sequence[Track], estimates: Sequence[Estimate]
+        self, tracks: Sequence[Track], told: Mapping[int, Verdict]
     ) -> tuple[Track, ...]:
         """The tracks, and where sure bodies are beside each other, but for exchangeable ones."""
         sure = {
-            k: one.T_world_object
-            for k, one in enumerate(estimates)
-            if one.instance is None and one.status == "ok" and one.T_world_object is not None
+            k: one.best.T_world_object
+            for k, one in sorted(told.items())
+            if self.bodies[k].instance is None and one.status == "ok" and one.best is not None
         }
         after = list(tracks)
         for k, j in permutations(sure, 2):
@@ -108,10 +109,13 @@ class Scene:
         return tuple(after)
 
 
-def _places(found: Sequence[Explanation]) -> Floats:
-    """Where bodies are (n, 3); NaN of those without a pose."""
+def _places(found: Sequence[Explanation], origin: Floats) -> Floats:
+    """Where origins (3,) of bodies are (n, 3); NaN of those without a pose."""
     bests = [one.verdict.best for one in found]
-    return np.array([np.full(3, np.nan) if T is None else T.T_world_object[:3, 3] for T in bests])
+    none = np.full(3, np.nan)
+    return np.array(
+        [none if one is None else transform(one.T_world_object, origin[None])[0] for one in bests]
+    )
 
 
 def _seen_by(data: Frame, finder: Frame) -> Frame:

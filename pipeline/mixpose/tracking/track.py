@@ -186,7 +186,8 @@ class Track:
         if len(self.branches) == 1:
             return self.branches[0]
         scale = np.repeat([body.radius, 1.0], 3)
-        away = [twist_between(one.T_world_object, T_world_object) / scale for one in self.branches]
+        places = [one.T_world_object for one in self.branches]
+        away = [twist_between(T, nearest_alike(T_world_object, body, T)) / scale for T in places]
         return self.branches[int(np.linalg.norm(away, axis=1).argmin())] if away else None
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, Fit
+from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
+from mixpose.rigid import covariance_at, from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.arguments import pose_meant, require_meant
@@ -41,6 +43,8 @@ class Tracker(Setup):
     refinements: tuple[Refinement, ...] = REFINEMENTS
     instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
     T_held: Floats | None = None  # (4, 4), that of another one, where directions are held
+    # (3,), the origin of the frame that poses are told of, in that of `body`
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
     def create(
@@ -77,6 +81,31 @@ class Tracker(Setup):
             instance=instance,
             T_held=T_held,
         )
+
+    @classmethod
+    def about_centre(
+        cls,
+        body: Body,
+        options: EstimatorOptions,
+        T_start: Floats | None = None,
+        *,
+        T_held: Floats | None = None,
+        **rest: Any,
+    ) -> Tracker:
+        """As `create`, with what is believed of motion said of the middle of the body.
+
+        What moves, and how unsure that is, is the same wherever somebody put the origin.  Where
+        directions are held they are the origin's own, if turns that are free would move it there.
+        """
+        free = free_mask(options).reshape(2, 3)
+        if any((free[1] & (np.arange(3) != held)).any() for held in np.flatnonzero(~free[0])):
+            return cls.create(body, options, T_start, T_held=T_held, **rest)
+        centre = body.means.mean(axis=0)
+        there = from_parts(np.eye(3), centre)
+        told = pose_meant(T_start), T_held
+        T_start, T_held = (None if T is None else T @ there for T in told)
+        tracker = cls.create(body.centred, options, T_start, T_held=T_held, **rest)
+        return replace(tracker, origin=-centre)
 
     @property
     def label(self) -> str:
@@ -175,7 +204,7 @@ class Tracker(Setup):
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
     ) -> Estimate:
         """The estimate of a frame, with reports of the first pose, believed or not."""
-        body, best = self.body, verdict.best
+        body, best, at = self.body, verdict.best, from_parts(np.eye(3), self.origin)
         shown = best or next(iter(ranked), None)
         used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
@@ -189,12 +218,14 @@ class Tracker(Setup):
             time_s=data.time_s,
             object=body.name,
             status=verdict.status,
-            T_world_object=best.T_world_object if best else None,
-            covariance=best.covariance if best else None,
+            T_world_object=best.T_world_object @ at if best else None,
+            covariance=self._at_origin(best) if best else None,
             score=shown.score if shown else 0.0,
             confidence=verdict.confidence,
             sensors=reports,
-            hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
+            hypotheses=tuple(
+                [Hypothesis(one.T_world_object @ at, weight) for one, weight in rivals]
+            ),
             instance=self.instance,
             proposer=origin,
             blurs=best.blurs if best else (),
@@ -203,6 +234,12 @@ class Tracker(Setup):
             doubt=verdict.doubt,
             measured=partial(_offsets, used, shown.variances) if shown and used else dict,
         )
+
+    def _at_origin(self, pose: ScoredPose) -> Floats:
+        """The covariance (6, 6) of a pose, of its origin."""
+        if not self.origin.any():
+            return pose.covariance
+        return covariance_at(pose.covariance, pose.T_world_object[:3, :3] @ self.origin)
 
 
 def estimate_pose(
@@ -217,7 +254,7 @@ def estimate_pose(
     NaN, other shapes, features of a view that have not the dimension of its sensor.
     """
     require_meant(views, model)
-    tracker = Tracker.create(model, options or EstimatorOptions(), start)
+    tracker = Tracker.about_centre(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     with one_blas_thread():
         _, estimate = tracker.advance(tracker.begin(), 0, None, views)

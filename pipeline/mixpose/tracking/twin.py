@@ -15,8 +15,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import expit, logit
 
-from mixpose.judgement import Alternative, ScoredPose, Second, Verdict, is_sure
+from mixpose.judgement import (
+    APART,
+    Alternative,
+    ScoredPose,
+    Second,
+    Verdict,
+    is_sure,
+    met_by_one,
+)
 from mixpose.matching import log_likelihood
+from mixpose.objective import View
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.doubt import TWICE, decided
 from mixpose.tracking.frame import Frame, Start
@@ -42,6 +51,9 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
     if best is None or not is_ok_but_for_mirrors(verdict):
         return verdict
+    if (apart := _seen_elsewhere(data, best, rest)) is not None:
+        kept = [*((one, weight / 2) for one, weight in verdict.kept), (apart, 0.5)]
+        return replace(verdict, kept=kept).doubted([Alternative(APART)])
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
     second, odds = _where_it_was(data, best, rest), -math.inf
@@ -111,7 +123,8 @@ def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
     for view in data.still or data.views:
         points = view.observation.points
         is_left = np.ones(0 if points is None else len(points), dtype=np.bool_)
-        if len(is_left) and view.name in numbers:
+        # what a sensor that is left out meets, it meets by chance
+        if len(is_left) and view.name in numbers and view.name not in pose.left_out:
             is_left[numbers[view.name][numbers[view.name] >= 0]] = False
         if is_left.any():
             rest.append(replace(view, observation=view.observation.only(is_left)))
@@ -188,6 +201,30 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
         if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
     return None
+
+
+def _seen_elsewhere(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
+    """A pose that is sure by sensors that see nothing of the best one, which one alone meets.
+
+    Nobody knows then which of them is out of step.
+    """
+    rules = data.rules.acceptance
+    names = met_by_one(best, rules)
+    views = [one for one in rest.views if one.name in names and _may_fix(one, data)]
+    if not views or (best.matches.dimensions != 2).any():
+        return None
+    alone = data.alone(views=views, still=(), starts=()).seen_otherwise(options=data.options)
+    likelihood = likelihood_of(alone)
+    for start in _starts(alone, replace(rest, views=views)):
+        pose = likelihood.judge(likelihood.fit(start), start)
+        if is_sure(pose, data.free, rules):
+            return replace(pose, proposer=SECOND_POSE)
+    return None
+
+
+def _may_fix(view: View, data: Frame) -> bool:
+    """Whether a sensor sees more than what fixes a pose."""
+    return bool(view.observation.cells * view.sensor.dimension > np.count_nonzero(data.free))
 
 
 def _where_it_was(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from mixpose.constants import constant
 from mixpose.records import Floats, Indices
@@ -40,6 +41,9 @@ class SmoothingRules:
     off: float = constant(
         0.2, "logarithm of that share, at least: where it is 1 sudden motion puts it at 0.9 to 1.05"
     )
+    shares: tuple[float, float] = constant(
+        (-2.0, 2.0), "of that logarithm, among which is the right one: 4 deviations of `believed`"
+    )
     tail: float = constant(
         3.0,
         "degrees of freedom of the noise of motion: at corners of a path squared errors are 1.0 "
@@ -47,6 +51,9 @@ class SmoothingRules:
         "that a hand which rests is as still as it looks, and errs by up to 1.7 times",
     )
     passes: int = constant(60, "at most, over which sudden motion is told from steady; 40 do")
+    ahead: float = constant(
+        1.5, "times each of these changes, which are all one way: two thirds of the passes"
+    )
     settled: float = constant(0.1, "change of the logarithm of a scale in the last of these")
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
@@ -103,25 +110,24 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
 
     Among sudden motion: what is steady takes the jumps of a body that rests in between for noise.
     """
-    found = dict[float, float]()
+    most = max(rules.block // len(blocks), rules.fewest)
+    blocks = [one.part(slice(most)) for one in blocks]
     logs = [np.zeros((len(one) - 1, 2)) for one in blocks]
 
-    def likely(x: float) -> float:
-        if x not in found:
-            total = -0.5 * (x / rules.believed) ** 2
-            for k, one in enumerate(blocks):
-                at = replace(model, white=float(np.exp(x)))
-                _, each, logs[k] = _among_sudden(one, at, rules, logs[k])
-                total += float(each.sum())
-            found[x] = total
-        return found[x]
+    def unlikely(x: float) -> float:
+        total = 0.5 * (x / rules.believed) ** 2
+        for k, one in enumerate(blocks):
+            at = replace(model, white=float(np.exp(x)))
+            _, each, logs[k] = _among_sudden(one, at, rules, logs[k])
+            total -= float(each.sum())
+        return total
 
-    best = max((0.0, float(np.log(model.white))), key=likely)
-    for step in _SHARES:
-        while likely(x := max((best - step, best + step), key=likely)) > likely(best):
-            best = x
-    is_sure = abs(best) > rules.off and 2 * (likely(best) - likely(0.0)) > rules.surely
-    return float(np.exp(best)) if is_sure else 1.0
+    best = minimize_scalar(
+        unlikely, bounds=rules.shares, method="bounded", options={"xatol": rules.off / 2}
+    )
+    # noise settles from share to share, so that what was tried first looks worse than it is
+    is_sure = abs(best.x) > rules.off and 2 * (unlikely(0.0) - best.fun) > rules.surely
+    return float(np.exp(best.x)) if is_sure else 1.0
 
 
 def smooth_with_sudden_motion(
@@ -144,8 +150,9 @@ def _among_sudden(
 ) -> tuple[SmoothedTrack, Floats, Floats]:
     """The same, and the logarithms of λ (N - 1, 2), which begin at some."""
     for _ in range(rules.passes):
-        before, logs = logs, _fixed_point(track, model, logs, rules)
-        if np.abs(logs - before).max(initial=0.0) < rules.settled:
+        change = _fixed_point(track, model, logs, rules) - logs
+        logs = logs + rules.ahead * change
+        if np.abs(change).max(initial=0.0) < rules.settled:
             break
     result = smooth_track(track, model, np.exp(logs))
     share = _usual(logs) / np.exp(logs)
@@ -209,7 +216,6 @@ _COARSE = (
     (0.8, 5, (*_EACH, *_SHARE)),
 )
 _FINE = ((0.5, 5), (0.15, 3))
-_SHARES = (0.7, 0.3, 0.1)  # steps of the share's logarithm, among sudden motion
 
 
 def _along(
