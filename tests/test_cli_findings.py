@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mixpose.body import ASIDE, TURNED
 from mixpose.cli.findings import Findings
 from mixpose.density import Observation
 from mixpose.objective import View
@@ -39,6 +40,30 @@ def test_poses_before_the_body_is_seen_twice_may_be_of_its_mirror_image(before: 
     (line,) = findings.causes()
     assert line.startswith(f"{TWICE} in {20 - before} of 20 frames")
     assert line.endswith("is there a mirror?") == (before > 0)
+
+
+@pytest.mark.parametrize(
+    ("doubt", "count", "asked"),
+    [
+        (ASIDE, 20, "does it have more rows or fewer than told?"),
+        (f"{TURNED} 180 deg", 20, "is a feature of [object] missing, or one too many?"),
+        (f"{TURNED} 180 deg", 8, ""),  # of 20: what tells may be hidden now and then
+    ],
+)
+def test_look_alikes_all_along_ask_whether_the_session_has_all_features(
+    doubt: str, count: int, asked: str
+) -> None:
+    session = load_session(SESSION)
+    findings, label = Findings(session), session.labels[0]
+    for frame in range(20):
+        status: Status = "ambiguous" if frame < count else "ok"
+        why = doubt if frame < count else ""
+        pose = np.eye(4)
+        findings.add(Estimate(frame, None, label, status, pose, np.eye(6), 1.0, {}, doubt=why))
+    (line,) = findings.causes()
+    assert line.startswith(f"{doubt} in {count} of 20 frames")
+    assert line.endswith(asked)
+    assert ("?" in line) == bool(asked)
 
 
 @pytest.mark.parametrize(("status", "warned"), [("lost", True), ("ok", False)])

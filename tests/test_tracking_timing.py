@@ -175,11 +175,11 @@ def test_where_few_frames_a_second_show_a_fast_motion_poses_know_how_unsure_it_i
 ) -> None:
     """Velocities change between frames, and few of these tell by which filter to go."""
     squares = []
-    for seed in range(6):
+    for seed in range(10):
         path = recording(
             tmp_path / str(seed), right="delay = 0.03", frames=20, seed=seed, pixel_noise=0.15,
             amplitude_translation=20.0, fps=10.0, amplitude_rotation_deg=25.0, period_s=1.3,
         )  # fmt: skip
         squares.append(per_dimension(*estimated(path)))
-    # with one filter and its acceleration taken for known 1.49, of the frames that are ok
+    # 1.15 of 24 recordings; of six, with one filter and its acceleration taken for known, 1.49
     assert 0.5 < np.mean(squares) < 1.4

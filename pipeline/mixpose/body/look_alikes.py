@@ -28,6 +28,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_angle_deg, transform
 
 ASIDE = "the body explains as much a step of its grid aside"
+TURNED = "the body explains as much turned by"
 
 Pairs: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 
@@ -76,11 +77,7 @@ class LookAlike:
         """In words: what else there may be in place of the body."""
         if self.other is not self.body:
             return f"what is met lies like features of {self.other.name!r}"
-        return (
-            ASIDE
-            if self.is_step
-            else f"the body explains as much turned by {self.turn_deg:.0f} deg"
-        )
+        return ASIDE if self.is_step else f"{TURNED} {self.turn_deg:.0f} deg"
 
 
 def tolerance_of(body: Body, other: Body, share: float) -> float:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import ASIDE
+from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
@@ -292,7 +292,9 @@ class Findings:
             if doubt == APART:
                 line += f": {CAUSES}"
             if doubt == ASIDE:
-                line += ": is a part of it hidden, or does the session say more rows than it has?"
+                line += ": is a part of it hidden, or does it have more rows or fewer than told?"
+            if doubt.startswith(TURNED) and each.count > total / 2:
+                line += ": is a feature of [object] missing, or one too many?"
             if doubt == TWICE and self._agreed_before:
                 line += ": poses before may be of its mirror image; is there a mirror?"
             lines.append(line)
