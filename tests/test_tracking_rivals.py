@@ -93,6 +93,24 @@ def test_frames_that_tell_nothing_of_two_poses_do_not_together(
     assert [one.status for one in there] == ["ok"] * 3
 
 
+def test_rivals_of_a_body_that_looks_the_same_turned_move_as_it_does(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # as the board looks the same from behind, each of its rivals may be told in two ways
+    told = board(4, 3, (45.0, 90.0, 0.0))
+    assert len(told.symmetries) == 2
+    tracker = Tracker.create(told, EstimatorOptions())
+    track = tracker.begin()
+    for k in range(10):
+        views = detect(pinhole_cameras, board(4, 3), moved(k), noise=0.1, seed=k)
+        track, estimate = tracker.advance(track, k, k / 30, views)
+        assert estimate.status == "ambiguous"
+        velocities = [one.velocity for one in track.branches if one.velocity is not None]
+        assert len(velocities) >= 2 or not k
+        # it turns by 0.1 rad in a frame at the most, and half a turn is 94 rad in a second
+        assert max([np.abs(one[3:]).max() for one in velocities], default=0.0) < 5
+
+
 def test_what_a_pose_goes_on_from_is_told_by_any_of_the_poses_that_look_the_same() -> None:
     plain = board(4, 3)
     assert len(plain.symmetries) == 4

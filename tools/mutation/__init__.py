@@ -21,6 +21,7 @@ from mutation import (
     planning,
     proposing,
     recordings,
+    rivalry,
     searching,
     trajectories,
 )
@@ -45,6 +46,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *files.MUTANTS,
     *edge.MUTANTS,
     *elsewhere.MUTANTS,
+    *rivalry.MUTANTS,
     *planning.MUTANTS,
     *trajectories.MUTANTS,
 )

@@ -131,7 +131,7 @@ MUTANTS = (
     Mutant(
         "tracking-the-least-motion-is-right",
         "tracking/frame.py",
-        "logs[1:] += math.log(frame.rules.motion.surprise)",
+        "logs[1:] += math.log(rules.motion.surprise) if is_unsure else rules.acceptance.log_doubt",
         "logs[0] -= 1e9",
         "a board that moves by two squares is expected one square on",
         ("test_tracking_starts.py",),
