@@ -24,7 +24,7 @@ MUTANTS = (
         (_RIVALS,),
     ),
     Mutant(
-        "bodies-steps-of-small-grids-are-no-rivals",
+        "body-steps-of-small-grids-are-no-rivals",
         "body/look_alikes.py",
         "if np.count_nonzero(near) > max(len(chosen) // 2, FEWEST):",
         "if np.count_nonzero(near) > len(chosen):",
@@ -81,7 +81,7 @@ MUTANTS = (
     ),
     Mutant(
         "checking-times-of-other-moments-are-silent",
-        "cli/check.py",
+        "checking/recordings.py",
         "(off := float(np.median(apart))) > usual:",
         "(off := float(np.median(apart))) > 1e9:",
         "frames that are paired by number are of other moments, and nothing is said",

@@ -130,6 +130,26 @@ def _spread(numbers: Sequence[int], most: int) -> list[int]:
     return [numbers[int(place)] for place in places]
 
 
+def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
+    """Sensors whose frames are taken with frames of other moments, as their times have it."""
+    timed = [(name, each.times) for name, each in surveys.items() if len(each.times) > 1]
+    if len(timed) < 2:
+        return []
+    (first, known), *others = timed  # the time of a frame is that of the first sensor
+    numbers = np.array(list(known))
+    usual = float(np.median(np.diff(list(known.values())) / np.diff(numbers)))
+    warnings = []
+    for name, times in others:
+        apart = np.array([abs(times[k] - known[k]) for k in times.keys() & known.keys()])
+        if len(apart) and (off := float(np.median(apart))) > usual:
+            warnings.append(
+                f"sensor {name!r}: its frames are {off:.3g} s from those of {first!r} with the "
+                f"same number, and {first!r} has one every {usual:.3g} s: is fps or times of one "
+                "of them wrong, or are its frames numbered from another moment?"
+            )
+    return warnings
+
+
 def image_of(source: Source, number: int) -> Image | None:
     """One image of a recording again; None where it holds something else."""
     with closing(source.frames(number, number + 1)) as frames:

@@ -99,7 +99,7 @@ def check_session(request: CheckRequest) -> None:
     report.warnings = [
         *shared,
         *_pairing_warnings(opened),
-        *_time_warnings(surveys),
+        *recordings.time_warnings(surveys),
         *report.warnings,
     ]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
@@ -200,26 +200,6 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
                 f"sensors {one!r} and {other!r} have {len(own)} frames each, numbered from "
                 f"{min(own)} and from {min(others)}: if both began at once, number those of one "
                 "anew, as frames of one number are taken together"
-            )
-    return warnings
-
-
-def _time_warnings(surveys: Mapping[str, recordings.Survey]) -> list[str]:
-    """Sensors whose frames are taken with frames of other moments, as their times have it."""
-    timed = [(name, each.times) for name, each in surveys.items() if len(each.times) > 1]
-    if len(timed) < 2:
-        return []
-    (first, known), *others = timed  # the time of a frame is that of the first sensor
-    numbers = np.array(list(known))
-    usual = float(np.median(np.diff(list(known.values())) / np.diff(numbers)))
-    warnings = []
-    for name, times in others:
-        apart = np.array([abs(times[k] - known[k]) for k in times.keys() & known.keys()])
-        if len(apart) and (off := float(np.median(apart))) > usual:
-            warnings.append(
-                f"sensor {name!r}: its frames are {off:.3g} s from those of {first!r} with the "
-                f"same number, and {first!r} has one every {usual:.3g} s: is fps or times of one "
-                "of them wrong, or are its frames numbered from another moment?"
             )
     return warnings
 
