@@ -34,7 +34,7 @@ MUTANTS = (
     Mutant(
         "tracking-sensors-are-not-asked-each-alone",
         "tracking/twin.py",
-        "if (apart := _seen_elsewhere(data, best, rest)) is not None:",
+        "if (apart := _sure_by(data, others)) is not None:",
         "if (apart := None) is not None:",
         "of two cameras one shows an old frame, and is ok",
         (_RIVALS,),

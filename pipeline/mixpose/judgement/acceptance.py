@@ -155,8 +155,10 @@ def decide(
     told = [one for one in ranked if is_possible(one, free)]
     if not told:
         return Verdict(None, [])
-    best = max(told, key=lambda one: 0.0 if one is told[0] else ahead_of(one, told[0]))
-    odds = [0.0 if one is best else ahead_of(one, best) for one in ranked]
+    best, odds = told[0], _odds_against(told[0], ranked, ahead_of)
+    likeliest = max(told, key=lambda one: odds[ranked.index(one)])
+    if likeliest is not best:
+        best, odds = likeliest, _odds_against(likeliest, ranked, ahead_of)
     weights = beliefs(odds)
     rivals = [each for one, each in zip(ranked, odds, strict=True) if one is not best]
     against = [Alternative("", each) for each in (-best.log_evidence, *rivals)]
@@ -169,6 +171,15 @@ def decide(
     ]
     kept.sort(key=lambda each: each[0] is not best)
     return Verdict(best, kept, tuple(against), rules.log_doubt)
+
+
+def _odds_against(
+    best: ScoredPose,
+    ranked: Sequence[ScoredPose],
+    ahead_of: Callable[[ScoredPose, ScoredPose], float],
+) -> list[float]:
+    """Log odds of each pose against one of them."""
+    return [0.0 if one is best else ahead_of(one, best) for one in ranked]
 
 
 def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
@@ -271,11 +282,18 @@ def _are_one(
 
 
 def met_by_one(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
-    """Sensors that a pose is not of, where one alone meets most of the body; else none."""
-    coverage = judged.matches.coverage.tolist()
-    known = dict(zip(judged.matches.names, coverage, strict=True))
-    of = [k for k, each in known.items() if each >= rules.agreeing and k not in judged.left_out]
-    return [name for name in known if name not in of] if len(of) == 1 else []
+    """Sensors that should see a body and that its pose is not of, as one alone meets most of it.
+
+    None where two do.
+    """
+    seen, of, others = judged.matches, list[str](), list[str]()
+    given = zip(seen.names, seen.coverage.tolist(), seen.expected.tolist(), strict=True)
+    for name, coverage, expected in given:
+        if coverage >= rules.agreeing and name not in judged.left_out:
+            of.append(name)
+        elif expected > 0:
+            others.append(name)
+    return others if len(of) == 1 else []
 
 
 def others_miss(

@@ -9,7 +9,7 @@ those searched in vain before, and every few frames anyway; of a flat body all.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,21 +48,23 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     Either may be it then, whichever was followed so far, unless one is the other's mirror image;
     and the other one goes on to be the other.
     """
-    best, left = verdict.best, {one.name: one.observation.cells for one in rest.views}
+    best = verdict.best
     if best is None or not is_ok_but_for_mirrors(verdict):
         return verdict
-    if (apart := _seen_elsewhere(data, best, rest)) is not None:
-        kept = [*((one, weight / 2) for one, weight in verdict.kept), (apart, 0.5)]
-        return replace(verdict, kept=kept).doubted([Alternative(APART)])
+    if others := _may_be_elsewhere(data, best, rest):
+        if (apart := _sure_by(data, others)) is not None:
+            kept = [*((one, weight / 2) for one, weight in verdict.kept), (apart, 0.5)]
+            return replace(verdict, kept=kept).doubted([Alternative(APART)])
+        verdict = replace(verdict, tried=_most_tried(data, others))
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
     second, odds = _where_it_was(data, best, rest), -math.inf
     if second is not None:
         odds = min(data.track.twice + second.log_evidence, -accepted.log_doubt)
     is_there = second is not None and is_sure(second, data.free, accepted)
-    if not is_there and _is_due(data, best, left):
-        most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
-        verdict, found = replace(verdict, tried=most), _second_pose(data, best, rest)
+    if not is_there and _is_due(data, best, rest.views):
+        tried = {**verdict.tried, **_most_tried(data, rest.views)}
+        verdict, found = replace(verdict, tried=tried), _second_pose(data, best, rest)
         if found is not None:
             second, odds = found, -accepted.log_doubt
     if second is None or odds <= accepted.log_doubt:
@@ -155,9 +157,9 @@ def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     return float(likely - most)
 
 
-def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
+def _is_due(data: Frame, best: ScoredPose, views: Sequence[View]) -> bool:
     """Whether as many detections as are left may be the body once more, and were not searched."""
-    used, rules = best.matches, data.rules
+    used, left = best.matches, {one.name: one.observation.cells for one in views}
     if (used.dimensions != 2).any():
         return False
     rest = np.array([left.get(name, 0) for name in used.names])
@@ -167,12 +169,8 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     is_much = is_much or most >= used.met.sum() - _most_missed(data)
     if 2 * most < np.count_nonzero(data.free) or not is_much:
         return False
-    track = data.track
-    is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
     # a flat body has a mirror image that looks like it
-    if is_more or track.doubted or is_flat(data):
-        return True
-    return track.is_in_turn(data.frame, rules.proposals.static)
+    return is_flat(data) or _is_in_turn(data, views)
 
 
 def _most_missed(data: Frame) -> float:
@@ -203,28 +201,47 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
     return None
 
 
-def _seen_elsewhere(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
-    """A pose that is sure by sensors that see nothing of the best one, which one alone meets.
-
-    Nobody knows then which of them is out of step.
-    """
-    rules = data.rules.acceptance
-    names = met_by_one(best, rules)
+def _may_be_elsewhere(data: Frame, best: ScoredPose, rest: SeenTogether) -> list[View]:
+    """Sensors that see nothing of a pose which one alone meets, and may see the body elsewhere."""
+    if (best.matches.dimensions != 2).any():
+        return []
+    names = met_by_one(best, data.rules.acceptance)
     views = [one for one in rest.views if one.name in names and _may_fix(one, data)]
-    if not views or (best.matches.dimensions != 2).any():
-        return None
-    alone = data.alone(views=views, still=(), starts=()).seen_otherwise(options=data.options)
-    likelihood = likelihood_of(alone)
-    for start in _starts(alone, replace(rest, views=views)):
-        pose = likelihood.judge(likelihood.fit(start), start)
-        if is_sure(pose, data.free, rules):
-            return replace(pose, proposer=SECOND_POSE)
-    return None
+    return views if _is_in_turn(data, views) else []
 
 
 def _may_fix(view: View, data: Frame) -> bool:
     """Whether a sensor sees more than what fixes a pose."""
     return bool(view.observation.cells * view.sensor.dimension > np.count_nonzero(data.free))
+
+
+def _is_in_turn(data: Frame, views: Sequence[View]) -> bool:
+    """Whether views show more than was searched in vain before, or are searched again anyway."""
+    track = data.track
+    is_more = any(one.observation.cells > track.tried.get(one.name, 0) for one in views)
+    again = track.is_in_turn(data.frame, data.rules.proposals.static)
+    return bool(views) and (is_more or track.doubted or again)
+
+
+def _most_tried(data: Frame, views: Sequence[View]) -> dict[str, int]:
+    """Detections of views that were searched in vain, now or before."""
+    tried = data.track.tried
+    return {one.name: max(one.observation.cells, tried.get(one.name, 0)) for one in views}
+
+
+def _sure_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
+    """A pose that is sure by some views alone.
+
+    Where they see nothing of the best one, nobody knows which of the two is out of step.
+    """
+    alone = data.alone(views=views, still=(), starts=()).seen_otherwise(options=data.options)
+    together = SeenTogether(views, data.rules.judgement, data.rules.search)
+    likelihood = likelihood_of(alone)
+    for start in _starts(alone, together):
+        pose = likelihood.judge(likelihood.fit(start), start)
+        if is_sure(pose, data.free, data.rules.acceptance):
+            return replace(pose, proposer=SECOND_POSE)
+    return None
 
 
 def _where_it_was(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
