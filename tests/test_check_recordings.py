@@ -203,6 +203,18 @@ def test_sensors_whose_numbers_do_not_pair_are_told(
     assert said in report_on(recording / "session.toml", capsys)
 
 
+@pytest.mark.parametrize("sides", [("left",), ("left", "right")])
+def test_a_sensor_that_shows_the_same_again_is_told_where_others_do_not(
+    recording: Path, capsys: pytest.CaptureFixture[str], sides: tuple[str, ...]
+) -> None:
+    for side in sides:
+        for n in (4, 5):
+            shutil.copy(recording / f"{side}0003.png", recording / f"{side}000{n}.png")
+    report = report_on(recording / "session.toml", capsys)
+    said = "sensor 'left' shows the same as the frame before in frames 4, 5, while others do not"
+    assert (f"{said}: frozen, or frames doubled?" in report) == (sides == ("left",))
+
+
 @pytest.mark.parametrize(
     ("times", "off"),
     # 8 frames a 0.04 s: median of n / 25 - n / 50; 2.5 frames later; half a frame, as of cameras

@@ -81,8 +81,10 @@ def geometry_doubts(
 
     def further() -> Frames:
         """As many frames again, between those."""
-        more = recording.shared(2 * count, {number for number, _ in frames})
-        return [(each.number, observe(session, each)) for each in islice(more, count)]
+        more = recording.shared(2 * count, set(chosen))
+        found = [(each.number, observe(session, each)) for each in islice(more, count)]
+        chosen.extend(number for number, _ in found)
+        return found
 
     def otherwise() -> Otherwise:
         """Though there are as many features as there should be."""
@@ -92,7 +94,7 @@ def geometry_doubts(
     if (told := _told(recording, frames, found)) is not None:
         return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()
-    numbers = ", ".join(str(number) for number in sorted(n for n, _ in frames[: found.count]))
+    numbers = ", ".join(map(str, sorted(chosen[: found.count])))
     met = f", features met to {found.rms:.2g} sigma in the median" if found.good else ""
     tried = f"{found.good} of {found.count} frames that were estimated ({numbers}) are explained"
     doubts = replace(doubts, tried=f"{tried}{met}")

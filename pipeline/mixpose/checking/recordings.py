@@ -14,6 +14,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
+from mixpose.frames.repeated import is_same, shown_by
 from mixpose.frames.source import Frames
 from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
@@ -21,6 +22,7 @@ from mixpose.records import Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
+_LISTED = 5  # frame numbers that are named
 _QUICK = 5  # frames that are looked at where not all are
 # images of a sensor in which features are counted: to find them takes five times as long as to read
 # an image, and the median of so many is as good as that of all
@@ -44,6 +46,7 @@ class Survey:
     damaged: tuple[int, ...] = ()  # their numbers, as far as known
     is_whole: bool = True  # whether all frames were looked at
     times: Mapping[int, float] = field(default_factory=dict)  # of frames that have one, in s
+    repeated: tuple[int, ...] = ()  # frames that show something, and the same as the one before
     # frames that were counted, with the points found in place of an image; none where too many
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
@@ -75,13 +78,17 @@ def survey(
     damage: Damage = []
     counts: dict[int, int | None] = {}
     numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
-    times = dict[int, float]()
+    times, repeated, before = dict[int, float](), list[int](), None
     size: tuple[int, int] | None = None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
             numbers.append(frame.number)
             if frame.time_s is not None:
                 times[frame.number] = frame.time_s
+            shown = shown_by(frame)
+            if shown is not None and shown.any() and is_same(before, shown):
+                repeated.append(frame.number)
+            before = shown
             if isinstance(frame.data, np.ndarray):
                 size = (frame.data.shape[1], frame.data.shape[0])
                 if looked_at is not None and frame.number not in looked_at:
@@ -111,6 +118,7 @@ def survey(
         damaged=tuple(number for number, _ in damage if number is not None),
         is_whole=not quick,
         times=times,
+        repeated=tuple(repeated),
         found=found,
     )
 
@@ -146,6 +154,22 @@ def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
                 f"sensor {name!r}: its frames are {off:.3g} s from those of {first!r} with the "
                 f"same number, and {first!r} has one every {usual:.3g} s: is fps or times of one "
                 "of them wrong, or are its frames numbered from another moment?"
+            )
+    return warnings
+
+
+def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:
+    """Sensors that show the same as the frame before, while others do not."""
+    warnings = []
+    for name, own in surveys.items():
+        others = [one for other, one in surveys.items() if other != name]
+        changed = {n for one in others for n in {*one.numbers} - {*one.repeated}}
+        if frozen := [number for number in own.repeated if own.is_whole and number in changed]:
+            frames = ", ".join(map(str, frozen[:_LISTED]))
+            more = f", ... ({len(frozen)} frames)" if len(frozen) > _LISTED else ""
+            warnings.append(
+                f"sensor {name!r} shows the same as the frame before in frames {frames}{more}, "
+                "while others do not: frozen, or frames doubled?"
             )
     return warnings
 

@@ -100,6 +100,7 @@ def check_session(request: CheckRequest) -> None:
         *shared,
         *_pairing_warnings(opened),
         *recordings.time_warnings(surveys),
+        *recordings.frozen_warnings(surveys),
         *report.warnings,
     ]
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)

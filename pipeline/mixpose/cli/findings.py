@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli.body_size import BodySize, size_warnings
+from mixpose.frames.repeated import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, FrameSet, PointPattern, RawFrame
+from mixpose.records import Estimate, Floats, FrameSet
 from mixpose.session import Session
 from mixpose.tracking import CHANGED, OUT_OF_STEP, TWICE, plane_views
 
@@ -35,7 +36,6 @@ _AT_LEAST = 0.2  # of sigma, for that
 _USUAL = 100  # frames by which it is told what is usual
 _KEPT = 3  # frames that are tried with other sessions
 _SHOWN = 3  # stretches that are named
-_PIXELS = 37  # of an image every so many are compared first
 
 
 @dataclass
@@ -142,9 +142,9 @@ class Findings:
                 self._no_frame[name].add(frame_set.number, place)
             elif name not in seen and name not in flooded:
                 self._no_feature[name].add(frame_set.number, place)
-            shown = None if frame is None else _shown(frame)
+            shown = None if frame is None else shown_by(frame)
             if shown is not None:
-                if name in seen and _is_same(self._shown.get(name), shown):
+                if name in seen and is_same(self._shown.get(name), shown):
                     self._again.add(name)
                 self._shown[name] = shown
         is_lost = estimate.status == "lost"
@@ -390,17 +390,3 @@ def _about(marker: _Marker, typical: float, unit: str) -> list[str]:
     if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
         return [f"not met from frame {marker.since} on, in {gone} frames: gone?"]
     return []
-
-
-def _shown(frame: RawFrame) -> NDArray[Any] | None:
-    """What tells whether a sensor shows the same again: an image, or what was detected."""
-    if isinstance(frame.data, PointPattern):
-        return frame.data.points
-    return frame.data if isinstance(frame.data, np.ndarray) else None
-
-
-def _is_same(before: NDArray[Any] | None, now: NDArray[Any]) -> bool:
-    if before is None or before.shape != now.shape:
-        return False
-    few = np.array_equal(before[::_PIXELS, ::_PIXELS], now[::_PIXELS, ::_PIXELS])
-    return few and bool(np.array_equal(before, now))
