@@ -85,7 +85,7 @@ MUTANTS = (
         "(off := float(np.median(apart))) > usual:",
         "(off := float(np.median(apart))) > 1e9:",
         "frames that are paired by number are of other moments, and nothing is said",
-        ("test_check_recordings.py",),
+        ("test_check_pairing.py",),
     ),
     Mutant(
         "learning-frames-turned-over-count",

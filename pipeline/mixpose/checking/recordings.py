@@ -22,7 +22,7 @@ from mixpose.records import Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
-_LISTED = 5  # frame numbers that are named
+LISTED = 5  # frame numbers that are named
 _QUICK = 5  # frames that are looked at where not all are
 # images of a sensor in which features are counted: to find them takes five times as long as to read
 # an image, and the median of so many is as good as that of all
@@ -158,6 +158,12 @@ def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
     return warnings
 
 
+def listed(numbers: Sequence[int]) -> str:
+    """Numbers of frames for people; of many how many there are."""
+    text = ", ".join(map(str, numbers[:LISTED]))
+    return text if len(numbers) <= LISTED else f"{text}, ... ({len(numbers)} frames)"
+
+
 def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:
     """Sensors that show the same as the frame before, while others do not."""
     warnings = []
@@ -165,10 +171,8 @@ def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:
         others = [one for other, one in surveys.items() if other != name]
         changed = {n for one in others for n in {*one.numbers} - {*one.repeated}}
         if frozen := [number for number in own.repeated if own.is_whole and number in changed]:
-            frames = ", ".join(map(str, frozen[:_LISTED]))
-            more = f", ... ({len(frozen)} frames)" if len(frozen) > _LISTED else ""
             warnings.append(
-                f"sensor {name!r} shows the same as the frame before in frames {frames}{more}, "
+                f"sensor {name!r} shows the same as the frame before in frames {listed(frozen)}, "
                 "while others do not: frozen, or frames doubled?"
             )
     return warnings

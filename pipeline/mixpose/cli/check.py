@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
@@ -27,7 +27,6 @@ from mixpose.session import ObjectSetup, SensorSetup, Session, load_session
 
 _TYPICAL_POSES = 3
 _AWAY = (1.0, 2.0, 4.0)  # times the distance at which the body fills half of one camera's image
-_LISTED = 5  # frame numbers that are named
 _ALL_WAYS = np.pi / 2  # a turn that is less certain than this, in radians, is not known at all
 
 
@@ -153,7 +152,7 @@ def _say_sensor(
     if found.damage:
         read = f"{len(found.damage)} of the {total} looked at cannot be read"
     report.say("", f"{source.describe()}; {read}" if not found.damage or found.numbers else read)
-    for text in found.damage[:_LISTED]:
+    for text in found.damage[: recordings.LISTED]:
         report.say("", f"damaged: {text}")
     where = f"sensor {setup.name!r}"
     caution = source.caution()
@@ -172,7 +171,9 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, recordings.Su
     missing = sorted(known - own)
     if missing:
         everyone = len(known | own)
-        report.say("", f"missing: {_numbers(missing)} of the {everyone} frames of all sensors")
+        report.say(
+            "", f"missing: {recordings.listed(missing)} of the {everyone} frames of all sensors"
+        )
 
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
@@ -215,7 +216,7 @@ def _say_features(
         report.warnings.append(f"{where}: its recording has no frame")
     if found.counts is None:
         if found.numbers and found.empty:
-            frames = _numbers(found.empty)
+            frames = recordings.listed(found.empty)
             report.warnings.append(f"{where}: nothing but one value in frame {frames}")
         return
     low, high = min(found.counts), max(found.counts)
@@ -235,12 +236,7 @@ def _say_features(
             f"{expected} are expected: {keys.advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
-        report.warnings.append(f"{where}: no feature in frame {_numbers(found.empty)}")
-
-
-def _numbers(numbers: Sequence[int]) -> str:
-    text = ", ".join(map(str, numbers[:_LISTED]))
-    return text if len(numbers) <= _LISTED else f"{text}, ... ({len(numbers)} frames)"
+        report.warnings.append(f"{where}: no feature in frame {recordings.listed(found.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:

@@ -226,12 +226,16 @@ class Frame(Setup):
         return self.expectation([*poses]) - self.anywhere[0]
 
     def away_from(self, T_world_object: Floats) -> list[Floats]:
-        """How far the features (N,) of each prediction are from those at a pose."""
-        here, means = transform(T_world_object, self.body.means), self.body.means
-        return [
-            np.linalg.norm(transform(one.T_world_object, means) - here, axis=1)
-            for one in self.predictions
-        ]
+        """How far the features (N,) of each prediction are from those at a pose.
+
+        Of poses that look the same it is the nearest to the prediction.
+        """
+        body, away = self.body, list[Floats]()
+        for one in self.predictions:
+            T = nearest_alike(T_world_object, body, one.T_world_object)
+            here, there = (transform(each, body.means) for each in (T, one.T_world_object))
+            away.append(np.linalg.norm(there - here, axis=1))
+        return away
 
     def other_at(self, T_world_object: Floats) -> float | None:
         """Log odds that what is at a pose is not the body, by the prediction that it goes on from.

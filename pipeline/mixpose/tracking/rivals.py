@@ -19,10 +19,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mixpose.judgement import ScoredPose, ahead, nearest_alike, odds_of
+from mixpose.judgement import ScoredPose, ahead, odds_of
 from mixpose.matching import Matches
 from mixpose.records import Floats
-from mixpose.rigid import transform
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.track import Branch
 
@@ -47,22 +46,19 @@ def _before(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
 
 def _expected(data: Frame, T_world_object: Floats) -> Branch | None:
     """The prediction that puts features next to where a pose has them; None where none is near."""
-    body, away = data.body, list[float]()
-    for one in data.predictions:
-        T = nearest_alike(T_world_object, body, one.T_world_object)
-        here, there = (transform(each, body.means) for each in (T, one.T_world_object))
-        away.append(float(np.linalg.norm(here - there, axis=1).mean()))
+    away = [float(off.mean()) for off in data.away_from(T_world_object)]
     nearest = int(np.argmin(away))
-    return data.predictions[nearest] if away[nearest] <= body.radius else None
+    return data.predictions[nearest] if away[nearest] <= data.body.radius else None
 
 
 def _of_more_than_told(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """By how much likelier a rival is as the body may have more features than the session says."""
-    gains = [_gained_alone(data, *pair) for pair in ((rival, best), (best, rival))]
-    if min(gains) <= 0:
+    if (by_rival := _gained_alone(data, rival, best)) <= 0:
+        return 0.0
+    if (by_best := _gained_alone(data, best, rival)) <= 0:
         return 0.0
     mistaken = math.log(data.rules.acceptance.mistaken)
-    of_rival, of_best = np.logaddexp(0.0, mistaken + np.array(gains)).tolist()
+    of_rival, of_best = np.logaddexp(0.0, [mistaken + by_rival, mistaken + by_best]).tolist()
     return float(of_best - of_rival)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -204,7 +204,7 @@ class Tracker(Setup):
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
     ) -> Estimate:
         """The estimate of a frame, with reports of the first pose, believed or not."""
-        body, best, at = self.body, verdict.best, from_parts(np.eye(3), self.origin)
+        body, best, at = self.body, verdict.best, self._T_body_origin
         shown = best or next(iter(ranked), None)
         used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
@@ -234,6 +234,11 @@ class Tracker(Setup):
             doubt=verdict.doubt,
             measured=partial(_offsets, used, shown.variances) if shown and used else dict,
         )
+
+    @cached_property
+    def _T_body_origin(self) -> Floats:
+        """The frame (4, 4) that poses are told of, in that of `body`."""
+        return from_parts(np.eye(3), self.origin)
 
     def _at_origin(self, pose: ScoredPose) -> Floats:
         """The covariance (6, 6) of a pose, of its origin."""

@@ -190,9 +190,7 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
     """
     agree = min(int(np.count_nonzero(best.used.met)), 2)
     alone = data.alone(views=rest.views, still=(), starts=())
-    likelihood = likelihood_of(alone)
-    for start in _starts(alone, rest):
-        pose = likelihood.judge(likelihood.fit(start), start)
+    for pose in _poses(alone, rest):
         least = data.rules.acceptance.log_doubt
         is_likely = _more_missed(best, pose, data) > least or mirrored(data, best, pose)[0] > -least
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
@@ -236,9 +234,7 @@ def _sure_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
     """
     alone = data.alone(views=views, still=(), starts=()).seen_otherwise(options=data.options)
     together = SeenTogether(views, data.rules.judgement, data.rules.search)
-    likelihood = likelihood_of(alone)
-    for start in _starts(alone, together):
-        pose = likelihood.judge(likelihood.fit(start), start)
+    for pose in _poses(alone, together):
         if is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
     return None
@@ -262,12 +258,14 @@ def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
             yield Start(branch.T_world_object, branch.uncertainty)
 
 
-def _starts(alone: Frame, rest: SeenTogether) -> Iterator[Start]:
-    """Where a second pose may be, as a search finds."""
+def _poses(alone: Frame, rest: SeenTogether) -> Iterator[ScoredPose]:
+    """What a second pose may be, as a search finds."""
+    likelihood = likelihood_of(alone)
     found: Sequence[Copy | Candidate]
     if len(rest.views) > 1:  # quickly, by points that cameras see together
         found = search_copies(rest, [alone.body], alone.free)
     else:
         found = candidates_of(alone)
     for one in found[: alone.rules.proposals.seconds]:
-        yield Start(one.T_world_object, alone.close)
+        start = Start(one.T_world_object, alone.close)
+        yield likelihood.judge(likelihood.fit(start), start)
