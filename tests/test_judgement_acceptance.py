@@ -14,12 +14,14 @@ from mixpose.body import Body, PointFeature
 from mixpose.judgement import (
     AcceptanceRules,
     Alternative,
+    NoiseModel,
     ScoredPose,
     beliefs,
     convinces,
     decide,
     insert,
     nearest_alike,
+    two_agree,
 )
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate
 from mixpose.objective import View, matched_objective
@@ -284,3 +286,23 @@ def test_what_is_likelier_clutter_stands_for_no_evident_pose() -> None:
         ranked = [first]
         insert(ranked, second, EIGHT, ALL_FREE, RULES)
         assert [one.log_evidence for one in ranked] == [1.8]
+
+
+@pytest.mark.parametrize(
+    ("met", "off", "ratio", "expected"),
+    [
+        (8, 0.3, 0.5, True),
+        (4, 0.3, 0.5, True),
+        (3, 0.3, 0.5, False),  # less than half of the body
+        (8, 0.45, 0.5, False),  # beyond 3.5 deviations of 0.1, which is more than the other has
+        (8, 0.3, 1.5, False),  # farther off than chance: a pose between what the two see
+    ],
+)
+def test_two_sensors_agree_where_both_meet_most_of_the_body_as_closely_as_chance_has_it(
+    met: int, off: float, ratio: float, expected: bool
+) -> None:
+    J = np.zeros((8, 2, 6))
+    shares = np.repeat([1.0, 0.0], [met, 8 - met])
+    exact = Seen(J, "0", offsets=0.02), Seen(J, "1", offsets=off, shares=shares)
+    pose = replace(scored(TRUTH, *exact), residual_ratio=ratio)
+    assert two_agree(pose, AcceptanceRules(), NoiseModel()) == expected

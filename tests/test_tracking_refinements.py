@@ -32,6 +32,7 @@ from mixpose.tracking.refinements import (
     _carry,
     _paired,
     agreed,
+    all_near,
     merged_pair,
     without_sensor,
 )
@@ -153,6 +154,29 @@ def test_a_spot_of_two_features_that_is_cut_does_not_bend_the_pose() -> None:
     (rival,) = merged_pair(data, likelihood, likelihood.judge(likelihood.fit(here), here))
     # least squares would turn it by 0.1°
     assert rotation_angle_deg(rival.T_world_object, T) < 0.01
+
+
+def test_spots_that_are_all_farther_off_than_before_are_met_together() -> None:
+    camera, T, _ = two_in_one()
+    T = perturb(T, np.array([0.0, 0.0, 0.0, 0.4, 0.3, 0.2]))
+    y = camera.project(transform(T, SIX))[0]
+    y += np.random.default_rng(5).normal(0, 1.6, y.shape)
+
+    def away(twist: Floats) -> Floats:
+        return np.asarray((camera.project(transform(perturb(T, twist), SIX))[0] - y).ravel())
+
+    labelled = perturb(T, least_squares(away, np.zeros(6), x_scale=np.repeat([100.0, 1.0], 3)).x)
+    tracker = Tracker.create(WAND, EstimatorOptions(), T)
+    data = tracker.data(tracker.begin(), 1, None, [view_of("camera", camera, y)])
+    likelihood, here = likelihood_of(data), Start(T, tracker.start_uncertainty)
+    judged = likelihood.judge(likelihood.fit(here), here)
+    # four are met to less than noise
+    assert judged.matches.missed.tolist() == [2.0]
+    (start,) = all_near(data, likelihood, judged)
+    again = likelihood.judge(likelihood.fit(start), start)
+    assert again.matches.missed.tolist() == [0.0]
+    assert rotation_angle_deg(again.T_world_object, labelled) < 0.01
+    assert again.log_density > judged.log_density
 
 
 def followed_to_cut_spots(

@@ -122,14 +122,17 @@ def test_what_a_pose_goes_on_from_is_told_by_any_of_the_poses_that_look_the_same
         assert track.nearest(near @ turn, plain) is track.branches[0]
 
 
+def side_by_side(camera: PinholeCamera) -> list[PinholeCamera]:
+    """Two cameras close enough to each other that one alone knows the pose hardly worse."""
+    turn = from_rotation_vector([0.0, 0.0, 0.3], np.zeros(3))
+    return [camera, replace(camera, T_sensor_world=camera.T_sensor_world @ turn)]
+
+
 def test_of_two_cameras_that_each_see_the_body_elsewhere_none_is_believed(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     """As where one of them shows an old frame: the body rested, and the other saw it move."""
-    # close enough to each other that one alone knows the pose hardly worse
-    one = pinhole_cameras[0]
-    turned = one.T_sensor_world @ from_rotation_vector([0.0, 0.0, 0.3], np.zeros(3))
-    cameras = [one, replace(one, T_sensor_world=turned)]
+    cameras = side_by_side(pinhole_cameras[0])
     body = board(6, 5)
     tracker = Tracker.create(body, EstimatorOptions())
     track = tracker.begin()
@@ -147,6 +150,25 @@ def test_of_two_cameras_that_each_see_the_body_elsewhere_none_is_believed(
     blank = replace(new[1], observation=new[1].observation.only(np.zeros(30, dtype=np.bool_)))
     _, estimate = tracker.advance(track, 4, 4 / 30, [old[0], blank])
     assert estimate.status == "ok"
+
+
+def test_cameras_that_contradicted_each_other_are_believed_once_they_agree(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    body, away = board(6, 5), moved(7, 150.0)
+    tracker = Tracker.create(body, EstimatorOptions())
+    track, told = tracker.begin(), []
+    cameras = side_by_side(pinhole_cameras[0])
+    rests, apart, alone = (TRUTH, TRUTH), (TRUTH, away), (TRUTH,)
+    for k, poses in enumerate([rests, rests, apart, alone, alone, rests, alone]):
+        views = [
+            replace(detect([camera], body, T, noise=0.05, seed=10 * k + i)[0], name=str(i))
+            for i, (camera, T) in enumerate(zip(cameras, poses, strict=False))
+        ]
+        track, estimate = tracker.advance(track, k, k / 30, views)
+        told.append((estimate.status, estimate.doubt))
+    # one alone cannot say which of the two is where its session tells
+    assert told == [("ok", "")] * 2 + [("ambiguous", APART)] * 3 + [("ok", "")] * 2
 
 
 @pytest.mark.parametrize("arm", [300.0, 3000.0])

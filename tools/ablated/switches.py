@@ -11,7 +11,7 @@ from mixpose.objective import View
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.proposers import Proposer, multistart, searched
-from mixpose.tracking.refinements import Refinement, agreed, merged_pair, without_sensor
+from mixpose.tracking.refinements import Refinement, agreed, all_near, merged_pair, without_sensor
 
 FREE = 0.0
 NEVER = float("inf")
@@ -105,6 +105,7 @@ SWITCHES = (
     Switch("no other tilt", ruled("look_alikes", kinds=("congruent", "mirrored"))),
     Switch("no mirror image", ruled("look_alikes", kinds=("congruent", "tilted"))),
     Switch("no merged_pair", without_refinement(merged_pair)),
+    Switch("no all_near", without_refinement(all_near)),
     Switch("no agreed", without_refinement(agreed)),
     Switch("sizes tell nothing", ruled("sizes", cut=0.0)),
     Switch("no without_sensor", without_refinement(without_sensor)),

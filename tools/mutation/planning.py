@@ -121,7 +121,7 @@ _DESIGN = (
     Mutant(
         "design-averted-features-count",
         "design/prediction.py",
-        "visible = visible & facing(sensor, poses, world, plan.body.normals)",
+        "visible = visible & facing(sensor, poses, world, plan.body.normals, plan.body.edge_on)",
         "visible = visible & True",
         "markers on the back are counted",
     ),

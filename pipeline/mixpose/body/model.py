@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -50,6 +51,14 @@ class Gravity:
         return np.asarray(self.sigma**2 * np.outer(self.unit, self.unit))
 
 
+EDGE_ON = math.cos(math.radians(80.0))
+"""Cosine of the angle to its normal from which a flat feature is not found.
+
+Of corners of printed tags in four real recordings 46 % are found between 75 and 80 degrees, 4 % of
+2,700 between 80 and 85 degrees, and none of 2,100 beyond.
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """A rigid body known by its features."""
@@ -93,6 +102,11 @@ class Body:
             weights=np.concatenate([weights for _, weights in parts]),
             feature=np.repeat(np.arange(len(parts)), counts),
         )
+
+    @property
+    def edge_on(self) -> float:
+        """Cosine of the angle to its normal from which a feature is not seen."""
+        return 0.0 if self.shape == "sphere" else EDGE_ON
 
     @cached_property
     def node_normals(self) -> Floats | None:

@@ -72,7 +72,7 @@ class Rig:
         eye, world = self.sensors[sensor], transform(poses, self.points)
         y, visible = eye.project(world)
         return y + self.beside(sensor, poses), visible & facing(
-            eye, poses, world, self.body.normals
+            eye, poses, world, self.body.normals, self.body.edge_on
         )
 
     def beside(self, sensor: int, poses: Floats) -> Floats:

@@ -96,7 +96,7 @@ def predict(plan: Plan, poses: Floats) -> Prediction:
     rows = zip(plan.sensors, plan.noises, plan.weighed().tolist(), strict=True)
     for k, (sensor, noise, variance) in enumerate(rows):
         _, A, visible = sensor.linearise(world)
-        visible = visible & facing(sensor, poses, world, plan.body.normals)
+        visible = visible & facing(sensor, poses, world, plan.body.normals, plan.body.edge_on)
         seen[:, k] = visible
         A = A * visible[..., None, None]
         J = pose_jacobian(A, arms)

@@ -17,6 +17,7 @@ from mixpose.judgement.acceptance import (
     met_by_one as met_by_one,
     nearest_alike as nearest_alike,
     others_miss as others_miss,
+    two_agree as two_agree,
 )
 from mixpose.judgement.evidence import (
     DetectionModel as DetectionModel,

@@ -328,6 +328,20 @@ def others_miss(
     return bool((odds[sees] < -rules.log_doubt).any())
 
 
+def two_agree(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> bool:
+    """Whether two sensors meet most of the body where one pose has it, no farther off than chance.
+
+    One that is off by more than noise as the most exact of them has it sees it elsewhere.
+    """
+    used = judged.used
+    squares, degrees = (used.summed(each) for each in (used.squares, used.measurements))
+    variances = squares / np.maximum(degrees, 1e-12)
+    meet = used.summed(used.coverage) >= rules.agreeing * used.images
+    least = max(float(variances[meet].min(initial=np.inf)), model.usual**2)
+    agree = meet & (variances <= model.errors.outlying**2 * least)
+    return bool(judged.residual_ratio <= 1 and np.count_nonzero(agree) > 1)
+
+
 def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
     """Of the noise so far (2,), squares and degrees of freedom, or what is typical before that."""
     is_known = before[1] >= model.known

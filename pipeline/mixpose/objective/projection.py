@@ -115,8 +115,8 @@ class BodyProjection:
         if self._normals is None:
             faced = ~np.zeros(seen.shape, dtype=np.bool_)
         else:
-            points = world.reshape(H, n, 3)
-            faced = np.array([facing(one, poses, points, self._normals) for one in self.sensors])
+            given = poses, world.reshape(H, n, 3), self._normals, self.body.edge_on
+            faced = np.array([facing(one, *given) for one in self.sensors])
             seen &= faced
         return Match(y.reshape(L, H, n, 2), J, seen, faced, self._weights * seen)
 

@@ -107,7 +107,8 @@ def projected_features(
     """Places (N, m) of features, which of them can be measured, and which are faced as well."""
     points = transform(T_world_object, body.means)
     y, inside = sensor.project(points)
-    return y, inside, inside & facing(sensor, T_world_object, points, body.normals)
+    faced = facing(sensor, T_world_object, points, body.normals, body.edge_on)
+    return y, inside, inside & faced
 
 
 def projected_covariances(

@@ -10,14 +10,21 @@ from mixpose.sensors.cloud import CloudPlane, CloudSensor
 
 
 def facing(
-    sensor: Sensor, T_world_object: Floats, points_world: Floats, normals: Floats | None
+    sensor: Sensor,
+    T_world_object: Floats,
+    points_world: Floats,
+    normals: Floats | None,
+    edge_on: float = 0.0,
 ) -> Mask:
     """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
 
-    Normals (n, 3) are in the object's frame, poses (..., 4, 4).  All features face a cloud, whose
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4).  From a cosine of the angle to its
+    normal on a feature is `edge_on`.  All features face a cloud, whose
     system sees them from several sides.
     """
     if normals is None or isinstance(sensor, CloudPlane | CloudSensor):
         return np.ones(points_world.shape[:-1], dtype=np.bool_)
     outward = normals @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
-    return np.asarray((outward * sensor.towards(points_world)).sum(axis=-1) > 0)
+    towards = sensor.towards(points_world)
+    cosines = np.vecdot(outward, towards) / np.linalg.norm(towards, axis=-1)
+    return np.asarray(cosines > edge_on)

@@ -33,6 +33,7 @@ from mixpose.judgement import (
     others_miss,
     possible_mistakes,
     shape_shown,
+    two_agree,
 )
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
@@ -47,6 +48,7 @@ TWICE = (
 )
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
+CONTRADICTION = "one sensor or another"  # by which name it is remembered
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
 
@@ -73,9 +75,11 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
     rules, sensors = data.rules, {view.name: view.sensor for view in data.still or data.views}
-    before = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
+    own = _of_contradiction(data, best), of_reflection(data, best)
+    names = {one.name for one in own}
+    before = {name: odds for name, odds in data.track.mistaken.items() if name not in names}
     known = rules.judgement.noise, sensors, before
-    mistakes = [*possible_mistakes(best, data.body, data.free, *known), of_reflection(data, best)]
+    mistakes = [*possible_mistakes(best, data.body, data.free, *known), *own]
     # one frame in as many as there are sessions with a mistake may be of another kind
     most = _most_told(data)
     mistaken = {
@@ -118,7 +122,7 @@ def _alternatives(
     data: Frame, best: ScoredPose, mistakes: Sequence[Mistake], told: float
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
-    rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
+    rules, noise = data.rules.acceptance, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
         known = data.other_at(best.T_world_object)  # where it was seen beside its mirror image
         yield Alternative(IN_A_MIRROR, 0.0 if known is None else known)
@@ -128,8 +132,6 @@ def _alternatives(
     of_image = 0.5 if data.options.mirrors else rules.mistaken
     likely = [of_image if one.name == MIRRORED else rules.mistaken for one in mistakes]
     yield from map(Alternative, (one.what for one in mistakes), odds_of_each(mistakes, likely))
-    if others_miss(best, _noise_before(data, best), track.agreed, rules, noise):
-        yield Alternative(APART)
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
     if is_open(best, data.free, rules, noise):
@@ -190,7 +192,34 @@ def of_other_things(data: Frame, judged: ScoredPose) -> float:
 
 def _most_told(data: Frame) -> float:
     """Log odds of a mistake that frames tell at the most."""
-    return -2 * math.log(data.rules.acceptance.mistaken)
+    return 2 * _as_likely_as_not(data)
+
+
+def _of_contradiction(data: Frame, judged: ScoredPose) -> Mistake:
+    """That a sensor is elsewhere or out of step, and nobody knows which: as likely as not.
+
+    From a frame on in which one alone meets the body and another sees as much of it elsewhere, and
+    until two agree.  A pose between them is farther off than chance makes it.
+    """
+    rules, before = data.rules, data.track.mistaken.get(CONTRADICTION, 0.0)
+    accepted, known = rules.acceptance, (data.track.agreed, rules.acceptance, rules.judgement.noise)
+    if others_miss(judged, _noise_before(data, judged), *known):
+        before = _as_likely_as_not(data)
+    elif before and two_agree(judged, accepted, rules.judgement.noise):
+        before = 0.0
+    return Mistake(CONTRADICTION, APART, before, 0.0 if before else -math.inf)
+
+
+def contradicted(data: Frame, verdict: Verdict) -> Verdict:
+    """The same, where a sensor sees the body elsewhere than the best pose has it."""
+    mistaken = data.track.mistaken if verdict.mistaken is None else verdict.mistaken
+    mistaken = {**mistaken, CONTRADICTION: _as_likely_as_not(data)}
+    return replace(verdict, mistaken=mistaken).doubted([Alternative(APART)])
+
+
+def _as_likely_as_not(data: Frame) -> float:
+    """Log odds by frames of a mistake that makes up for how few sessions have it."""
+    return -math.log(data.rules.acceptance.mistaken)
 
 
 def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:

@@ -13,6 +13,7 @@ from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.special import fdtri
 
 from mixpose.fit import Fit, FitRules
@@ -105,9 +106,7 @@ def _with_pairs(
         if not np.count_nonzero(seen.merged):
             break
         weights = welsch(seen.squared, np.maximum(narrow, least))
-        J, offsets = replace(seen, shares=seen.shares * weights).rows()
-        rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-        T = perturb(T, least_squares(rest, free=frame.free)[0])
+        T = _by_least_squares(frame, T, replace(seen, shares=seen.shares * weights))
     return None if T is T_world_object else T
 
 
@@ -141,6 +140,55 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matc
             merged[k], extra[k, pair] = merged[k] + 1, middle**2
             squared[i], squared[:, j] = np.inf, np.inf
     return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra), is_far
+
+
+def all_near(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
+    """Least squares with detections near features that are missed: all errors may be larger now.
+
+    A fit that met most of them to less than noise stays there, and leaves the others out.
+    """
+    seen = judged.matches
+    if judged.left_out or seen.measurements.sum() <= np.count_nonzero(frame.free):
+        return
+    if (near := _with_near(frame, seen)) is not seen:
+        T = _by_least_squares(frame, judged.T_world_object, near)
+        # once more, of what is met there
+        again = _with_near(frame, met_at(frame, Fit(T))[1])
+        yield Start(_by_least_squares(frame, T, again))
+
+
+def _by_least_squares(frame: Frame, T_world_object: Floats, seen: Matches) -> Floats:
+    """The pose (4, 4) that is nearest to what another one meets."""
+    J, offsets = seen.rows()
+    rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
+    return perturb(T_world_object, least_squares(rest, free=frame.free)[0])
+
+
+def _with_near(frame: Frame, seen: Matches) -> Matches:
+    """What a pose meets, and what it nearly does: features missed by detections of none.
+
+    Such a pair is within twice the reach of one that is met: what least squares leave out of as
+    many coordinates as are twice those free is off twice as far.
+    """
+    reach = 2 * math.sqrt(2 * frame.rules.judgement.association.reach_squared)  # in σ_ε
+    lost = (seen.weights > 0) & (seen.shares == 0) & (seen.beside < reach)
+    if not np.count_nonzero(lost):
+        return seen
+    shares, offsets = seen.shares.copy(), seen.offsets.copy()
+    for k in np.flatnonzero(lost.any(axis=1)).tolist():
+        if (points := frame.views[k].observation.points) is None:
+            continue
+        rest = np.setdiff1d(np.arange(len(points)), seen.detections[k])
+        which, m = np.flatnonzero(lost[k]), points.shape[1]
+        away = (points[rest] - seen.places[k, which, None, :m]) / seen.sigmas[k]
+        distances = np.linalg.norm(away, axis=2)
+        for i, j in zip(*linear_sum_assignment(np.minimum(distances, reach))):
+            if distances[i, j] < reach:
+                shares[k, which[i]], offsets[k, which[i], :m] = (
+                    seen.weights[k, which[i]],
+                    away[i, j],
+                )
+    return replace(seen, shares=shares, offsets=offsets)
 
 
 def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
@@ -243,4 +291,4 @@ def _carry(met: Floats, J: Floats, offsets: Floats, rules: FitRules) -> bool:
     return bool(np.vecdot(moved, moved).max() > rules.moved**2)
 
 
-REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, agreed)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, all_near, agreed)

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.special import expit, logit
 
 from mixpose.judgement import (
-    APART,
     Alternative,
     ScoredPose,
     Second,
@@ -27,7 +26,7 @@ from mixpose.judgement import (
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
-from mixpose.tracking.doubt import TWICE, decided
+from mixpose.tracking.doubt import TWICE, contradicted, decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
@@ -54,7 +53,7 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     if others := _may_be_elsewhere(data, best, rest):
         if (apart := _sure_by(data, others)) is not None:
             kept = [*((one, weight / 2) for one, weight in verdict.kept), (apart, 0.5)]
-            return replace(verdict, kept=kept).doubted([Alternative(APART)])
+            return contradicted(data, replace(verdict, kept=kept))
         verdict = replace(verdict, tried=_most_tried(data, others))
     accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
