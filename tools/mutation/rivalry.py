@@ -1,4 +1,4 @@
-"""Mutants of what tells poses of one body apart, of its middle, and of frames told apart."""
+"""Mutants of what tells poses of a body and sensors apart, of its middle, and what is in view."""
 
 from __future__ import annotations
 
@@ -150,5 +150,13 @@ MUTANTS = (
         "return replace(seen, shares=shares)\n\n\ndef agreed",
         "what is nearly met is taken for met exactly",
         ("test_tracking_refinements.py",),
+    ),
+    Mutant(
+        "body-flat-features-are-seen-edge-on",
+        "body/model.py",
+        'return 0.0 if self.shape == "sphere" else EDGE_ON',
+        "return 0.0",
+        "a box whose sides are seen edge-on misses two thirds of its markers",
+        ("test_sensors_facing.py",),
     ),
 )
