@@ -238,7 +238,6 @@ def test_one_function_climbs() -> None:
     # poses that go on by steps of `ascend`, and that of each branch by its velocity
     assert {name for name, loop in loops if "perturb" in called(loop)} == {
         "tracking/in_motion.py:fit_in_motion",
-        "tracking/refinements.py:_with_pairs",
         "tracking/track.py:predict",
     }
     for name, loop in loops:
