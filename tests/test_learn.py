@@ -25,7 +25,6 @@ from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import Eyes, Lesson, by_markers, learn, learn_from, like
-from mixpose.learning.rules import LearningRules
 from mixpose.learning.telling import doubts_of
 from mixpose.rigid import rotation_angle_deg
 from mixpose.sensors import CalibrationError, PinholeCamera
@@ -231,7 +230,7 @@ def test_a_body_that_is_only_shifted_is_learnt_and_turns_are_missed() -> None:
     poses[:, :3, :3] = np.eye(3)
     (found,) = lesson_of([(points, poses)]).bodies
     assert len(found.points) == 5
-    (doubt,) = doubts_of(found, "body.csv", "mm", LearningRules())
+    (doubt,) = doubts_of(found, "body.csv", "mm")
     assert "turned by 0." in doubt
     assert "missing: turns of 30 deg or more about each axis" in doubt
 

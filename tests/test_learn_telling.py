@@ -16,14 +16,13 @@ from mixpose.learning.copies import _never_with, is_chance
 from mixpose.learning.growing import Found, least_met
 from mixpose.learning.placing import Placement, Shape
 from mixpose.learning.points import Cloud, _supported
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector
 from mixpose.sensors import PinholeCamera
 
 POINTS = np.array([[0, 0, 0], [60, 5, 0], [-15, 70, 10], [20, -30, 45], [-40, 10, 80.0]])
-RULES = LearningRules()
 
 
 def learnt(
@@ -58,7 +57,7 @@ def turning(along: float, across: float) -> Floats:
     ],
 )
 def test_turns_that_are_missing_are_named(along: float, across: float, missing: str | None) -> None:
-    told = doubts_of(learnt(turning(along, across)), "body", "mm", RULES)
+    told = doubts_of(learnt(turning(along, across)), "body", "mm")
     if missing is None:
         assert told == []
     else:
@@ -67,7 +66,7 @@ def test_turns_that_are_missing_are_named(along: float, across: float, missing: 
 
 
 def test_markers_that_move_on_the_body_are_told_with_the_key_to_write() -> None:
-    told = doubts_of(learnt(turning(40.0, 20.0), spread=0.456), "body", "mm", RULES)
+    told = doubts_of(learnt(turning(40.0, 20.0), spread=0.456), "body", "mm")
     assert told == ["body: its markers move on it by 0.46 mm: write sigma = 0.46 into its [object]"]
 
 
@@ -87,7 +86,7 @@ def test_markers_that_map_onto_themselves_are_counted(corners: int, ways: str) -
     angles = 2 * np.pi * np.arange(corners) / corners
     ring = np.stack([30 * np.cos(angles), 30 * np.sin(angles), 0 * angles], axis=1)
     axis = np.array([[0, 0, 20.0], [0, 0, -55.0]])
-    told = doubts_of(learnt(turning(40.0, 20.0), np.concatenate([ring, axis])), "body", "mm", RULES)
+    told = doubts_of(learnt(turning(40.0, 20.0), np.concatenate([ring, axis])), "body", "mm")
     assert len(told) == 1
     assert f"onto themselves in {ways}" in told[0]
 
@@ -136,11 +135,11 @@ def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> Non
 def test_four_points_that_no_other_size_has_are_a_body_from_twice_the_least_frames(
     more: int, expected: bool
 ) -> None:
-    rules, points = LearningRules(), np.vstack([np.zeros(3), 50 * np.eye(3)])
+    points = np.vstack([np.zeros(3), 50 * np.eye(3)])
     one = Placement(np.eye(4), np.arange(4), 0.5)
-    places = [(k, one) for k in range(2 * rules.least_frames + more)]
+    places = [(k, one) for k in range(2 * RULES.least_frames + more)]
     body = Found(Shape(points, np.full(4, 0.1)), tuple(places))
-    assert is_chance(body, [], rules) == expected
+    assert is_chance(body, []) == expected
 
 
 def test_of_points_that_are_hardly_ever_seen_together_the_one_seen_less_goes() -> None:
@@ -171,9 +170,9 @@ def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:
 
 def test_a_sensor_that_meets_hardly_any_markers_is_named() -> None:
     body = replace(learnt(turning(30.0, 30.0)), met={"a": 4.0, "b": 5.0, "c": 0.2})
-    (told,) = doubts_of(body, "body.csv", "mm", RULES)
+    (told,) = doubts_of(body, "body.csv", "mm")
     assert told == (
         "body.csv: 'c' meets 0.2 of its markers in a frame, and others 4.5: does it look "
         "elsewhere, or stand elsewhere than the session says?"
     )
-    assert doubts_of(replace(body, met={"a": 4.0, "b": 1.0}), "body.csv", "mm", RULES) == []
+    assert doubts_of(replace(body, met={"a": 4.0, "b": 1.0}), "body.csv", "mm") == []

@@ -27,7 +27,7 @@ from mixpose.records import (
     RawFrame,
     SensorReport,
 )
-from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.selection import Selection
 from mixpose.sensors import CloudSensor, doubted
 from mixpose.threads import one_blas_thread, prompt_switching
 from mixpose.tracking import (
@@ -74,7 +74,7 @@ def run(
     *,
     sources: Mapping[str, str] | None = None,
     opened: Mapping[str, Source] | None = None,
-    selection: Selection = ALL_FRAMES,
+    selection: Selection = Selection(),
     T_start: Floats | Starts | None = None,
     watch: Watch | None = None,
     memory: Memory | None = None,

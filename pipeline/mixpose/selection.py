@@ -12,6 +12,3 @@ class Selection:
     start: int | None = None
     stop: int | None = None
     step: int = 1
-
-
-ALL_FRAMES = Selection()

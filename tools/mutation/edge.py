@@ -8,8 +8,8 @@ _SIMULATION = (
     Mutant(
         "simulation-averted-features-are-seen",
         "simulation/visible_spots.py",
-        "* sensor.towards(points)).sum(axis=-1) > 0)",
-        "* sensor.towards(points)).sum(axis=-1) < 0)",
+        "return sensors.facing(sensor, M,",
+        "return ~sensors.facing(sensor, M,",
         "recordings show the back of the body",
     ),
     Mutant(

@@ -86,8 +86,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "learning/bodies.py",
-        "slack = rules.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())",
-        "slack = rules.gate * np.sqrt(4.0) * np.hypot(others.typical, reference.reach[base].max())",
+        "slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())",
+        "slack = RULES.gate * np.sqrt(4.0) * np.hypot(others.typical, reference.reach[base].max())",
         "only speed: more triples are tried, of which those count whose points are met",
     ),
     Harmless(

@@ -12,7 +12,7 @@ _LEVELS = (
     Mutant(
         "extraction-cut-disks-are-whole",
         "extraction/blob.py",
-        "rim.coverage < rules.whole or rim.residual > rules.exact * residual",
+        "rim.coverage < BLOBS.whole or rim.residual > BLOBS.exact * residual",
         "rim.coverage < 0",
         "what is cut counts as much as what is whole",
         ("test_extraction_deviations.py",),
@@ -28,7 +28,7 @@ _LEVELS = (
     Mutant(
         "extraction-streaks-are-cut",
         "extraction/blob.py",
-        "longer = np.minimum(longer, longer_than_alike(shapes, rules.alike)).tolist()",
+        "longer = np.minimum(longer, longer_than_alike(shapes, BLOBS.alike)).tolist()",
         "pass",
         "spots that are long alike count little beside round things",
         ("test_extraction_deviations.py",),
@@ -36,7 +36,7 @@ _LEVELS = (
     Mutant(
         "extraction-slivers-are-whole",
         "extraction/blob.py",
-        "return rules.rough / math.pow(radius, 1.5)",
+        "return BLOBS.rough / math.pow(radius, 1.5)",
         "return math.inf",
         "what is left of a small spot counts as much as a whole one",
         ("test_extraction_deviations.py",),
@@ -84,7 +84,7 @@ _LEVELS = (
     Mutant(
         "extraction-no-surroundings",
         "extraction/threshold.py",
-        "max(side, rules.min_margin) for side in",
+        "max(side, LEVELS.min_margin) for side in",
         "0 * side for side in",
         "a feature that fills its window is taken for background",
         (_BLOBS,),
@@ -234,7 +234,7 @@ _SADDLES = (
     Mutant(
         "extraction-corners-of-any-symmetry",
         "extraction/corners.py",
-        "crossed &= (crossings == 4) & (symmetry >= rules.symmetry)",
+        "crossed &= (crossings == 4) & (symmetry >= CORNERS.symmetry)",
         "crossed &= crossings == 4",
         "crossings of unlike things count as corners",
         (_CORNERS,),
@@ -285,7 +285,7 @@ _SIZES = (
     Mutant(
         "extraction-disks-that-touch-stay-one",
         "extraction/blobs.py",
-        "    _part_lobes(list(chain(*found)), rules)\n",
+        "    _part_lobes(list(chain(*found)))\n",
         "",
         "spheres that touch in an image are no spheres",
         ("test_extraction_touching.py",),
@@ -293,7 +293,7 @@ _SIZES = (
     Mutant(
         "extraction-an-ellipse-has-a-waist",
         "extraction/blobs.py",
-        "if disk and _may_be_two(disk, rules) and len(_lobes(part, rules)) > 1:",
+        "if disk and _may_be_two(disk) and len(_lobes(part)) > 1:",
         "if False:",
         "two spheres that overlap are one between them",
         ("test_extraction_touching.py",),

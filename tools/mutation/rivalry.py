@@ -90,7 +90,7 @@ MUTANTS = (
     Mutant(
         "learning-frames-turned-over-count",
         "learning/adjusting.py",
-        "return told if len(told) >= rules.least_frames else body.places",
+        "return told if len(told) >= RULES.least_frames else body.places",
         "return body.places",
         "a tool that turns about one axis seems to turn over",
         ("test_learn.py",),

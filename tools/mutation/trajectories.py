@@ -24,8 +24,8 @@ MUTANTS = (
     Mutant(
         "learning-by-few-triples-alone",
         "learning/bodies.py",
-        "least, rules.many_bases)",
-        "least, rules.bases)",
+        "least, RULES.many_bases)",
+        "least, RULES.bases)",
         "a body that shows few of its markers for a while is learnt twice",
         ("test_learn.py",),
     ),

@@ -173,8 +173,8 @@ class _Run:
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
         bundle = self._bundle(part).of_poses
-        before = result.squared_residuals(bundle, self._task.rig, best)
-        after = result.squared_residuals(bundle, best.state.rig, best)
+        _, before = result.fitted(bundle, self._task.rig, best)
+        _, after = result.fitted(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
@@ -184,7 +184,7 @@ class _Run:
                 for block in self._blocks
                 if (fit.undetermined & ~best.undetermined)[block.place].any()
             }
-            found = result.squared_residuals(bundle, fit.state.rig, best)
+            _, found = result.fitted(bundle, fit.state.rig, best)
             for s in sensors:
                 if s not in lost:
                     held[s].append(found[s][folds[best.weighted[s][0].pairs.frame] == fold])

@@ -55,10 +55,5 @@ def _held(bundle: Bundle, found: Adjusted, k: int, step: Floats) -> tuple[Floats
 
     there = moved(found.state.rig, bundle.blocks, step)
     rest, squared = fitted(replace(bundle, gauge=gauge), there, found)
-    return step + rest, _misfit(squared, found)
-
-
-def _misfit(squared: list[Floats], found: Adjusted) -> float:
-    """Sum of squared residuals of what is met, by the noise."""
     pairs = zip(squared, found.noise, strict=True)
-    return float(sum(np.nansum(each) / noise**2 for each, noise in pairs))
+    return step + rest, float(sum(np.nansum(each) / noise**2 for each, noise in pairs))

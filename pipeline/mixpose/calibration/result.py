@@ -91,19 +91,10 @@ class Calibration:
         return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))
 
 
-def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floats]:
-    """Squared residuals (n,) of each sensor's pairs under a rig; NaN of pairs that are not met.
-
-    Poses are fitted to the rig by least squares first, in a bundle without parameters of the rig,
-    so that all rigs are held to the same.
-    """
-    return fitted(bundle, rig, adjusted)[1]
-
-
 def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
-    """How far a bundle's parameters go (G,) from a rig to suit pairs best, and `squared_residuals`.
+    """How far a bundle's parameters go (G,) from a rig to suit pairs best, with poses.
 
-    By least squares, together with poses.
+    And squared residuals (n,) of each sensor's pairs then; NaN of pairs that are not met.
     """
     state, spent, gone = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
     for _ in range(_CLIMBS):

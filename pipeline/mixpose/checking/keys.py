@@ -70,7 +70,10 @@ def advice(
     trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.found - expected)))
     if before > expected:
         trials = [trial for trial in trials if trial.found <= 2 * expected]
-    chosen = _with_the_body(session, number, trials)
+    # the body has to be found for sure: clutter may be ambiguous, too
+    chosen = next(
+        (t for t in trials if estimate_of(anywhere(session), number, t.views).status == "ok"), None
+    )
     if chosen is None and before < expected and trials:
         chosen = trials[0]  # what finds more loses nothing, even where the body cannot be told
     if chosen is not None:
@@ -117,14 +120,6 @@ class _Trial(NamedTuple):
     value: Any
     found: int
     views: list[View]
-
-
-def _with_the_body(session: Session, number: int, trials: Sequence[_Trial]) -> _Trial | None:
-    """The first trial in which the body is found for sure; clutter may be ambiguous, too."""
-    for trial in trials:
-        if estimate_of(anywhere(session), number, trial.views).status == "ok":
-            return trial
-    return None
 
 
 def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:

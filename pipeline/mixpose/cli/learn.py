@@ -10,7 +10,7 @@ from mixpose.cli.notices import say, warn, watched
 from mixpose.cli.output import is_stdout, print_lines, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
-from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
+from mixpose.learning import Learnt, Lesson, by_markers, learn, like
 from mixpose.learning.telling import MARK, doubts_of, lines_of, look_alikes, table_text
 from mixpose.session import Session, load_scene
 from mixpose.session.marker_files import Markers, read_marker_file
@@ -29,11 +29,10 @@ def learn_session(request: LearnRequest) -> None:
     inputs = [path] if request.like is None else [path, request.like]
     refuse_to_overwrite_but(request.output, inputs, MARK)
     older = None if request.like is None else _older(request.like, session)
-    rules = LearningRules()
     if others := [one.name for one in session.sensors if one.sensor.dimension != 2]:
         warn(f"{', '.join(others)}: bodies are learnt from what cameras see, and not from this")
     with watched() as progress:
-        lesson = learn(session, named_sources(request.source or ()), rules, progress)
+        lesson = learn(session, named_sources(request.source or ()), progress)
     bodies = _in_frames(lesson, request, older)
     if len(bodies) > 1 and is_stdout(request.output):
         raise SessionError(
@@ -45,7 +44,7 @@ def learn_session(request: LearnRequest) -> None:
     for file, body in zip(files, bodies, strict=True):
         refuse_to_overwrite_but(file, inputs, MARK)
         write_text(file, table_text(body), "-o")
-    _tell(lesson, bodies, files, session, rules)
+    _tell(lesson, bodies, files, session)
 
 
 def _older(path: Path, session: Session) -> Markers:
@@ -81,11 +80,7 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
 
 
 def _tell(
-    lesson: Lesson,
-    bodies: Sequence[Learnt],
-    files: Sequence[Path],
-    session: Session,
-    rules: LearningRules,
+    lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
     called = [Path("body.csv") if is_stdout(file) else file for file in files]
@@ -99,7 +94,7 @@ def _tell(
     print_lines(lines, *files)
     names = [file.name for file in called]
     pairs = zip(bodies, names, strict=True)
-    doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit, rules)]
+    doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
     for doubt in (*doubts, *look_alikes(bodies, names), *_late_ones(session, bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""

@@ -42,9 +42,12 @@ class BackgroundRules:
     )
 
 
-def background_tiles(image: Grey, rules: BackgroundRules = BackgroundRules()) -> Grey:
+BACKGROUND = BackgroundRules()
+
+
+def background_tiles(image: Grey) -> Grey:
     """Coarse map of the background of an image (H, W): medians of its tiles (rows, columns)."""
-    tile = tile_side(image, rules)
+    tile = tile_side(image)
     rows, v = _sample_places(image.shape[0], tile)
     columns, u = _sample_places(image.shape[1], tile)
     # First rows, then columns: several times as fast as both at once, and two to three times as
@@ -86,12 +89,12 @@ def _about(pixels: slice, tile: int) -> tuple[slice, slice]:
     )
 
 
-def noise_of(image: Grey, rules: BackgroundRules = BackgroundRules()) -> float:
+def noise_of(image: Grey) -> float:
     """Robust standard deviation of a pixel of an image (H, W), shading and features apart."""
-    spacing = rules.noise_spacing
+    spacing = BACKGROUND.noise_spacing
     if image.shape[1] <= 2 * spacing:
         return 0.0 if image.dtype == np.float32 else 1.0
-    tile = tile_side(image, rules)
+    tile = tile_side(image)
     _, v = _sample_places(image.shape[0], tile)
     _, u = _sample_places(image.shape[1] - 2 * spacing, tile)
     places = np.concatenate([u + shift * spacing for shift in range(3)])
@@ -122,10 +125,10 @@ def _counted(deviations: Grey, least: float) -> float:
     return float(counts @ np.arange(counts.size) / counts.sum())
 
 
-def tile_side(image: Grey, rules: BackgroundRules) -> int:
+def tile_side(image: Grey) -> int:
     """About how wide and high a tile is, in px."""
     height, width = image.shape
-    return max(int(min(height, width)) // rules.tiles_per_short_side, rules.min_tile)
+    return max(int(min(height, width)) // BACKGROUND.tiles_per_short_side, BACKGROUND.min_tile)
 
 
 @lru_cache(maxsize=PLACES)

@@ -11,11 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mixpose.constants import constant
-from mixpose.extraction.contours import ContourRules
-from mixpose.extraction.ellipse import EllipseRules, Rim
+from mixpose.extraction.ellipse import Rim
 from mixpose.extraction.shape import longer_than_alike
-from mixpose.extraction.spots import SpotRules
-from mixpose.extraction.threshold import ThresholdRules
 from mixpose.records import Floats
 
 
@@ -23,10 +20,6 @@ from mixpose.records import Floats
 class BlobRules:
     """What a blob is."""
 
-    threshold: ThresholdRules = ThresholdRules()
-    contours: ContourRules = ContourRules()
-    spots: SpotRules = SpotRules()
-    rims: EllipseRules = EllipseRules()
     small_area: float = constant(
         100.0, "px up to which the centroid of grey values is the better centre, above it the rim"
     )
@@ -53,6 +46,9 @@ class BlobRules:
     finest: float = constant(0.01, "px, that this is at least: pixels alone make as much")
 
 
+BLOBS = BlobRules()
+
+
 class Blob(NamedTuple):
     """One blob: centre in pixels of the window, area in px, and the rim of a disk."""
 
@@ -67,13 +63,13 @@ class Blob(NamedTuple):
     size: float | None = None  # px at half of its height, of what has no rim
 
 
-def usually_off(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> float:
+def usually_off(blobs: Sequence[Blob]) -> float:
     """By how much centres of whole blobs seem off for noise, px: the lower quartile."""
     told = sorted([blob.off for blob in blobs if blob.off is not None])
-    return max(told[(len(told) - 1) // 4] if told else 0.0, rules.finest)
+    return max(told[(len(told) - 1) // 4] if told else 0.0, BLOBS.finest)
 
 
-def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRules()) -> Floats:
+def deviations_of(blobs: Sequence[Blob], usual: float) -> Floats:
     """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
 
     A disk of which something is hidden, or that is merged with something, is longer than wide by as
@@ -84,23 +80,23 @@ def deviations_of(blobs: Sequence[Blob], usual: float, rules: BlobRules = BlobRu
     residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
     typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
     longer = [blob.length / typical[0] - 1 for blob in blobs]
-    margins = [_roughness(blob, residual, rules) for blob in blobs]
+    margins = [_roughness(blob, residual) for blob in blobs]
     if any(one > margin for one, margin in zip(longer, margins)):  # as a rule all are round
         shapes = np.array([(blob.area, blob.length, blob.turn) for blob in blobs])
-        longer = np.minimum(longer, longer_than_alike(shapes, rules.alike)).tolist()
+        longer = np.minimum(longer, longer_than_alike(shapes, BLOBS.alike)).tolist()
     for k, (blob, margin) in enumerate(zip(blobs, margins)):
         is_cut_rim = blob.rim is not None and margin < math.inf
-        off, share = blob.off or 0.0, rules.by_rim if is_cut_rim else 1.0
-        shown = share * off if off > rules.usual * usual else 0.0
+        off, share = blob.off or 0.0, BLOBS.by_rim if is_cut_rim else 1.0
+        shown = share * off if off > BLOBS.usual * usual else 0.0
         radius = math.sqrt(blob.area / math.pi)
-        deviations[k] = max(rules.off_centre * radius * (longer[k] - margin), shown)
+        deviations[k] = max(BLOBS.off_centre * radius * (longer[k] - margin), shown)
     return deviations
 
 
-def _roughness(blob: Blob, residual: float, rules: BlobRules) -> float:
+def _roughness(blob: Blob, residual: float) -> float:
     """By how much a whole blob may be longer than others; all of a rim tells by itself."""
     radius, rim = math.sqrt(blob.area / math.pi), blob.rim
     if rim is None:
-        return rules.rough / math.pow(radius, 1.5)
-    is_cut = rim.coverage < rules.whole or rim.residual > rules.exact * residual
-    return 0.0 if radius < rules.large and is_cut else math.inf
+        return BLOBS.rough / math.pow(radius, 1.5)
+    is_cut = rim.coverage < BLOBS.whole or rim.residual > BLOBS.exact * residual
+    return 0.0 if radius < BLOBS.large and is_cut else math.inf

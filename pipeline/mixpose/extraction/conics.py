@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,8 +21,7 @@ SQUARED = 4  # times: of two quotients the larger counts as its 16th power; more
 _LEAST = 1e-3  # px, of a half-axis: points on a line make none
 
 
-@dataclass(frozen=True)
-class Ellipses:
+class Ellipses(NamedTuple):
     """B ellipses in pixel coordinates."""
 
     centre: Floats  # (B, 2)
@@ -42,16 +41,14 @@ class Ellipses:
 
     def select(self, chosen: Mask | NDArray[np.intp]) -> Ellipses:
         """Some of them."""
-        parts = (self.centre, self.half_axes, self.angle, self.sound)
-        return Ellipses(*(part[chosen] for part in parts))  # type: ignore[arg-type]
+        return Ellipses._make(part[chosen] for part in self)
 
     def replaced(self, rows: NDArray[np.intp], others: Ellipses) -> Ellipses:
         """These with others in some rows."""
-        parts = [self.centre.copy(), self.half_axes.copy(), self.angle.copy(), self.sound.copy()]
-        own = [others.centre, others.half_axes, others.angle, others.sound]
-        for part, other in zip(parts, own, strict=True):
+        parts = Ellipses._make(part.copy() for part in self)
+        for part, other in zip(parts, others, strict=True):
             part[rows] = other
-        return Ellipses(*parts)  # type: ignore[arg-type]
+        return parts
 
 
 def together(rows: Sequence[Sequence[float]]) -> Ellipses:
@@ -68,8 +65,7 @@ def none(count: int) -> Ellipses:
 
 def joined(parts: Sequence[Ellipses]) -> Ellipses:
     """Ellipses, and others after them."""
-    each = [(one.centre, one.half_axes, one.angle, one.sound) for one in parts]
-    return Ellipses(*map(np.concatenate, zip(*each)))
+    return Ellipses(*map(np.concatenate, zip(*parts)))
 
 
 def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:

@@ -47,6 +47,9 @@ class ContourRules:
     gap_px: float = constant(2.0, "px more: a pixel lost on each side")
 
 
+CONTOURS = ContourRules()
+
+
 def outlines(scene: Foreground) -> list[Contour]:
     """Outermost contours of what is above the detection level.
 
@@ -124,11 +127,6 @@ def ovals(contours: Sequence[Contour]) -> Ellipses:
     return Ellipses(centres, 2 * np.sqrt(squares) + 0.5, 0.5 * np.arctan2(2 * uv, uu - vv), sound)
 
 
-def is_solid(contour: Contour, least: float) -> bool:
-    """Whether a contour fills so much of its convex hull."""
-    return bool(cv2.contourArea(contour) >= least * cv2.contourArea(cv2.convexHull(contour)))
-
-
 def lobes(contour: Contour, depth: float, least: float) -> list[Contour]:
     """The outlines of things that touch, as waists part their common one; one if it has none.
 
@@ -195,12 +193,10 @@ def on_border(scene: Foreground, box: Box) -> bool:
     return bool(u == 0 or v == 0 or u + width == columns or v + height == rows)
 
 
-def neighbours(
-    contours: Sequence[Contour], rules: ContourRules = ContourRules()
-) -> list[list[int]]:
+def neighbours(contours: Sequence[Contour]) -> list[list[int]]:
     """Groups of contours, by their places, that nearly touch: perhaps parts of one broken rim."""
     near: list[set[int]] = [set() for _ in contours]
-    for k, j, gap in _pairs_by_box(contours, rules) if len(contours) > 1 else ():
+    for k, j, gap in _pairs_by_box(contours) if len(contours) > 1 else ():
         if _are_near(contours[k], contours[j], gap):
             near[k].add(j)
     groups: list[list[int]] = []
@@ -211,9 +207,7 @@ def neighbours(
     return groups
 
 
-def _pairs_by_box(
-    contours: Sequence[Contour], rules: ContourRules
-) -> Iterator[tuple[int, int, float]]:
+def _pairs_by_box(contours: Sequence[Contour]) -> Iterator[tuple[int, int, float]]:
     """Pairs k > j whose boxes are nearer than the gap that is small beside them; with that gap."""
     count = len(contours)
     boxes = np.array([cv2.boundingRect(contour) for contour in contours])
@@ -221,7 +215,7 @@ def _pairs_by_box(
     largest = boxes[:, 2:].max(axis=1)
     for rows in np.array_split(np.arange(count), count // _AT_ONCE + 1):
         off = np.maximum(low[rows, None] - high, low - high[rows, None]).max(axis=2)
-        gaps = rules.gap * np.minimum(largest[rows, None], largest) + rules.gap_px
+        gaps = CONTOURS.gap * np.minimum(largest[rows, None], largest) + CONTOURS.gap_px
         k, j = np.nonzero((off <= gaps) & (np.arange(count) < rows[:, None]))
         yield from zip(rows[k].tolist(), j.tolist(), gaps[k, j].tolist())
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.background import BackgroundRules, Grey, noise_of
-from mixpose.extraction.options import ExtractOptions, check_level
+from mixpose.extraction.background import Grey, noise_of
+from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.quadratic import points_in, stationary_points
 from mixpose.extraction.sampling import sample
 from mixpose.extraction.threshold import Window
@@ -35,7 +35,6 @@ BATCH = 256
 class CornerRules:
     """Which saddles are corners."""
 
-    background: BackgroundRules = BackgroundRules()
     blur: float = constant(
         1.5, "px before the Hessian: enough against noise, little enough for fields of 8 px"
     )
@@ -53,42 +52,44 @@ class CornerRules:
     faint: float = constant(0.2, "of the clearest corner's step, that `auto` keeps")
 
 
-def extract_corners(
-    image: Image, options: ExtractOptions, window: Window, rules: CornerRules = CornerRules()
-) -> PointPattern:
+CORNERS = CornerRules()
+
+
+def extract_corners(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
     """Saddle points of the grey values in a window of an image, as `points_in` has them.
 
     The threshold of the options is "auto", or the least difference of grey between bright and dark
-    fields; corners have neither polarity nor area.  Raises `SessionError` for other thresholds.
+    fields; corners have neither polarity nor area.
     """
-    check_level(options.threshold, "corners", "the least step from bright to dark")
 
     def find(part: Image) -> Floats:
-        if min(part.shape) <= 2 * rules.margin:
+        if min(part.shape) <= 2 * CORNERS.margin:
             return np.empty((0, 2))
-        return _find(part.astype(np.float32), options.threshold, rules)
+        return _find(part.astype(np.float32), options.threshold)
 
     return points_in(image, window, find)
 
 
-def _find(grey: Grey, threshold: str | float, rules: CornerRules) -> Floats:
-    blurred = cv2.GaussianBlur(grey, (0, 0), rules.blur, borderType=cv2.BORDER_REPLICATE)
+def _find(grey: Grey, threshold: str | float) -> Floats:
+    blurred = cv2.GaussianBlur(grey, (0, 0), CORNERS.blur, borderType=cv2.BORDER_REPLICATE)
     # Rings are sampled with little blur only, as they are thin; single pixels are noisy.
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)
-    rough, steps = _peaks(blurred, rules)
+    rough, steps = _peaks(blurred)
     order = np.argsort(-steps, kind="stable")
-    order = order[steps[order] > rules.noise_factor * noise_of(grey, rules.background)]
+    order = order[steps[order] > CORNERS.noise_factor * noise_of(grey)]
     corners, clearest = [np.empty((0, 2))], 0.0
     for first in range(0, len(order), BATCH):
         # The clearest first: what is too faint beside them need not be looked at.
         batch = order[first : first + BATCH]
-        batch = batch[steps[batch] >= rules.faint * clearest]
-        fitted_corners, fitted = stationary_points(blurred, rough[batch], _is_saddle)
-        crossed, differences = _four_fields(smooth, fitted_corners, rules)
+        batch = batch[steps[batch] >= CORNERS.faint * clearest]
+        fitted_corners, fitted = stationary_points(
+            blurred, rough[batch], lambda uu, uv, vv: 4 * uu * vv - uv * uv < 0
+        )
+        crossed, differences = _four_fields(smooth, fitted_corners)
         if isinstance(threshold, str):
             found_steps = steps[batch][fitted][crossed]
             clearest = max(clearest, found_steps.max(initial=0.0))
-            corners.append(fitted_corners[crossed][found_steps >= rules.faint * clearest])
+            corners.append(fitted_corners[crossed][found_steps >= CORNERS.faint * clearest])
         else:
             corners.append(fitted_corners[crossed & (differences >= threshold)])
     return np.concatenate(corners)
@@ -102,14 +103,14 @@ def saddle_strength(blurred: Grey) -> Grey:
     return np.asarray(cv2.subtract(cv2.multiply(d_uv, d_uv), cv2.multiply(d_uu, d_vv)))
 
 
-def _peaks(blurred: Grey, rules: CornerRules) -> tuple[Floats, Floats]:
+def _peaks(blurred: Grey) -> tuple[Floats, Floats]:
     """Places (n, 2) of the clearest saddles about, away from the border, and their steps (n,).
 
     A step is the difference of grey between the fields of a sharp corner that would make such a
     saddle.  The work is done in bands of rows, which stay in the cache: 1.9 ms of 640 x 512 px,
     where `skimage.feature.peak_local_max` finds the same in 130 ms.
     """
-    margin, spacing = rules.margin, rules.spacing
+    margin, spacing = CORNERS.margin, CORNERS.spacing
     box = np.ones((2 * spacing + 1, 2 * spacing + 1), np.uint8)
     height, width = blurred.shape
     columns = np.s_[margin : width - margin]
@@ -126,24 +127,17 @@ def _peaks(blurred: Grey, rules: CornerRules) -> tuple[Floats, Floats]:
         places.append(np.stack([u + margin, v + top], axis=-1))
         strengths.append(strength[v, u])
     # Between fields of grey ±c/2 the mixed second derivative at the corner is c / (π σ²).
-    steps = math.pi * rules.blur**2 * np.sqrt(np.concatenate(strengths).astype(np.float64))
+    steps = math.pi * CORNERS.blur**2 * np.sqrt(np.concatenate(strengths).astype(np.float64))
     return np.concatenate(places).astype(np.float64), steps
 
 
-def _is_saddle(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
-    """Whether quadratics with these coefficients of u², uv and v² are saddles."""
-    return 4 * uu * vv - uv * uv < 0
-
-
-def _four_fields(
-    smooth: Grey, corners: Floats, rules: CornerRules
-) -> tuple[NDArray[np.bool_], Floats]:
+def _four_fields(smooth: Grey, corners: Floats) -> tuple[NDArray[np.bool_], Floats]:
     """Whether four fields meet at corners (n, 2), and the step of grey between them (n,)."""
     angles = np.arange(RING_SAMPLES) * (2 * np.pi / RING_SAMPLES)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     crossed = np.ones(len(corners), dtype=np.bool_)
     difference = np.zeros(len(corners))
-    for radius in rules.ring_radii:
+    for radius in CORNERS.ring_radii:
         samples = sample(smooth, corners[:, None] + radius * ring)
         low, high = samples.min(axis=1, initial=np.inf), samples.max(axis=1, initial=-np.inf)
         bright = samples > ((low + high) / 2)[:, None]
@@ -151,6 +145,6 @@ def _four_fields(
         around = samples - samples.mean(axis=1, keepdims=True)
         even = around + np.roll(around, RING_SAMPLES // 2, axis=1)
         symmetry = (even**2).sum(axis=1) / np.maximum(4 * (around**2).sum(axis=1), 1e-12)
-        crossed &= (crossings == 4) & (symmetry >= rules.symmetry)
+        crossed &= (crossings == 4) & (symmetry >= CORNERS.symmetry)
         difference = high - low
     return crossed, difference

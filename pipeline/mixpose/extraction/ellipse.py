@@ -15,7 +15,7 @@ hole are not found.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -79,6 +79,9 @@ class EllipseRules:
     hidden_arcs: int = constant(8, "arcs, of which three that follow each other may be hidden")
 
 
+RIMS = EllipseRules()
+
+
 class Rim(NamedTuple):
     """An ellipse found in an image, in px, as `conics.together` takes it."""
 
@@ -109,11 +112,11 @@ class Rims:
             own[rows] = values
         return Rims(self.ellipses.replaced(rows, others.ellipses), *numbers)
 
-    def are_good(self, rules: EllipseRules = EllipseRules()) -> Mask:
+    def are_good(self) -> Mask:
         """Which (B,) are ellipses."""
         minor, major = np.sort(self.ellipses.half_axes, axis=1).T
-        least = np.where(major < rules.long * minor, rules.coverage, rules.long_coverage)
-        near = self.residual <= tolerance(minor, rules) / 2
+        least = np.where(major < RIMS.long * minor, RIMS.coverage, RIMS.long_coverage)
+        near = self.residual <= tolerance(minor) / 2
         return np.asarray(self.ellipses.sound & (self.coverage >= least) & near)
 
     def each(self, chosen: Indices) -> list[Rim]:
@@ -130,38 +133,37 @@ def find_rims(
     outlines: Sequence[Contour],
     contrasts: Floats,
     ovals: Ellipses,
-    rules: EllipseRules = EllipseRules(),
 ) -> Rims:
     """The elliptical rims of bright features, by their outlines in pixels of signals (H, W).
 
     `which` (B,) is the signal of each; an edge is a step of at least `contrasts` (B,).  Where
     outlines are sound `ovals` (B), rims are looked for at these.
     """
-    ellipses = _begun(outlines, ovals, rules)
+    ellipses = _begun(outlines, ovals)
     rims, again = Rims(ellipses, *np.zeros((4, len(outlines)))), ellipses.sound
     # Roughly first, then from the better ellipse, which has all of a soft or broken rim in reach.
-    for least in (rules.coverage / 2, rules.coverage):
+    for least in (RIMS.coverage / 2, RIMS.coverage):
         found = np.flatnonzero(again)
         if not found.size:
             break
         at = signals, which[found], rims.ellipses.select(found), contrasts[found]
-        rims = rims.replaced(found, _rims_near(*at, least, rules))
+        rims = rims.replaced(found, _rims_near(*at, least))
         # most are near enough at once
-        is_near = rims.are_good(rules) & (rims.moved <= rules.min_reach / 2)
+        is_near = rims.are_good() & (rims.moved <= RIMS.min_reach / 2)
         again = rims.ellipses.sound & ~is_near
     return rims
 
 
-def _begun(outlines: Sequence[Contour], ovals: Ellipses, rules: EllipseRules) -> Ellipses:
+def _begun(outlines: Sequence[Contour], ovals: Ellipses) -> Ellipses:
     """The ellipses near which rims are looked for: ovals, else those through hulls."""
     minor, major = np.sort(ovals.half_axes, axis=1).T
-    rest = np.flatnonzero(~(ovals.sound & (minor >= rules.oblique * major)))
+    rest = np.flatnonzero(~(ovals.sound & (minor >= RIMS.oblique * major)))
     if not rest.size:
         return ovals
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hulls = [cv2.convexHull(outlines[k])[:, 0] for k in rest.tolist()]
-    return ovals.replaced(rest, fit_ellipses(*_side_by_side(hulls), rules)[0])
+    return ovals.replaced(rest, fit_ellipses(*_side_by_side(hulls))[0])
 
 
 def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
@@ -174,94 +176,83 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signals: Sequence[Grey],
-    which: Indices,
-    others: Ellipses,
-    contrasts: Floats,
-    least: float,
-    rules: EllipseRules,
+    signals: Sequence[Grey], which: Indices, others: Ellipses, contrasts: Floats, least: float
 ) -> Rims:
     """Rims through the edges near other ellipses.
 
     Those that have edges in less than a share `least` of the directions are not fitted.
     """
-    edges, found, steps, lows, off = _edges(signals, which, others, contrasts, rules)
+    edges, found, steps, lows, off = _edges(signals, which, others, contrasts)
     found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
-    dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
-    enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
-    better, distance = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
-    within = tolerance(better.half_axes.min(axis=1), rules)
+    dark = found & (light <= RIMS.lit * _medians(steps, found)[:, None])
+    enough = dark.sum(axis=1) >= RIMS.dark * found.sum(axis=1)
+    better, distance = fit_ellipses(edges, np.where(enough[:, None], dark, found))
+    within = tolerance(better.half_axes.min(axis=1))
     on_rim = found & (distance <= within[:, None]) & better.sound[:, None]
     count = on_rim.sum(axis=1)
     squares = np.where(on_rim, distance, 0.0) ** 2
     residual = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
-    better = replace(better, sound=better.sound & (count > 0))
+    better = better._replace(sound=better.sound & (count > 0))
     moved = np.where(on_rim, np.abs(off), 0.0).max(axis=1)
     return Rims(better, count / DIRECTIONS, residual, _medians(steps, on_rim), moved)
 
 
 def are_waisted(
-    signals: Sequence[Grey],
-    which: Indices,
-    ellipses: Ellipses,
-    contrasts: Floats,
-    rules: EllipseRules = EllipseRules(),
+    signals: Sequence[Grey], which: Indices, ellipses: Ellipses, contrasts: Floats
 ) -> Mask:
     """Which ellipses (B,) are long and two spots that touch: dim in the middle, but not hollow.
 
     They are as high as the signal steps at the rim by `contrasts` (B,), or higher inside.
     """
     axes, waisted = ellipses.half_axes, np.zeros(len(which), dtype=np.bool_)
-    own = np.flatnonzero(axes.max(axis=1) >= rules.long * axes.min(axis=1))
+    own = np.flatnonzero(axes.max(axis=1) >= RIMS.long * axes.min(axis=1))
     if not own.size:
         return waisted
     directions = turns(ellipses.angle[own]).swapaxes(1, 2) * axes[own, :, None]
     order = np.argsort(-axes[own], axis=1, kind="stable")[..., None]
-    along = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, rules.waist], [0.0, -rules.waist]])
+    along = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, RIMS.waist], [0.0, -RIMS.waist]])
     places = ellipses.centre[own, None] + along @ np.take_along_axis(directions, order, axis=1)
     lines = places.transpose(2, 0, 1), np.zeros((2, *places.shape[:2])), np.zeros(1)
     middle, *ends = sample_each(signals, which[own], *lines)[0].T
     (low, high), (left, right) = np.sort(ends[:2], axis=0), np.sort(ends[2:], axis=0)
     height = np.maximum(high - left, contrasts[own])
-    waisted[own] = (low - middle > rules.dip * height) & (middle - right > rules.ridge * height)
+    waisted[own] = (low - middle > RIMS.dip * height) & (middle - right > RIMS.ridge * height)
     return waisted
 
 
-def tolerance(minor: Any, rules: EllipseRules) -> Any:
+def tolerance(minor: Any) -> Any:
     """Distance in px within which an edge counts as on an ellipse of this minor half-axis."""
     # A tenth of small ones, whose shape pixels blur; of large ones what print and lens bend.
-    return np.maximum(rules.tolerance, np.maximum(np.minimum(0.1 * minor, 1.0), 0.02 * minor))
+    return np.maximum(RIMS.tolerance, np.maximum(np.minimum(0.1 * minor, 1.0), 0.02 * minor))
 
 
-def fit_ellipses(
-    points: Floats, there: Mask, rules: EllipseRules = EllipseRules()
-) -> tuple[Ellipses, Floats]:
+def fit_ellipses(points: Floats, there: Mask) -> tuple[Ellipses, Floats]:
     """Ellipses through those of points (B, n, 2), in order along each, that are there (B, n).
 
     Some may lie elsewhere.  Sound but for less than six points, or where they are on no ellipse.
     With the distances (B, n) of points from them.
     """
-    best = fit_conics(points, there, rules.oblique)
+    best = fit_conics(points, there, RIMS.oblique)
     distance, spread = _spreads(best, points, there)
     used = there.copy()
-    doubtful = np.flatnonzero(~(spread < rules.spread) & (there.sum(axis=1) >= FEWEST))
+    doubtful = np.flatnonzero(~(spread < RIMS.spread) & (there.sum(axis=1) >= FEWEST))
     if doubtful.size:
-        tried, better = _without_an_arc(points[doubtful], there[doubtful], spread[doubtful], rules)
+        tried, better = _without_an_arc(points[doubtful], there[doubtful], spread[doubtful])
         best = best.replaced(doubtful[better], tried)
         used[doubtful[better]] = False
         distance, spread = _spreads(best, points, there)
-    hopeless = spread > rules.spread + rules.hopeless * best.half_axes.min(axis=1)
-    best = replace(best, sound=best.sound & ~hopeless)
+    hopeless = spread > RIMS.spread + RIMS.hopeless * best.half_axes.min(axis=1)
+    best = best._replace(sound=best.sound & ~hopeless)
     rows = np.flatnonzero(best.sound)
     for _ in range(REFITS):
         # those whose points stay the same are done
-        near = there[rows] & (distance[rows] <= np.maximum(rules.spread, 3 * spread[rows])[:, None])
+        near = there[rows] & (distance[rows] <= np.maximum(RIMS.spread, 3 * spread[rows])[:, None])
         changed = (near != used[rows]).any(axis=1)
         rows, near = rows[changed], near[changed]
         if not rows.size:
             break
-        refitted = fit_conics(points[rows], near, rules.oblique)
+        refitted = fit_conics(points[rows], near, RIMS.oblique)
         best, used[rows] = best.replaced(rows, refitted), near
         distance[rows], spread[rows] = _spreads(refitted, points[rows], there[rows])
         rows = rows[refitted.sound]
@@ -274,15 +265,13 @@ def _spreads(ellipses: Ellipses, points: Floats, there: Mask) -> tuple[Floats, F
     return distance, np.where(ellipses.sound, _medians(distance, there), np.inf)
 
 
-def _without_an_arc(
-    points: Floats, there: Mask, spread: Floats, rules: EllipseRules
-) -> tuple[Ellipses, Mask]:
+def _without_an_arc(points: Floats, there: Mask, spread: Floats) -> tuple[Ellipses, Mask]:
     """Ellipses through all points but those of an arc that may be hidden.
 
     Of several arcs that is the first that leaves an ellipse as near to the points as asked for,
     else the nearest.  Those nearer to the points (B, n, 2) than what is there already, and which.
     """
-    arcs = rules.hidden_arcs
+    arcs = RIMS.hidden_arcs
     counts = there.sum(axis=1)[:, None]
     # places along each ellipse
     order = np.cumsum(there, axis=1) - 1
@@ -291,9 +280,9 @@ def _without_an_arc(
     ahead = (order[:, None] - first[:, :, None]) % counts[:, :, None]
     parts = there[:, None] & (ahead < shown[:, :, None])
     around = np.repeat(points, arcs, axis=0)
-    tried = fit_conics(around, parts.reshape(len(around), -1), rules.oblique)
+    tried = fit_conics(around, parts.reshape(len(around), -1), RIMS.oblique)
     spreads = _spreads(tried, around, np.repeat(there, arcs, axis=0))[1].reshape(-1, arcs)
-    good = spreads < rules.spread
+    good = spreads < RIMS.spread
     chosen = np.where(good.any(axis=1), good.argmax(axis=1), spreads.argmin(axis=1))
     rows = np.arange(len(points))
     better = spreads[rows, chosen] < spread
@@ -308,11 +297,7 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 
 def _edges(
-    signals: Sequence[Grey],
-    which: Indices,
-    ellipses: Ellipses,
-    contrasts: Floats,
-    rules: EllipseRules,
+    signals: Sequence[Grey], which: Indices, ellipses: Ellipses, contrasts: Floats
 ) -> tuple[Floats, Mask, Floats, Floats, Floats]:
     """Edges (B, n, 2) along the normals of ellipses, to parts of a pixel, in n directions.
 
@@ -327,7 +312,7 @@ def _edges(
     length = np.sqrt((b * x) ** 2 + (a * y) ** 2)
     x, y = b * x / length, a * y / length
     normals = np.array([c * x - s * y, s * x + c * y])
-    reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
+    reach = np.clip(RIMS.reach * ellipses.half_axes.min(axis=1), RIMS.min_reach, RIMS.max_reach)
     reach = reach.astype(np.intp)
     where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
     for whole in sorted(set(reach.tolist())):

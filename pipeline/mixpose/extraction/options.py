@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mixpose.errors import SessionError
-
 
 @dataclass(frozen=True)
 class ExtractOptions:
@@ -23,12 +21,3 @@ class ExtractOptions:
     # profiles, as `sigma`; 0 where it is much smaller. Width of the spots that "log" looks for, px;
     # 0 for 3.
     spot_sigma: float = 0.0
-
-
-def check_level(threshold: str | float, method: str, meaning: str) -> None:
-    """Refuse, by `SessionError`, thresholds but "auto" and a grey level, with its meaning there."""
-    if isinstance(threshold, str) and threshold != "auto":
-        raise SessionError(
-            f"extract.threshold: {threshold!r} does not go with method {method!r};"
-            f' allowed are "auto" and a grey level, {meaning}'
-        )

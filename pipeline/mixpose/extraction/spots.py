@@ -38,6 +38,9 @@ class SpotRules:
     prominence_noise_factor: float = constant(4.0, "the same, of the noise")
 
 
+SPOTS = SpotRules()
+
+
 class Spot(NamedTuple):
     """What is found of a small blob."""
 
@@ -47,13 +50,7 @@ class Spot(NamedTuple):
     size: float  # px at half of its height
 
 
-def find_spots(
-    scene: Foreground,
-    contour: Contour,
-    area: float,
-    level: float,
-    rules: SpotRules = SpotRules(),
-) -> list[Spot]:
+def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Spot]:
     """The spot of a small blob, or those of blobs that touch in it.
 
     The contour encloses `area` px that are above the level.  There is none if the border of the
@@ -65,25 +62,25 @@ def find_spots(
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1] - scene.zero
     if highest < scene.least_peak or on_border(scene, box):
         return []
-    patch, corner = signal_about(scene, box, rules.margin)
+    patch, corner = signal_about(scene, box, SPOTS.margin)
     base = background(patch)
     # The usual blob has the patch for itself, and nothing else there needs to be masked.
     alone = np.count_nonzero(patch > level) == area
     inside = None if alone else filled(contour, patch.shape, corner)
     peak = cv2.minMaxLoc(patch, inside)[1]
-    if scene.judged and peak - base < rules.min_step * peak:
+    if scene.judged and peak - base < SPOTS.min_step * peak:
         return []
-    if scene.judged and peak - level < rules.prominence * peak:
+    if scene.judged and peak - level < SPOTS.prominence * peak:
         return []
     base = min(base, level)
-    parts = come_apart(scene, contour, patch, inside, level, rules)
+    parts = come_apart(scene, contour, patch, inside, level)
     own = patch if inside is None else patch * inside
     size = float(areas_at_half(own[None], np.array([base]), np.array([peak]))[0])
     spots = []
     whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or whole:
         top = cv2.minMaxLoc(patch, part)[1] if parts else peak
-        cut = max(valley, base + rules.centroid * (top - base))
+        cut = max(valley, base + SPOTS.centroid * (top - base))
         weights = np.maximum(patch - np.float32(cut), 0)
         if part is not None:
             weights *= part
@@ -102,7 +99,6 @@ def come_apart(
     patch: NDArray[np.float32],
     inside: NDArray[np.uint8] | None,
     level: float,
-    rules: SpotRules,
 ) -> list[tuple[NDArray[np.uint8], float]]:
     """Masks (h, w) of the parts of a long blob that come apart at a higher level, with that level.
 
@@ -113,28 +109,28 @@ def come_apart(
     one 2.5 times brighter: 16 of 30 to 26) in three times the time, and a photograph of 8
     megapixels takes it more than a minute.
     """
-    if not (scene.judged and is_long(contour, rules)):
+    if not (scene.judged and is_long(contour)):
         return []
     signal = patch if inside is None else patch * inside
-    least_rise = rules.prominence_noise_factor * scene.noise
-    highest = (1 - rules.prominence) * float(signal.max())
-    while (level := level * rules.level_ratio) < highest:
+    least_rise = SPOTS.prominence_noise_factor * scene.noise
+    highest = (1 - SPOTS.prominence) * float(signal.max())
+    while (level := level * SPOTS.level_ratio) < highest:
         count, labels = cv2.connectedComponents((signal > level).view(np.uint8))
-        if not 2 < count <= rules.max_parts + 1:
+        if not 2 < count <= SPOTS.max_parts + 1:
             continue
         parts = [(labels == k).view(np.uint8) for k in range(1, count)]
         tops = [cv2.minMaxLoc(signal, part)[1] for part in parts]
         prominent = [
             (part, level)
             for part, top in zip(parts, tops, strict=True)
-            if top >= scene.least_peak and top - level >= max(rules.prominence * top, least_rise)
+            if top >= scene.least_peak and top - level >= max(SPOTS.prominence * top, least_rise)
         ]
         if len(prominent) > 1:
             return prominent
     return []
 
 
-def is_long(contour: Contour, rules: SpotRules) -> bool:
+def is_long(contour: Contour) -> bool:
     """Whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
-    return bool(max(a, b) + 1 > rules.long * (min(a, b) + 1))
+    return bool(max(a, b) + 1 > SPOTS.long * (min(a, b) + 1))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import (
-    BackgroundRules,
     Grey,
     background_tiles,
     noise_of,
@@ -41,7 +40,6 @@ STEPS = 65535
 class ThresholdRules:
     """The level above which something counts."""
 
-    background: BackgroundRules = BackgroundRules()
     min_margin: int = constant(
         64, "px around a window that are looked at at least, to know its background: four tiles"
     )
@@ -68,6 +66,9 @@ class ThresholdRules:
         "how far Sauvola's level is from an even mean, of what is left up to the brightest pixel: "
         "0.2 to 0.5 are in use (Sauvola and Pietikäinen 2000); the lower finds more of what is dim",
     )
+
+
+LEVELS = ThresholdRules()
 
 
 @dataclass(frozen=True)
@@ -105,62 +106,52 @@ def above(signal: Grey, level: float) -> NDArray[np.uint8]:
     return np.asarray(signal > min(whole, _highest(signal))).view(np.uint8)
 
 
-def foreground(
-    image: Image,
-    options: ExtractOptions,
-    window: Window,
-    rules: ThresholdRules = ThresholdRules(),
-) -> Foreground:
+def foreground(image: Image, options: ExtractOptions, window: Window) -> Foreground:
     """Take the background out of a window and choose the level for its features.
 
     The window is within the image, and not empty.
     """
-    bright, inner, threshold = _bright(image, options, window, rules)
-    noise = noise_of(bright, rules.background)
+    bright, inner, threshold = _bright(image, options, window)
+    noise = noise_of(bright)
     if threshold == "otsu" or not isinstance(threshold, str):
         grey = bright[inner]
         level = _otsu(grey) if isinstance(threshold, str) else threshold
         return Foreground(grey, 0.0, level, noise, 0.0, judged=False, tops=grey.max(axis=1))
     local = threshold in ("local", "sauvola")
-    grey, zero = _without_background(bright, inner, noise, rules, local=local)
+    grey, zero = _without_background(bright, inner, noise, local=local)
     tops = grey.max(axis=1)
     if threshold in ("li", "triangle"):
-        level = max(rules.noise_factor * noise, _histogram_level(grey, threshold) - zero)
-        least_peak = max(rules.peak_noise_factor * noise, level)
+        level = max(LEVELS.noise_factor * noise, _histogram_level(grey, threshold) - zero)
+        least_peak = max(LEVELS.peak_noise_factor * noise, level)
         return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
     peak = _peak(grey, tops) - zero
-    level = max(rules.noise_factor * noise, rules.faint * peak)
-    least_peak = max(rules.peak_noise_factor * noise, rules.peak * peak)
+    level = max(LEVELS.noise_factor * noise, LEVELS.faint * peak)
+    least_peak = max(LEVELS.peak_noise_factor * noise, LEVELS.peak * peak)
     if threshold == "sauvola":
         # What Sauvola's level takes off beyond the detection level.
-        beyond = np.maximum(_sauvola_above_mean(bright, rules)[inner] - np.float32(level), 0)
+        beyond = np.maximum(_sauvola_above_mean(bright)[inner] - np.float32(level), 0)
         grey = grey.astype(np.float32) - beyond
         tops = grey.max(axis=1)
     return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
 
 
-def feature_values(
-    image: Image,
-    options: ExtractOptions,
-    window: Window,
-    rules: ThresholdRules = ThresholdRules(),
-) -> NDArray[np.float32]:
+def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDArray[np.float32]:
     """Grey values (v1 - v0, u1 - u0) of the features in a window without the background, else 0.
 
     Down to zero as far beside the level as spots of `spot_sigma` reach: without its tails a pair
     that overlaps looks closer together than it is.
     """
-    found = foreground(image, options, window, rules)
+    found = foreground(image, options, window)
     grey, zero = found.grey, found.zero
     if not found.judged:
-        bright, inner, _ = _bright(image, options, window, rules)
-        grey, zero = _without_background(bright, inner, found.noise, rules, local=False)
+        bright, inner, _ = _bright(image, options, window)
+        grey, zero = _without_background(bright, inner, found.noise, local=False)
     values = np.zeros(grey.shape, np.float32)
     # Rows without features are left alone: most of a frame has none.
     rows = np.flatnonzero(above(found.tops, found.zero + found.level))
     signal = grey[rows].astype(np.float32) - np.float32(zero)
     values[rows] = np.maximum(signal, 0) * above(found.grey[rows], found.zero + found.level)
-    reach = math.ceil(rules.tail * options.spot_sigma)
+    reach = math.ceil(LEVELS.tail * options.spot_sigma)
     if reach and len(rows):
         near = cv2.dilate((values > 0).astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8))
         values = np.maximum(grey.astype(np.float32) - np.float32(zero), 0) * near
@@ -168,7 +159,7 @@ def feature_values(
 
 
 def _bright(
-    image: Image, options: ExtractOptions, window: Window, rules: ThresholdRules
+    image: Image, options: ExtractOptions, window: Window
 ) -> tuple[Grey, tuple[slice, slice], str | float]:
     """Surroundings of a window with features bright, the window in them, and the threshold.
 
@@ -177,7 +168,7 @@ def _bright(
     """
     u0, v0, u1, v1 = window
     height, width = image.shape
-    u_margin, v_margin = (max(side, rules.min_margin) for side in (u1 - u0, v1 - v0))
+    u_margin, v_margin = (max(side, LEVELS.min_margin) for side in (u1 - u0, v1 - v0))
     left, top = max(u0 - u_margin, 0), max(v0 - v_margin, 0)
     near = image[top : min(v1 + v_margin, height), left : min(u1 + u_margin, width)]
     inner = np.s_[v0 - top : v1 - top, u0 - left : u1 - left]
@@ -200,18 +191,13 @@ def _highest(grey: Grey) -> int | float:
 
 
 def _without_background(
-    bright: Grey,
-    inner: tuple[slice, slice],
-    noise: float,
-    rules: ThresholdRules,
-    *,
-    local: bool,
+    bright: Grey, inner: tuple[slice, slice], noise: float, *, local: bool
 ) -> tuple[Grey, float]:
     """Grey values of the inner part with an even background, and the grey value of that."""
     if local:
-        side = _local_box(bright, rules)
+        side = _local_box(bright)
         return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side)))[inner], 0.0
-    tiles = background_tiles(bright, rules.background)
+    tiles = background_tiles(bright)
     ascending = np.sort(tiles, axis=None)
     low, high = float(ascending[0]), float(ascending[-1])
     if high - low <= 2 * noise:
@@ -241,13 +227,13 @@ def _shared(rows: Grey) -> np.number[Any]:
     return cast("np.number[Any]", cv2.min(rows[:, :-1], rows[:, 1:]).max())
 
 
-def _local_box(bright: Grey, rules: ThresholdRules) -> int:
+def _local_box(bright: Grey) -> int:
     """Side in px of the box that a pixel is compared with."""
     shorter = int(min(bright.shape))
-    return max(round(shorter * rules.local_box), 3) // 2 * 2 + 1
+    return max(round(shorter * LEVELS.local_box), 3) // 2 * 2 + 1
 
 
-def _sauvola_above_mean(bright: Grey, rules: ThresholdRules) -> Grey:
+def _sauvola_above_mean(bright: Grey) -> Grey:
     """By how much the level of Sauvola and Pietikäinen is above the local mean, per pixel.
 
     Their rule is for dark print: ``m (1 + k (s / r - 1))`` with the mean m and the standard
@@ -260,8 +246,8 @@ def _sauvola_above_mean(bright: Grey, rules: ThresholdRules) -> Grey:
     if low == high:
         return np.zeros(bright.shape, np.float32)
     turned = np.float32(high) - bright.astype(np.float32)
-    side = _local_box(bright, rules)
-    level = threshold_sauvola(turned, side, k=rules.sauvola_k, r=(high - low) / 2)
+    side = _local_box(bright)
+    level = threshold_sauvola(turned, side, k=LEVELS.sauvola_k, r=(high - low) / 2)
     return np.asarray(cv2.boxFilter(turned, -1, (side, side)) - level, dtype=np.float32)
 
 

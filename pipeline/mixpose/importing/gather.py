@@ -38,17 +38,8 @@ class Imported:
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
     """Read calibration files and files of bodies, which are told by their ending.
 
-    Parameters
-    ----------
-    unit : Unit
-        Wanted.
-    lengths : Unit or None
-        Unit of translations in files whose format does not fix it; None where nobody says.
-
-    Raises
-    ------
-    SessionError
-        In one line, if a file cannot be read or files contradict each other.
+    Lengths are wanted in `unit`; `lengths` is that of translations in files whose format does not
+    fix it. Raises SessionError if a file cannot be read or files contradict each other.
     """
     bodies = [path for path in paths if path.suffix.lower() in _TABLES]
     try:
@@ -63,7 +54,7 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             "import: found no calibration file among the files; allowed: at least one, beside "
             f"bodies ({', '.join(_TABLES)})"
         )
-    placed = [rig for rig in rigs if rig.is_placed]
+    placed = [rig for rig in rigs if any(one.T_camera_rig is not None for one in rig.cameras)]
     if len(placed) > 1:
         raise SessionError(
             f"{placed[1].files[0]}: its cameras stand in another world than those of "

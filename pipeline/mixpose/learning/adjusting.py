@@ -18,7 +18,7 @@ from mixpose.calibration.rig import State, blocks_of
 from mixpose.learning.growing import Found, Places, only_once, usual_reach
 from mixpose.learning.placing import FEWEST, body_of
 from mixpose.learning.points import Cloud
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
 from mixpose.sensors import CalibrationError
@@ -78,9 +78,7 @@ class Learnt:
         )
 
 
-def adjusted(
-    bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes, rules: LearningRules
-) -> list[Learnt]:
+def adjusted(bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes) -> list[Learnt]:
     """Adjust bodies one by one, each by the detections that belong to no other.
 
     Markers of which too few frames are left are dropped; bodies with fewer than three, too.  What
@@ -88,13 +86,13 @@ def adjusted(
     """
     learnt = []
     for body in bodies:
-        frames, poses = _frames_of(body, bodies, clouds, eyes, rules)
+        frames, poses = _frames_of(body, bodies, clouds, eyes)
         points = body.shape.points
         while len(points) >= FEWEST:
             found = _adjusted(points, frames, poses, eyes)
             seen = _seen(found, len(points), len(frames))
-            kept = seen >= max(rules.least_frames, rules.least_share * len(frames))
-            near = rules.alike * rules.gate * usual_reach(body.places, clouds)
+            kept = seen >= max(RULES.least_frames, RULES.least_share * len(frames))
+            near = RULES.alike * RULES.gate * usual_reach(body.places, clouds)
             kept &= only_once(found.state.rig.points, seen, np.full(len(points), near))
             if kept.all():
                 rig, blocks = found.state.rig, found.covariance.reshape(len(points), 3, -1, 3)
@@ -139,7 +137,7 @@ def as_symmetric(learnt: Learnt, reach: float) -> Learnt:
 
 
 def _frames_of(
-    body: Found, bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes, rules: LearningRules
+    body: Found, bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes
 ) -> tuple[tuple[SeenFrame, ...], Floats]:
     """What sensors saw of a body in the frames that tell most of it; and its poses there."""
     taken: dict[int, list[tuple[object, Indices]]] = {}
@@ -148,28 +146,28 @@ def _frames_of(
             own = clouds[k].detections[one.there]
             taken.setdefault(k, []).append((one, own))
     frames, poses = list[SeenFrame](), dict[int, Floats]()
-    for k, one in _told_apart(body, clouds, rules):
+    for k, one in _told_apart(body, clouds):
         others = [own for owner, own in taken[k] if owner is not one]
         frame = _left(clouds[k].seen, others, timed=body.count == 1)
         frames.append(frame)
         poses[id(frame)] = one.T_world_shape
-    chosen = informative(frames, len(eyes.sigmas), rules.adjusted, runs=eyes.rig.is_late)
+    chosen = informative(frames, len(eyes.sigmas), RULES.adjusted, runs=eyes.rig.is_late)
     return chosen, np.array([poses[id(frame)] for frame in chosen])
 
 
-def _told_apart(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> Places:
+def _told_apart(body: Found, clouds: Sequence[Cloud]) -> Places:
     """Placements whose points lie like no others of the shape; all, where these are too few.
 
     Of the others nobody knows how the body is turned.
     """
     model = body_of("", body.shape.points)
-    off = rules.gate * usual_reach(body.places, clouds)
+    off = RULES.gate * usual_reach(body.places, clouds)
     told = [
         (k, one)
         for k, one in body.places
         if not like_features(model, frozenset(one.own.tolist()), model, off)
     ]
-    return told if len(told) >= rules.least_frames else body.places
+    return told if len(told) >= RULES.least_frames else body.places
 
 
 def _left(seen: SeenFrame, others: Sequence[Indices], *, timed: bool) -> SeenFrame:
@@ -185,13 +183,14 @@ def _left(seen: SeenFrame, others: Sequence[Indices], *, timed: bool) -> SeenFra
 
 
 def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
-    rules = CalibrationRules()
     rig = replace(eyes.rig, points=points, body=body_of("", points))
     blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
     free = np.ones(6, dtype=np.bool_)
     state = State(rig, poses)
     gauge, _ = gauge_rows(state, blocks, free)
-    bundle = Bundle(frames, blocks, free, lambda _: gauge, eyes.sigmas, rules, eyes.errors)
+    bundle = Bundle(
+        frames, blocks, free, lambda _: gauge, eyes.sigmas, CalibrationRules(), eyes.errors
+    )
     return adjust(bundle, state)
 
 

@@ -19,7 +19,7 @@ from mixpose.learning.copies import is_chance, left_by, with_copies
 from mixpose.learning.growing import Found, Places, grown, least_met, placed
 from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 
@@ -28,27 +28,24 @@ _OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those
 
 
 def find_bodies(
-    clouds: Sequence[Cloud],
-    rules: LearningRules,
-    rng: np.random.Generator,
-    progress: Progress = silent,
+    clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress = silent
 ) -> list[Found]:
     """Find what moves rigidly in clouds without what stands still; most points seen first.
 
     Which points the bodies meet is told by `Cloud.rows`.
     """
     left, found = list(clouds), list[Found]()
-    while len(found) < rules.most_bodies:
-        progress("looking for bodies", len(found), rules.most_bodies)
-        body = _next(left, rules, rng)
+    while len(found) < RULES.most_bodies:
+        progress("looking for bodies", len(found), RULES.most_bodies)
+        body = _next(left, rng)
         if body is None:
             break
         # a frame that shows few points of a body may show none of the triples it was found by
         least = least_met(len(body.shape))
-        more = _missed(body, left_by(body.places, left), rules, least, rules.many_bases)
+        more = _missed(body, left_by(body.places, left), least, RULES.many_bases)
         body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
         found.append(_of_all(body, left))
-        left = _without(left, body, rules)
+        left = _without(left, body)
     return sorted(found, key=lambda each: -each.met)
 
 
@@ -61,49 +58,45 @@ def _of_all(body: Found, clouds: Sequence[Cloud]) -> Found:
     return replace(body, places=places)
 
 
-def _next(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> Found | None:
+def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> Found | None:
     """The most evident body of what is left."""
-    for loose in rules.looser[:2]:
+    for loose in RULES.looser[:2]:
         looser = [cloud.loosened(loose) for cloud in clouds]
-        for shape in _shapes(looser, rules, rng)[:_TRIED]:
-            body = _loose_enough(shape, loose, clouds, rules)
+        for shape in _shapes(looser, rng)[:_TRIED]:
+            body = _loose_enough(shape, loose, clouds)
             if body is not None:
                 return body
     return None
 
 
-def _loose_enough(
-    shape: Shape, least: float, clouds: Sequence[Cloud], rules: LearningRules
-) -> Found | None:
+def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found | None:
     """The body of a shape, as rigid as it can be without losing points in many frames."""
     best, frames = None, 0
-    for loose in rules.looser[rules.looser.index(least) :]:
+    for loose in RULES.looser[RULES.looser.index(least) :]:
         looser = [cloud.loosened(loose) for cloud in clouds]
-        body = grown(shape, looser, rules)
-        if body is None or is_chance(body, looser, rules):
+        body = grown(shape, looser)
+        if body is None or is_chance(body, looser):
             break
-        if best is not None and len(body.places) < rules.worth * frames:
+        if best is not None and len(body.places) < RULES.worth * frames:
             break
-        best = replace(with_copies(body, looser, rules), loose=loose)
+        best = replace(with_copies(body, looser), loose=loose)
         # with as few points as a looser shape is met by, where it has other bodies' among them
-        frames = len(placed(best.shape, looser, rules, best.count, FEWEST))
+        frames = len(placed(best.shape, looser, best.count, FEWEST))
     return best
 
 
-def _without(clouds: Sequence[Cloud], body: Found, rules: LearningRules) -> list[Cloud]:
+def _without(clouds: Sequence[Cloud], body: Found) -> list[Cloud]:
     """Clouds without a body, also where too few of its points are seen for a frame to count."""
     left = left_by(body.places, clouds)
-    return left_by(_missed(body, left, rules, FEWEST, rules.bases), left)
+    return left_by(_missed(body, left, FEWEST, RULES.bases), left)
 
 
-def _missed(
-    body: Found, left: Sequence[Cloud], rules: LearningRules, least: int, bases: int
-) -> Places:
+def _missed(body: Found, left: Sequence[Cloud], least: int, bases: int) -> Places:
     """Where it is in what it left, in frames in which fewer of it were found than there are."""
     missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(left))
     frames = np.flatnonzero(missing > 0)
     some = [left[k].loosened(body.loose) for k in frames.tolist()]
-    found, rest = placed(body.shape, some, rules, body.count, least, bases), []
+    found, rest = placed(body.shape, some, body.count, least, bases), []
     for k, one in found:
         if missing[frames[k]] > 0:
             rest.append((int(frames[k]), one))
@@ -111,39 +104,37 @@ def _missed(
     return rest
 
 
-def _shapes(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Shape]:
+def _shapes(clouds: Sequence[Cloud], rng: np.random.Generator) -> list[Shape]:
     """Shapes that recur, the most promising first; where there are too many, triples are drawn."""
     sizes = np.array([len(cloud) for cloud in clouds])
     usable = np.flatnonzero(sizes >= FEWEST)
-    if len(usable) < rules.least_frames:
+    if len(usable) < RULES.least_frames:
         return []
-    some = np.linspace(0, len(usable) - 1, min(len(usable), rules.compared)).astype(np.intp)
+    some = np.linspace(0, len(usable) - 1, min(len(usable), RULES.compared)).astype(np.intp)
     compared = usable[np.unique(some)]
     found = list[tuple[int, Shape]]()
-    for part in np.array_split(usable, min(rules.references, len(usable))):
+    for part in np.array_split(usable, min(RULES.references, len(usable))):
         reference = clouds[part[np.argmax(sizes[part])]]
         others = _Others.of([clouds[k] for k in compared if clouds[k] is not reference])
-        for triple in _near_triples(reference, rules, rng):
-            scored = _scored(reference, triple, others, rules)
+        for triple in _near_triples(reference, rng):
+            scored = _scored(reference, triple, others)
             if scored is not None:
                 found.append(scored)
     return [shape for _, shape in sorted(found, key=lambda scored: -scored[0])]
 
 
-def _near_triples(
-    cloud: Cloud, rules: LearningRules, rng: np.random.Generator
-) -> list[tuple[int, int, int]]:
+def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int, int]]:
     """Triples that are not on a line: of a point and two of its neighbours, and of any."""
-    reach = min(rules.neighbours + 1, len(cloud))
+    reach = min(RULES.neighbours + 1, len(cloud))
     _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
     found = set[tuple[int, int, int]]()
     for row in near:
         own = np.sort(row[triples_of(cloud.points[row], cloud.reach[row])], axis=1)
         found |= {(a, b, c) for a, b, c in own.tolist()}
     drawn = sorted(found)
-    if len(drawn) > rules.triples:
-        drawn = [drawn[k] for k in rng.choice(len(drawn), rules.triples, replace=False)]
-    for _ in range(rules.far_triples if len(cloud) > reach else 0):
+    if len(drawn) > RULES.triples:
+        drawn = [drawn[k] for k in rng.choice(len(drawn), RULES.triples, replace=False)]
+    for _ in range(RULES.far_triples if len(cloud) > reach else 0):
         a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
         some = [a, b, c]
         if (a, b, c) not in found and len(triples_of(cloud.points[some], cloud.reach[some])):
@@ -152,14 +143,14 @@ def _near_triples(
 
 
 def _scored(
-    reference: Cloud, triple: tuple[int, int, int], others: _Others, rules: LearningRules
+    reference: Cloud, triple: tuple[int, int, int], others: _Others
 ) -> tuple[int, Shape] | None:
     """What goes along with a triple, and how many points other frames show alike beyond two."""
     base = list(triple)
     goes_along, matched, score = np.zeros(len(reference)), 0, 0
     seen = reference.points[base][None]
-    far = rules.apart * rules.gate * reference.reach[base].max()
-    for met, places in _going_along(reference, base, others, rules):
+    far = RULES.apart * RULES.gate * reference.reach[base].max()
+    for met, places in _going_along(reference, base, others):
         if np.abs(places - seen).max(axis=(1, 2)).min() > far:
             seen = np.concatenate([seen, places[None]])
             matched += 1
@@ -194,11 +185,11 @@ class _Others:
 
 
 def _going_along(
-    reference: Cloud, base: list[int], others: _Others, rules: LearningRules
+    reference: Cloud, base: list[int], others: _Others
 ) -> Iterator[tuple[Mask, Floats]]:
     """Points (P,) of a cloud that lie in others as they do about a triple, and where this is."""
     points = reference.points[base]
-    slack = rules.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())
+    slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())
     cloud, triples = congruent_triples_of_each(points, others.apart, slack)
     poses = motions(points, others.points[cloud[:, None], triples])
     moved = transform(poses, reference.points)
@@ -210,7 +201,7 @@ def _going_along(
         nearest = found.argmin(axis=0)
         away[own] = found[nearest, np.arange(len(nearest))].reshape(away[own].shape)
         reach[own] = others.reach[k, nearest].reshape(away[own].shape)
-    share = away / (2 * rules.gate * np.hypot(reach, reference.reach))
+    share = away / (2 * RULES.gate * np.hypot(reach, reference.reach))
     met = share < 1
     met &= met[:, base].all(axis=1)[:, None]
     counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)

@@ -15,7 +15,7 @@ from scipy.special import pdtr
 from mixpose.learning.growing import Found, Places, averaged, placed
 from mixpose.learning.placing import FEWEST, Placement, Shape
 from mixpose.learning.points import Cloud
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices, Mask
 
 _OF_COPY = 0.6  # of the points of a shape that another one of it must show
@@ -25,30 +25,30 @@ _MISSED = 0.6  # as often as else: a point that goes missing along with another 
 _DECOYS = (0.8, 0.87, 0.93, 1.08, 1.16, 1.25)  # sizes of shapes that are not there
 
 
-def with_copies(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> Found:
+def with_copies(body: Found, clouds: Sequence[Cloud]) -> Found:
     """All bodies of a shape, where others are seen beside the first in some frames."""
     shape, least, left = body.shape, _of_copy(body.shape), left_by(body.places, clouds)
-    if len(placed(shape, left, rules, least=least)) < seen_often(len(body.places), rules):
-        return _in_one_piece(body, clouds, left, rules)
-    places = placed(shape, clouds, rules, rules.most_bodies, least)
+    if len(placed(shape, left, least=least)) < seen_often(len(body.places)):
+        return _in_one_piece(body, clouds, left)
+    places = placed(shape, clouds, RULES.most_bodies, least)
     # seldom two at a time: the one body, also where it shows fewer points
-    if np.sum(_per_frame(places, clouds) > 1) < seen_often(len({k for k, _ in places}), rules):
-        return Found(averaged(shape, places, clouds, rules), tuple(places))
-    count = _count(shape, places, clouds, rules)
+    if np.sum(_per_frame(places, clouds) > 1) < seen_often(len({k for k, _ in places})):
+        return Found(averaged(shape, places, clouds), tuple(places))
+    count = _count(shape, places, clouds)
     strange = _is_strange(shape, places, count)
     others = _never_with(shape, places, strange)
     if others.any():
         shape = _part(shape, ~others)
-        places = placed(shape, clouds, rules, rules.most_bodies, _of_copy(shape))
-        count = _count(shape, places, clouds, rules)
+        places = placed(shape, clouds, RULES.most_bodies, _of_copy(shape))
+        count = _count(shape, places, clouds)
     while count > 1 and _is_strange(shape, places, count).any():
         count -= 1
     if count == 1:
-        places = placed(shape, clouds, rules)
-    return Found(averaged(shape, places, clouds, rules), tuple(places), count)
+        places = placed(shape, clouds)
+    return Found(averaged(shape, places, clouds), tuple(places), count)
 
 
-def is_chance(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> bool:
+def is_chance(body: Found, clouds: Sequence[Cloud]) -> bool:
     """Whether shapes of other sizes, which are not there, are found about as often."""
     if len(body.shape) > FEWEST + 1:
         return False
@@ -56,11 +56,11 @@ def is_chance(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> boo
     counts = []
     for size in _DECOYS:
         shape = Shape(middle + size * (body.shape.points - middle), body.shape.reach)
-        counts.append(len(placed(shape, clouds, rules)))
+        counts.append(len(placed(shape, clouds)))
     expected = float(np.mean(counts))
     # the best of very many shapes recurs more often than one of them
-    most = rules.by_chance * (expected + np.sqrt(expected))
-    return bool(len(body.places) < 2 * rules.least_frames + most)
+    most = RULES.by_chance * (expected + np.sqrt(expected))
+    return bool(len(body.places) < 2 * RULES.least_frames + most)
 
 
 def left_by(places: Places, clouds: Sequence[Cloud]) -> list[Cloud]:
@@ -71,14 +71,12 @@ def left_by(places: Places, clouds: Sequence[Cloud]) -> list[Cloud]:
     return left
 
 
-def seen_often(frames: int, rules: LearningRules) -> float:
+def seen_often(frames: int) -> float:
     """Frames in which something is seen that is no accident."""
-    return max(rules.least_frames, 2 * rules.least_share * frames)
+    return max(RULES.least_frames, 2 * RULES.least_share * frames)
 
 
-def _in_one_piece(
-    body: Found, clouds: Sequence[Cloud], left: Sequence[Cloud], rules: LearningRules
-) -> Found:
+def _in_one_piece(body: Found, clouds: Sequence[Cloud], left: Sequence[Cloud]) -> Found:
     """A body without what moves apart from it: points missed together that are elsewhere then."""
     seen = np.array([one.met >= 0 for _, one in body.places])
     least = seen[:, seen.sum(axis=0).argmin()]
@@ -88,11 +86,11 @@ def _in_one_piece(
     part, rest = _part(body.shape, apart), _part(body.shape, ~apart)
     if min(len(part), len(rest)) < FEWEST:
         return body
-    elsewhere = Found(part, tuple(placed(part, left, rules)))
-    is_seldom = len(elsewhere.places) < seen_often(len(body.places), rules)
-    if is_seldom or is_chance(elsewhere, left, rules):
+    elsewhere = Found(part, tuple(placed(part, left)))
+    is_seldom = len(elsewhere.places) < seen_often(len(body.places))
+    if is_seldom or is_chance(elsewhere, left):
         return body
-    return Found(rest, tuple(placed(rest, clouds, rules)))
+    return Found(rest, tuple(placed(rest, clouds)))
 
 
 def _part(shape: Shape, some: Mask) -> Shape:
@@ -103,14 +101,14 @@ def _of_copy(shape: Shape) -> int:
     return max(FEWEST, int(np.ceil(_OF_COPY * len(shape))))
 
 
-def _count(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules) -> int:
+def _count(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> int:
     """How many placements there are at a time, in enough frames.
 
     In some of them all must show more than the three points that a mirror image has alike.
     """
     full = [(k, one) for k, one in places if one.count > min(FEWEST, len(shape) - 1)]
     per_frame, full_per_frame = _per_frame(places, clouds), _per_frame(full, clouds)
-    often = seen_often(int((per_frame > 0).sum()), rules)
+    often = seen_often(int((per_frame > 0).sum()))
     count = 1
     while (per_frame > count).sum() >= often and (full_per_frame > count).sum() >= often / 2:
         count += 1

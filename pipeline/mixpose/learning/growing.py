@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.learning.placing import FEWEST, Placement, Shape, placements, wide_triples
 from mixpose.learning.points import Cloud, gathered_places
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import inverse, transform
 
@@ -48,44 +48,43 @@ def least_met(points: int) -> int:
 def placed(
     shape: Shape,
     clouds: Sequence[Cloud],
-    rules: LearningRules,
     most: int = 1,
     least: int | None = None,
     bases: int | None = None,
 ) -> list[tuple[int, Placement]]:
     """Where a shape is in all clouds, at most so many times in each."""
-    triples = wide_triples(shape.points, shape.reach, bases or rules.bases)
+    triples = wide_triples(shape.points, shape.reach, bases or RULES.bases)
     least = least_met(len(shape)) if least is None else least
     return [
         (k, one)
         for k, cloud in enumerate(clouds)
-        for one in placements(shape, triples, cloud, rules, most, least)
+        for one in placements(shape, triples, cloud, most, least)
     ]
 
 
-def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found | None:
+def grown(shape: Shape, clouds: Sequence[Cloud]) -> Found | None:
     """Find a shape of three points or more in all frames, and in these all that goes along.
 
     None where it does not recur.
     """
-    for turn in range(rules.rounds):
-        places = placed(shape, clouds, rules)
-        if len(places) < rules.least_frames:
+    for turn in range(RULES.rounds):
+        places = placed(shape, clouds)
+        if len(places) < RULES.least_frames:
             return None
-        shape = averaged(shape, places, clouds, rules)
+        shape = averaged(shape, places, clouds)
         if len(shape) < FEWEST:
             return None
-        if turn + 1 == rules.rounds:
+        if turn + 1 == RULES.rounds:
             break
         before = len(shape)
-        shape = _with_hidden(shape, places, clouds, rules)
+        shape = _with_hidden(shape, places, clouds)
         if len(shape) == before and turn:
             break
     if not len(wide_triples(shape.points, shape.reach, 1)):
         return None
-    places = placed(shape, clouds, rules)
-    _, different = _poses_apart(shape, places, clouds, rules)
-    return Found(shape, tuple(places)) if different >= rules.least_frames else None
+    places = placed(shape, clouds)
+    _, different = _poses_apart(shape, places, clouds)
+    return Found(shape, tuple(places)) if different >= RULES.least_frames else None
 
 
 def usual_reach(places: Places, clouds: Sequence[Cloud]) -> float:
@@ -93,9 +92,7 @@ def usual_reach(places: Places, clouds: Sequence[Cloud]) -> float:
     return float(np.median([clouds[k].reach[one.there].mean() for k, one in places]))
 
 
-def _poses_apart(
-    shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
-) -> tuple[Indices, int]:
+def _poses_apart(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple[Indices, int]:
     """Numbers (K,) of the poses of placements, from 0, and how many are apart from each other.
 
     The number is the same where the body is at the same place: where no point of the shape is far
@@ -104,7 +101,7 @@ def _poses_apart(
     if not places:
         return np.zeros(0, dtype=np.intp), 0
     points = transform(np.array([one.T_world_shape for _, one in places]), shape.points)
-    far = rules.apart * rules.gate * usual_reach(places, clouds)
+    far = RULES.apart * RULES.gate * usual_reach(places, clouds)
     number, count = np.full(len(points), -1, dtype=np.intp), 0
     for k in range(len(points)):
         if number[k] < 0:
@@ -114,11 +111,11 @@ def _poses_apart(
     return number, count
 
 
-def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules) -> Shape:
+def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> Shape:
     """The shape as its frames show it on average, without points that few of them show."""
     weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
     counts, reach = np.zeros(len(shape)), np.zeros(len(shape))
-    number, different = _poses_apart(shape, places, clouds, rules)
+    number, different = _poses_apart(shape, places, clouds)
     seen = np.zeros((len(shape), different), dtype=np.bool_)
     for n, (k, one) in zip(number.tolist(), places, strict=True):
         own, there = one.own, one.there
@@ -128,8 +125,8 @@ def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: Learn
         counts[own] += 1
         reach[own] += clouds[k].reach[there]
         seen[own, n] = True
-    kept = seen.sum(axis=1) >= max(rules.least_frames, rules.least_share * seen.shape[1])
-    near = rules.alike * rules.gate * reach / np.maximum(counts, 1)
+    kept = seen.sum(axis=1) >= max(RULES.least_frames, RULES.least_share * seen.shape[1])
+    near = RULES.alike * RULES.gate * reach / np.maximum(counts, 1)
     kept &= only_once(shape.points, counts, near)
     middle = total[kept] / weight[kept, None]
     return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept]))
@@ -150,24 +147,22 @@ def _reach_of(reach: Floats, counts: Floats) -> Floats:
     return np.asarray(reach * np.maximum(1 / np.sqrt(counts), _SURER))
 
 
-def _with_hidden(
-    shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
-) -> Shape:
+def _with_hidden(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> Shape:
     """The shape with points that are at one place of it at many poses."""
     points, reach, frame = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
-    number, different = _poses_apart(shape, places, clouds, rules)
+    number, different = _poses_apart(shape, places, clouds)
     for n, (k, one) in zip(number.tolist(), places, strict=True):
         free = clouds[k].without(clouds[k].detections[one.there])
         own = transform(inverse(one.T_world_shape), free.points)
         points.append(own)
-        reach.append(rules.gate * free.reach * _lever(shape, own, one.count))
+        reach.append(RULES.gate * free.reach * _lever(shape, own, one.count))
         frame.append(np.full(len(own), n))
-    least = max(rules.least_frames, rules.least_share * different)
+    least = max(RULES.least_frames, RULES.least_share * different)
     reaches = np.concatenate(reach)
-    more = gathered_places(np.concatenate(points), reaches, np.concatenate(frame), least, rules)
+    more = gathered_places(np.concatenate(points), reaches, np.concatenate(frame), least)
     if not more:
         return shape
-    added = np.array([np.median(reaches[there]) / rules.gate for _, there in more])
+    added = np.array([np.median(reaches[there]) / RULES.gate for _, there in more])
     counts = np.array([len(there) for _, there in more], dtype=np.float64)
     return Shape(
         np.concatenate([shape.points, [place for place, _ in more]]),

@@ -15,7 +15,7 @@ from mixpose.learning.adjusting import Eyes, Learnt, adjusted
 from mixpose.learning.axes import in_principal_axes
 from mixpose.learning.bodies import find_bodies
 from mixpose.learning.points import Cloud, clouds_of, without_still
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
@@ -46,10 +46,7 @@ def eyes_of(session: Session) -> Eyes:
 
 
 def learn(
-    session: Session,
-    sources: dict[str, str] | None = None,
-    rules: LearningRules = LearningRules(),
-    progress: Progress = silent,
+    session: Session, sources: dict[str, str] | None = None, progress: Progress = silent
 ) -> Lesson:
     """Learn the bodies that move in a session's recording.
 
@@ -59,39 +56,34 @@ def learn(
     """
     eyes = eyes_of(session)
     read = replace(
-        CalibrationRules(), most_read=rules.most_frames, most_candidates=rules.most_frames
+        CalibrationRules(), most_read=RULES.most_frames, most_candidates=RULES.most_frames
     )
     runs = eyes.rig.is_late
     frames = read_frames(session, sources or {}, read, progress, runs=runs, known=None)
     if runs:
         found = f"{session.path}: learn: found delay or readout, and frames without times"
         require_times(frames, found)
-    return learn_from(frames, eyes, rules, progress, name=str(session.path))
+    return learn_from(frames, eyes, progress, name=str(session.path))
 
 
 @one_blas_thread()
 def learn_from(
-    frames: Sequence[SeenFrame],
-    eyes: Eyes,
-    rules: LearningRules = LearningRules(),
-    progress: Progress = silent,
-    *,
-    name: str = "recording",
+    frames: Sequence[SeenFrame], eyes: Eyes, progress: Progress = silent, *, name: str = "recording"
 ) -> Lesson:
     """Learn bodies from detections of a recording, which messages call by a name.
 
     Raises a RecordingError if no body is seen to move.
     """
     progress("triangulating", 0, 1)
-    clouds, noise = clouds_of(frames, eyes.rig.sensors, eyes.sigmas, rules)
+    clouds, noise = clouds_of(frames, eyes.rig.sensors, eyes.sigmas)
     if not any(len(cloud) for cloud in clouds):
         raise RecordingError(_seen_by_one(frames, eyes, name))
-    moving, still = without_still(clouds, rules)
-    found = find_bodies(moving, rules, np.random.default_rng(0), progress)
+    moving, still = without_still(clouds)
+    found = find_bodies(moving, np.random.default_rng(0), progress)
     progress("adjusting", 0, 1)
-    bodies = adjusted(found, clouds, eyes, rules)
+    bodies = adjusted(found, clouds, eyes)
     if not bodies:
-        raise RecordingError(_nothing_moves(clouds, moving, still, rules, name))
+        raise RecordingError(_nothing_moves(clouds, moving, still, name))
     return Lesson(tuple(map(in_principal_axes, bodies)), len(still), len(frames), noise)
 
 
@@ -114,16 +106,12 @@ def _seen_by_one(frames: Sequence[SeenFrame], eyes: Eyes, name: str) -> str:
 
 
 def _nothing_moves(
-    clouds: Sequence[Cloud],
-    moving: Sequence[Cloud],
-    still: Sequence[Floats],
-    rules: LearningRules,
-    name: str,
+    clouds: Sequence[Cloud], moving: Sequence[Cloud], still: Sequence[Floats], name: str
 ) -> str:
     """Why no body was found, and which motion would tell."""
     left = float(np.median([len(cloud) for cloud in moving]))
     seen = float(np.median([len(cloud) for cloud in clouds]))
-    far = rules.apart * rules.gate * float(np.median(np.concatenate([c.reach for c in clouds])))
+    far = RULES.apart * RULES.gate * float(np.median(np.concatenate([c.reach for c in clouds])))
     wanted = (
         "move the body by about its own size along each axis and turn it by 30 degrees or more "
         "about each, in view of two cameras"
@@ -141,6 +129,6 @@ def _nothing_moves(
         )
     return (
         f"{name}: learn: found {left:.0f} points in space in most frames, but no three that keep "
-        f"their distances while they move by {far:.2g} or more, {rules.least_frames} times; "
+        f"their distances while they move by {far:.2g} or more, {RULES.least_frames} times; "
         f"{wanted}"
     )

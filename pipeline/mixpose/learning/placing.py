@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body, PointFeature
 from mixpose.body.symmetry import congruent_triples, motions
 from mixpose.learning.points import Cloud
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts, transform
 
@@ -91,7 +91,7 @@ def wide_triples(points: Floats, reach: Floats, most: int) -> Indices:
 
 
 def placements(
-    shape: Shape, bases: Indices, cloud: Cloud, rules: LearningRules, most: int, least: int
+    shape: Shape, bases: Indices, cloud: Cloud, most: int, least: int
 ) -> list[Placement]:
     """Placements of a shape in a cloud, of which no two have a point in common; the best first.
 
@@ -101,7 +101,7 @@ def placements(
     if len(cloud) < least or not len(bases):
         return []
     typical = np.hypot(np.median(cloud.reach), np.median(shape.reach))
-    off, candidates = rules.gate * np.sqrt(2.0) * typical, []
+    off, candidates = RULES.gate * np.sqrt(2.0) * typical, []
     for base in shape.points[bases]:
         triples = congruent_triples(base, cloud.points, off)
         candidates.append(motions(base, cloud.points[triples]))
@@ -110,16 +110,16 @@ def placements(
         return []
     tree = cKDTree(cloud.points)
     away, nearest = tree.query(transform(poses, shape.points))
-    allowed = rules.gate * np.hypot(cloud.reach[nearest], shape.reach)
+    allowed = RULES.gate * np.hypot(cloud.reach[nearest], shape.reach)
     counts = (away < 2 * allowed).sum(axis=1) - 0.1 * np.minimum(away / allowed, 2).mean(axis=1)
-    order = np.argsort(-counts, kind="stable")[: rules.placements * most]
+    order = np.argsort(-counts, kind="stable")[: RULES.placements * most]
     refined = list[Placement]()
     for k in order:
         # most triples of a shape lead to the one place where it is; triangles fit in many ways
         alone = most == 1 and len(shape) > FEWEST and refined
         if alone and max(each.count for each in refined) >= counts[k]:
             break
-        refined.append(_refined(shape, poses[k], cloud, tree, rules))
+        refined.append(_refined(shape, poses[k], cloud, tree))
     good = [each for each in refined if each.count >= least]
     good.sort(key=lambda each: (-each.count, each.off))
     kept, taken = list[Placement](), set[int]()
@@ -133,26 +133,22 @@ def placements(
     return kept
 
 
-def _refined(
-    shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, rules: LearningRules
-) -> Placement:
+def _refined(shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree) -> Placement:
     """Fit a pose to all points that it meets."""
-    found = _placement(shape, T, cloud, tree, rules, _WIDE[0])
+    found = _placement(shape, T, cloud, tree, _WIDE[0])
     for wide in _WIDE[1:]:
         if found.count < FEWEST:
             break
         there = found.there
         T = _weighted_motion(shape.points[found.own], cloud.points[there], cloud.reach[there])
-        found = _placement(shape, T, cloud, tree, rules, wide)
+        found = _placement(shape, T, cloud, tree, wide)
     return found
 
 
-def _placement(
-    shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, rules: LearningRules, wide: float
-) -> Placement:
+def _placement(shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, wide: float) -> Placement:
     """Which point of a cloud each point of a shape is at a pose, one to one."""
     away, nearest = tree.query(transform(T, shape.points))
-    share = away / (rules.gate * wide * np.hypot(cloud.reach[nearest], shape.reach))
+    share = away / (RULES.gate * wide * np.hypot(cloud.reach[nearest], shape.reach))
     met = np.full(len(shape), -1, dtype=np.intp)
     order = np.argsort(share, kind="stable")
     order = order[share[order] < 1]

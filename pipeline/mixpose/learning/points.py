@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from mixpose.calibration import SeenFrame
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices, Mask
 from mixpose.search import triangulate
 from mixpose.sensors import Rays, Sensor
@@ -55,16 +55,16 @@ class Cloud:
 
 
 def clouds_of(
-    frames: Sequence[SeenFrame], sensors: Sequence[Sensor], sigmas: Floats, rules: LearningRules
+    frames: Sequence[SeenFrame], sensors: Sequence[Sensor], sigmas: Floats
 ) -> tuple[list[Cloud], float]:
     """Triangulate every frame; and the deviation of detections, as a share of their σ_ε (L,)."""
     told = [_seen(frame, sensors) for frame in frames]
-    wide = rules.widest * sigmas
-    some = np.linspace(0, len(told) - 1, min(len(told), rules.probes)).astype(int)
-    gaps = [_meetings(told[k][1], wide, rules)[2] for k in np.unique(some)]
-    noise = max(rules.widest * _deviation(np.concatenate([np.zeros(0), *gaps])), rules.quietest)
-    gates = min(rules.gate * noise, rules.widest) * sigmas
-    return [_cloud(*each, sensors, noise * sigmas, gates, rules) for each in told], noise
+    wide = RULES.widest * sigmas
+    some = np.linspace(0, len(told) - 1, min(len(told), RULES.probes)).astype(int)
+    gaps = [_meetings(told[k][1], wide)[2] for k in np.unique(some)]
+    noise = max(RULES.widest * _deviation(np.concatenate([np.zeros(0), *gaps])), RULES.quietest)
+    gates = min(RULES.gate * noise, RULES.widest) * sigmas
+    return [_cloud(*each, sensors, noise * sigmas, gates) for each in told], noise
 
 
 def _seen(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[int, Rays]]:
@@ -78,15 +78,13 @@ def _seen(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[
     return SeenFrame(frame.number, frame.time_s, pixels, frame.times), rays
 
 
-def _meetings(
-    rays: dict[int, Rays], gates: Floats, rules: LearningRules
-) -> tuple[Floats, Indices, Floats]:
+def _meetings(rays: dict[int, Rays], gates: Floats) -> tuple[Floats, Indices, Floats]:
     """Points (P, 3) where two rays meet, their detections (P, L), and how closely they meet."""
     lines = [rays[k] for k in sorted(rays)]
     index = np.array(sorted(rays), dtype=np.intp)
     if len(lines) < 2:
         return np.zeros((0, 3)), np.zeros((0, len(gates)), dtype=np.intp), np.zeros(0)
-    met = triangulate(lines, gates[index].tolist(), rules.min_sine)
+    met = triangulate(lines, gates[index].tolist(), RULES.min_sine)
     detections = np.full((len(met.points), len(gates)), -1, dtype=np.intp)
     rows = np.arange(len(met.points))
     for side in (0, 1):
@@ -117,14 +115,9 @@ def _deviation(gaps: Floats) -> float:
 
 
 def _cloud(
-    frame: SeenFrame,
-    rays: dict[int, Rays],
-    sensors: Sequence[Sensor],
-    noise: Floats,
-    gates: Floats,
-    rules: LearningRules,
+    frame: SeenFrame, rays: dict[int, Rays], sensors: Sequence[Sensor], noise: Floats, gates: Floats
 ) -> Cloud:
-    points, detections, gaps = _meetings(rays, gates, rules)
+    points, detections, gaps = _meetings(rays, gates)
     if len(rays) > 2 and len(points):
         detections = _supported(points, detections, gaps, frame, sensors, gates)
         kept = (detections >= 0).any(axis=1)
@@ -205,7 +198,7 @@ def _are_fixed(information: Floats) -> Mask:
 
 
 def gathered_places(
-    points: Floats, reach: Floats, frame: Indices, least: float, rules: LearningRules
+    points: Floats, reach: Floats, frame: Indices, least: float
 ) -> list[tuple[Floats, Indices]]:
     """Places (3,) at which points (n, 3) of many frames are, and which; most frames first.
 
@@ -244,24 +237,22 @@ def gathered_places(
         chosen = chosen[np.sort(away) <= allowed[chosen]]
         _, first = np.unique(frame[chosen], return_index=True)
         chosen = chosen[np.sort(first)]
-        if len(chosen) >= max(least, rules.gathered * near_by):
+        if len(chosen) >= max(least, RULES.gathered * near_by):
             found.append((place, chosen))
     return found
 
 
-def without_still(
-    clouds: Sequence[Cloud], rules: LearningRules
-) -> tuple[list[Cloud], list[Floats]]:
+def without_still(clouds: Sequence[Cloud]) -> tuple[list[Cloud], list[Floats]]:
     """Clouds without what stands still, and where that is.
 
     A body that rests in most of the frames is lost from these alone.
     """
     points = np.concatenate([cloud.points for cloud in clouds])
-    reach = rules.gate * np.concatenate([cloud.reach for cloud in clouds])
+    reach = RULES.gate * np.concatenate([cloud.reach for cloud in clouds])
     frame = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
     filled = sum(len(cloud) > 0 for cloud in clouds)
-    least = max(rules.still_share * filled, rules.least_frames)
-    still = gathered_places(points, reach, frame, least, rules)
+    least = max(RULES.still_share * filled, RULES.least_frames)
+    still = gathered_places(points, reach, frame, least)
     detections = np.concatenate([cloud.detections for cloud in clouds])
     taken = np.concatenate([np.zeros(0, dtype=np.intp), *(chosen for _, chosen in still)])
     left = [cloud.without(detections[taken[frame[taken] == k]]) for k, cloud in enumerate(clouds)]

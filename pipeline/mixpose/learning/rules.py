@@ -63,3 +63,6 @@ class LearningRules:
     turned_deg: float = constant(
         15.0, "a body that turned less may be one with whatever else moved along"
     )
+
+
+RULES = LearningRules()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.learning.adjusting import Learnt
 from mixpose.learning.placing import body_of
-from mixpose.learning.rules import LearningRules
+from mixpose.learning.rules import RULES
 from mixpose.records import Floats
 from mixpose.session.marker_files import LEARNT_COLUMNS
 
@@ -66,9 +66,9 @@ def table_text(learnt: Learnt) -> str:
     return stream.getvalue()
 
 
-def doubts_of(learnt: Learnt, name: str, unit: str, rules: LearningRules) -> list[str]:
+def doubts_of(learnt: Learnt, name: str, unit: str) -> list[str]:
     """What the recording does not tell, and what cannot be told from what."""
-    told = _doubts_of_motion(learnt, name, rules)
+    told = _doubts_of_motion(learnt, name)
     body = body_of(name, learnt.points)
     turns = len(body.symmetries)
     if turns > 1:
@@ -91,10 +91,10 @@ def doubts_of(learnt: Learnt, name: str, unit: str, rules: LearningRules) -> lis
     return told
 
 
-def _doubts_of_motion(learnt: Learnt, name: str, rules: LearningRules) -> list[str]:
+def _doubts_of_motion(learnt: Learnt, name: str) -> list[str]:
     turns = np.degrees(_turns(learnt))
     most = float(np.linalg.norm(turns, axis=1).max())
-    if most < rules.turned_deg:
+    if most < RULES.turned_deg:
         return [
             f"{name}: turned by {most:.1f} deg at most; missing: turns of 30 deg or more about "
             "each axis, without which sides that no camera saw have no markers, and things that "

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.density import Atlas
-from mixpose.extraction.corners import CornerRules, saddle_strength
+from mixpose.extraction.corners import CORNERS, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import feature_values
 from mixpose.fit import EstimatorOptions
@@ -71,7 +71,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         return titled(picture, "detections: no threshold")
     size = picture.shape[1], picture.shape[0]
     if options.method == "corners":
-        blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CornerRules().blur)
+        blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CORNERS.blur)
         values = np.sqrt(np.maximum(saddle_strength(blurred), 0))
         title = "strength of saddles"
     elif options.method == "log":

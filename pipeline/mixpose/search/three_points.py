@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.records import Floats, Indices
-from mixpose.rigid import from_parts
+from mixpose.rigid import cross, from_parts
 from mixpose.search.problem import SearchProblem, is_pointlike
 from mixpose.sensors import Rays
 
@@ -76,13 +76,6 @@ def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.co
     across[:, flat] = cross(x[:, flat], np.eye(3)[:, np.abs(x[:, flat]).argmin(axis=0)])
     z = across / np.sqrt(_dot(across, across))
     return (x, cross(z, x), z), length, third
-
-
-def cross(a: Floats, b: Floats) -> Floats:
-    """Cross products of vectors (3, ...)."""
-    return np.array(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from mixpose import sensors
 from mixpose.body import Body, SegmentFeature
 from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats, Mask
@@ -212,12 +213,8 @@ def facing(
     sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
 ) -> Mask:
     """Which features (N,) turn their front to a sensor; all of a body without normals."""
-    if body.normals is None or isinstance(sensor, CloudSensor):
-        return np.ones(len(body), dtype=np.bool_)
     M = T_world_object if mirror is None else mirror @ T_world_object
-    R = M[:3, :3]
-    points = body.means @ R.T + M[:3, 3]
-    return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)
+    return sensors.facing(sensor, M, transform(M, body.means), body.normals)
 
 
 def brightness_levels(count: int, spread: float, rng: Generator) -> Floats:

@@ -118,7 +118,7 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
         total = 0.5 * (x / rules.believed) ** 2
         for k, one in enumerate(blocks):
             at = replace(model, white=float(np.exp(x)))
-            _, each, logs[k] = _among_sudden(one, at, rules, logs[k])
+            _, each, logs[k] = smooth_with_sudden_motion(one, at, rules, logs[k])
             total -= float(each.sum())
         return total
 
@@ -131,24 +131,19 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
 
 
 def smooth_with_sudden_motion(
-    track: Track, model: MotionModel, rules: SmoothingRules
-) -> tuple[SmoothedTrack, Floats]:
+    track: Track, model: MotionModel, rules: SmoothingRules, logs: Floats | None = None
+) -> tuple[SmoothedTrack, Floats, Floats]:
     """Smooth a track with as much noise between each two times as there was.
 
-    And the logarithm (N,) of how likely each pose is, by those before and the noise up to it.
+    And the logarithm (N,) of how likely each pose is, by those before and the noise up to it, and
+    those of λ (N - 1, 2), which begin at `logs`, or at 0.
 
     Noise of each passage has an inverse gamma variance, so that all in all it has the t
     distribution.  d log p / d log λ = (bᵀQb − tr NQ) / 2 + ν (μ/λ − 1) / 2 = 0 gives the fixed
     point λ = (λ bᵀQb + ν μ) / (tr NQ + ν).  μ is what is usual, 1 where all of the motion is; the
     model was fitted to sudden motion as well.  d log p / d log μ = 0 where the mean of μ/λ is 1.
     """
-    return _among_sudden(track, model, rules, np.zeros((len(track) - 1, 2)))[:2]
-
-
-def _among_sudden(
-    track: Track, model: MotionModel, rules: SmoothingRules, logs: Floats
-) -> tuple[SmoothedTrack, Floats, Floats]:
-    """The same, and the logarithms of λ (N - 1, 2), which begin at some."""
+    logs = np.zeros((len(track) - 1, 2)) if logs is None else logs
     for _ in range(rules.passes):
         change = _fixed_point(track, model, logs, rules) - logs
         logs = logs + rules.ahead * change

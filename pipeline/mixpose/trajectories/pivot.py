@@ -129,20 +129,15 @@ def find_tip(pivoting: Pivoting) -> Tip:
     )
 
 
-def _turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
+def _require_turns(pivoting: Pivoting, scale: float, rules: PivotRules) -> tuple[Floats, Floats]:
     """By how much directions of the body swing, RMS in radians (3,), least first, and these (3, 3).
 
-    The tip along a direction that does not swing may be anywhere.
+    A RecordingError where one swings no more than errors make it: the tip may be anywhere along it.
     """
     R = pivoting.references[:, :3, :3].swapaxes(1, 2) @ pivoting.poses[:, :3, :3]
     away = R - R.mean(axis=0)
     values, vectors = np.linalg.eigh(np.einsum("kij,kil->jl", away, away) / len(R))
-    return np.sqrt(np.maximum(values, 0.0)), vectors.T
-
-
-def _require_turns(pivoting: Pivoting, scale: float, rules: PivotRules) -> tuple[Floats, Floats]:
-    """As `_turns_seen`; a RecordingError where a direction swings no more than errors make it."""
-    turns, directions = _turns_seen(pivoting)
+    turns, directions = np.sqrt(np.maximum(values, 0.0)), vectors.T
     both = scale * (pivoting.covariances + pivoting.reference_covariances)[:, 3:, 3:]
     d = pivoting.poses[:, :3, :3] @ directions.T
     # a turn by w moves a direction by w × d

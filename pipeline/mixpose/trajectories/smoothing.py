@@ -255,7 +255,7 @@ def _without_foreign(
     """A track without poses that lie where those around them forbid, and the track smoothed."""
     limit = float(chdtri(int(track.free.sum()), rules.foreign))
     wrong = logs_of_wrong(track, white_parts(track, np.array([model.white])), rules)[:, 0]
-    result, logs = smooth_with_sudden_motion(track, model, rules)
+    result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
         # among motion that is steady a corner of the path looks foreign, too
         off = _off(track, smooth_track(track, model), model, -1)
@@ -265,7 +265,7 @@ def _without_foreign(
         if not bad.any():
             break
         # but at a corner the others tell of sudden motion as well
-        among, others = smooth_with_sudden_motion(without(track, bad), model, rules)
+        among, others, _ = smooth_with_sudden_motion(without(track, bad), model, rules)
         places = np.flatnonzero(bad)
         parts = np.append(0, (places[1:] + places[:-1] + 1) // 2)  # what is next to each of them
         likelier = np.add.reduceat(others - logs, parts) + wrong[places] > 0
@@ -273,7 +273,7 @@ def _without_foreign(
         if not bad.any():
             break
         track = without(track, bad)
-        result, logs = smooth_with_sudden_motion(track, model, rules)
+        result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     return track, result
 
 

@@ -43,11 +43,6 @@ class Rig:
     files: tuple[str, ...]
     cameras: tuple[CalibratedCamera, ...]
 
-    @property
-    def is_placed(self) -> bool:
-        """Whether the files say where cameras stand."""
-        return any(camera.T_camera_rig is not None for camera in self.cameras)
-
 
 @dataclass(frozen=True)
 class Format:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
-from mixpose.session.calibration.pieces import motion_of_quaternion, size_of
+from mixpose.session.calibration.pieces import size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
 from mixpose.session.values import LARGEST, as_number
@@ -141,7 +143,11 @@ def _motion(cells: Sequence[str]) -> Floats:
     values = _floats(cells)
     if len(values) != 7:
         raise BadKeyError(found(" ".join(cells), "QW QX QY QZ TX TY TZ"))
-    return motion_of_quaternion(values[:4], values[4:])
+    length = np.linalg.norm(values[:4])
+    if not 0.5 < length < 2:
+        raise BadKeyError(f"found a quaternion of length {length:.3g}; allowed: 1")
+    R = Rotation.from_quat(values[:4], scalar_first=True).as_matrix()
+    return from_parts(R, np.asarray(values[4:]))
 
 
 def _whole(cell: str) -> int:

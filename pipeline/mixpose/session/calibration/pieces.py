@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
-
-import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
@@ -41,17 +37,6 @@ def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floa
     if is_matrix:
         return rigid(from_parts(values, t), key)
     return from_parts(rotation_of_vector(values, key).as_matrix(), t)
-
-
-def motion_of_quaternion(wxyz: Sequence[float], translation: Sequence[float]) -> Floats:
-    """A rigid motion (4, 4) of a quaternion, real part first, and a translation.
-
-    Raises BadKeyError if the quaternion has no length.
-    """
-    w, x, y, z = wxyz
-    if not 0.5 < np.linalg.norm(wxyz) < 2:
-        raise BadKeyError(f"found a quaternion of length {np.linalg.norm(wxyz):.3g}; allowed: 1")
-    return from_parts(Rotation.from_quat([x, y, z, w]).as_matrix(), np.asarray(translation))
 
 
 def model_of_distortion(name: object) -> CameraModel | None:
