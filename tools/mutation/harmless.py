@@ -216,9 +216,9 @@ HARMLESS: tuple[Harmless, ...] = (
         "any width that a line has room for will do",
     ),
     Harmless(
-        "simulation/visible_spots.py",
-        "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)",
-        "return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) >= 0)",
+        "sensors/facing.py",
+        "return np.asarray(cosines > (edge_on if sensor.dimension > 1 else 0.0))",
+        "return np.asarray(cosines >= (edge_on if sensor.dimension > 1 else 0.0))",
         "a face is exactly edge-on only by rounding",
     ),
     Harmless(

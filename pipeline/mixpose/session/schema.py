@@ -99,8 +99,8 @@ class ObjectTable(Table):
         Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
     ] = None
     """Outward directions, one per feature (points first, then segments): a feature is seen only
-    by sensors that it faces, at up to 80° from its normal, where it is a sixth as high as wide; a
-    sphere at up to 90°.
+    by sensors that it faces, by cameras at up to 80° from its normal, where it is a sixth as high
+    as wide; a sphere at up to 90°.
     Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`"""
     shape: Shape = "point"
     """What the markers are: points, or spheres or flat disks of a `radius`, the centres of whose
