@@ -98,6 +98,20 @@ def test_what_looks_like_the_body_as_closely_as_it_errs_is_a_second_one(
         assert status == "ambiguous" or off(one, HERE)[0] < 1.0
 
 
+def test_what_differs_by_a_marker_is_told_from_the_body_though_that_is_cut_afterwards() -> None:
+    points = TOOL.copy()
+    points[2, 0] += 5.0  # 4 px, which is near enough to be met
+    other = body("other", points)
+    # of all frames the one counts that tells most: in the last ones two markers are hidden
+    part, tracker = body("part", TOOL[:4]), Tracker.create(SOLID, OPTIONS)
+    scene = Scene((tracker,))
+    tracks = scene.begin()
+    for frame, shown in enumerate([[SOLID]] * 2 + [[SOLID, other]] * 3 + [[part, other]] * 3):
+        views = views_of(shown, [HERE, THERE][: len(shown)], frame)
+        tracks, (found,) = scene.advance(tracks, frame, None, views)
+        assert (found.status, off(found, HERE)[0] < 1.0) == ("ok", True), frame
+
+
 def test_as_many_other_spots_are_no_second_body() -> None:
     other = body("other", OTHER)
     scene = Scene((Tracker.create(SOLID, EstimatorOptions()),))

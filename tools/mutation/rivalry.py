@@ -159,4 +159,20 @@ MUTANTS = (
         "a box whose sides are seen edge-on misses two thirds of its markers",
         ("test_sensors_facing.py",),
     ),
+    Mutant(
+        "tracking-second-poses-may-be-off",
+        "tracking/twin.py",
+        "return (off[1] - off[0]) * math.log(sum(errors.chances))",
+        "return 0.0",
+        "what differs from the body by a marker makes frames ambiguous, or is it once that is cut",
+        ("test_tracking_twin.py",),
+    ),
+    Mutant(
+        "tracking-what-told-two-poses-apart-is-forgotten",
+        "tracking/tracker.py",
+        "(second.told or second.either <= log_doubt)",
+        "second.told",
+        "the same, where two of the body's markers are hidden later",
+        ("test_tracking_twin.py",),
+    ),
 )

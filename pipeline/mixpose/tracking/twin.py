@@ -23,7 +23,6 @@ from mixpose.judgement import (
     is_sure,
     met_by_one,
 )
-from mixpose.matching import log_likelihood
 from mixpose.objective import View
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.doubt import TWICE, contradicted, decided
@@ -144,16 +143,19 @@ def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
 
 
 def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
-    """Log odds for the second pose by its offsets, as detections err as they do at the first."""
-    errors, count = data.rules.judgement.noise.errors, int(np.count_nonzero(data.free))
-    noise = dict(zip(best.used.names, best.variances.tolist()))
-    pairs = zip(second.used.names, second.variances.tolist(), strict=True)
-    known = np.array([noise.get(name, own) for name, own in pairs])
-    likely, most = (
-        log_likelihood(errors.blur * np.sqrt(one), second.used, count, errors)
-        for one in (known, second.variances)
-    )
-    return float(likely - most)
+    """Log odds for the second pose by what either meets far off, though it looks whole.
+
+    Of spots of the body few are cut unseen; detections err as they do where they err least.
+    """
+    errors, noise = data.rules.judgement.noise.errors, dict[str, float]()
+    for one in (best, second):
+        for name, variance in zip(one.used.names, one.variances.tolist(), strict=True):
+            noise[name] = min(variance, noise.get(name, variance))
+    off = []
+    for one in (best, second):
+        least = np.array([noise[name] for name in one.used.names])[:, None]
+        off.append(int(np.count_nonzero(errors.are_off(one.used, least + one.used.extra))))
+    return (off[1] - off[0]) * math.log(sum(errors.chances))
 
 
 def _is_due(data: Frame, best: ScoredPose, views: Sequence[View]) -> bool:
