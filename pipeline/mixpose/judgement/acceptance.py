@@ -61,7 +61,9 @@ class Second(NamedTuple):
     pose: ScoredPose | None  # None where there is nothing
     there: float  # log odds that it is there
     either: float  # that it is the body, and not the best pose
-    told: bool = False  # whether one of the two is seen to be the other's image in a mirror
+    told: bool = (
+        False  # whether one of the two is seen to be an image in a mirror, or another thing
+    )
 
 
 @dataclass(frozen=True)

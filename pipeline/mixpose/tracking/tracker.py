@@ -313,7 +313,6 @@ def judged_again(
 def followed(data: Frame, verdict: Verdict) -> Track:
     """The track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
-    log_doubt = data.rules.acceptance.log_doubt
     # what is likelier clutter is told, and not followed
     if best is None or best.log_evidence < 0:
         clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
@@ -329,7 +328,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         other = data.other_at(T)
         if second and one is second.pose:
             other = -second.either
-        elif second and one is best and (second.told or second.either <= log_doubt):
+        elif second and second.told and one is best:
             other = second.either
         branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
         is_new = one.proposer == SECOND_POSE
@@ -354,7 +353,8 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         met_before=dict(zip(used.names, met.tolist(), strict=True)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,
-        known=is_ok or (track.known and of_other_things(data, best) < log_doubt),
+        known=is_ok
+        or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
         gained=best.gained if is_ok else track.gained,
         shape=None if is_ok else verdict.shape,

@@ -23,6 +23,7 @@ from mixpose.judgement import (
     is_sure,
     met_by_one,
 )
+from mixpose.matching import log_likelihood
 from mixpose.objective import View
 from mixpose.search import Candidate, Copy, SeenTogether, search_copies
 from mixpose.tracking.doubt import TWICE, contradicted, decided
@@ -70,11 +71,13 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
         return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
     either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
     either += min(_farther_off(best, second, data), 0.0)
+    elsewhere = min(_by_features_elsewhere(best, second, data), 0.0)
+    either += elsewhere
     either, in_mirror = _by_mirror(either, best, second, data)
     # of all frames the one counts that tells most
     if known is not None and abs(known) > abs(either):
         either = known
-    is_told, share = in_mirror < accepted.log_doubt, float(expit(either))
+    is_told, share = min(in_mirror, elsewhere) < accepted.log_doubt, float(expit(either))
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
     if either > 0:
         told = _decided_beside(second, data, rest, is_told)
@@ -143,19 +146,44 @@ def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
 
 
 def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
-    """Log odds for the second pose by what either meets far off, though it looks whole.
+    """Log odds for the second pose by its offsets, as detections err as they do at the first.
 
-    Of spots of the body few are cut unseen; detections err as they do where they err least.
+    As if two were cut unseen, at the least: spots that are cut are so together.
+    """
+    errors, count = data.rules.judgement.noise.errors, int(np.count_nonzero(data.free))
+    noise = dict(zip(best.used.names, best.variances.tolist()))
+    pairs = zip(second.used.names, second.variances.tolist(), strict=True)
+    known = np.array([noise.get(name, own) for name, own in pairs])
+    likely, most = (
+        log_likelihood(errors.blur * np.sqrt(one), second.used, count, errors)
+        for one in (known, second.variances)
+    )
+    return max(float(likely - most), 2 * _of_one_cut(data))
+
+
+def _of_one_cut(data: Frame) -> float:
+    """Log of the chance that a spot of the body is off, though it looks whole."""
+    return math.log(sum(data.rules.judgement.noise.errors.chances))
+
+
+def _by_features_elsewhere(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+    """Log odds for the second pose by features that are elsewhere at either of them.
+
+    Of two sensors or more that have it in view none meets such a feature closely, and some far off.
+    Detections err as they do where they err least.
     """
     errors, noise = data.rules.judgement.noise.errors, dict[str, float]()
     for one in (best, second):
         for name, variance in zip(one.used.names, one.variances.tolist(), strict=True):
             noise[name] = min(variance, noise.get(name, variance))
-    off = []
+    spots = []
     for one in (best, second):
         least = np.array([noise[name] for name in one.used.names])[:, None]
-        off.append(int(np.count_nonzero(errors.are_off(one.used, least + one.used.extra))))
-    return (off[1] - off[0]) * math.log(sum(errors.chances))
+        off = errors.are_off(one.used, least + one.used.extra)
+        close = ((one.used.shares > 0) & ~off).any(axis=0)
+        elsewhere = ~close & ((one.used.weights > 0).sum(axis=0) > 1)
+        spots.append(int(np.count_nonzero(off[:, elsewhere])))
+    return (spots[1] - spots[0]) * _of_one_cut(data)
 
 
 def _is_due(data: Frame, best: ScoredPose, views: Sequence[View]) -> bool:
