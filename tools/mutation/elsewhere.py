@@ -123,8 +123,8 @@ MUTANTS = (
     Mutant(
         "tracking-a-second-pose-however-far-off",
         "tracking/twin.py",
-        "    either += min(_farther_off(best, second, data), 0.0)\n",
-        "",
+        "told_by = odds, _more_missed(best, second, data), farther, elsewhere",
+        "told_by = odds, _more_missed(best, second, data), elsewhere",
         "an unknown tool with three markers alike is taken for a second body",
         ("test_tracking_twin.py",),
     ),

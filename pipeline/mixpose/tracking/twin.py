@@ -69,18 +69,18 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     if second is None or odds <= accepted.log_doubt:
         against = [] if known is None else [Alternative(TWICE, known)]
         return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
-    either = min(odds, 0.0) + min(_more_missed(best, second, data), 0.0)
-    either += min(_farther_off(best, second, data), 0.0)
-    elsewhere = min(_by_features_elsewhere(best, second, data), 0.0)
-    either += elsewhere
+    farther, elsewhere = (ask(best, second, data) for ask in (_farther_off, _by_features_elsewhere))
+    told_by = odds, _more_missed(best, second, data), farther, elsewhere
+    either = sum(min(each, 0.0) for each in told_by)
     either, in_mirror = _by_mirror(either, best, second, data)
     # of all frames the one counts that tells most
     if known is not None and abs(known) > abs(either):
         either = known
-    is_told, share = min(in_mirror, elsewhere) < accepted.log_doubt, float(expit(either))
+    is_image, share = in_mirror < accepted.log_doubt, float(expit(either))
+    is_told = is_image or elsewhere < accepted.log_doubt
     kept = [*((one, weight * (1 - share)) for one, weight in verdict.kept), (second, share)]
     if either > 0:
-        told = _decided_beside(second, data, rest, is_told)
+        told = _decided_beside(second, data, rest, is_image)
         own = [kept[-1], *kept[:-1]]
         told = replace(told, kept=own, second=Second(best, odds, -either, is_told))
     else:
@@ -93,16 +93,16 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
     return replace(told, tried=verdict.tried).doubted([Alternative(TWICE, -abs(either))])
 
 
-def _decided_beside(second: ScoredPose, data: Frame, rest: SeenTogether, is_told: bool) -> Verdict:
+def _decided_beside(second: ScoredPose, data: Frame, rest: SeenTogether, is_image: bool) -> Verdict:
     """The decision about a second pose that is the body's, by what the other one leaves.
 
-    What was mirrored is the other one, and where that `is_told` this is in no mirror.
+    What was mirrored is the other one, and where that `is_image` this is in no mirror.
     """
     mistaken = {name: told for name, told in data.track.mistaken.items() if name != MIRRORED}
     track = replace(data.track, mistaken=mistaken)
     seen = data.seen_otherwise(views=rest.views, still=(), starts=(), track=track)
     told = decided(seen, [second])
-    return told.without(IN_A_MIRROR) if is_told else told
+    return told.without(IN_A_MIRROR) if is_image else told
 
 
 def _by_mirror(
