@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from checked import copied
 from command_line import (
     LONGEST_S,
     assert_one_line,
@@ -40,12 +41,7 @@ def recording(tmp_path: Path) -> Path:
     """Eight frames of the two-camera recording, free to be spoilt."""
     folder = tmp_path / "recording"
     folder.mkdir()
-    source = SYNTHETIC / "two_cameras"
-    shutil.copy(source / "session.toml", folder)
-    for n in range(8):
-        for side in ("left", "right"):
-            shutil.copy(source / f"{side}{n:04d}.png", folder)
-    return folder
+    return copied(folder)
 
 
 def evaluate(poses: Path, truth: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from checked import copied
 from command_line import assert_one_line, command, lines_of, mixpose
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
@@ -19,12 +20,7 @@ def recording(tmp_path: Path) -> Path:
     """Eight frames of the two-camera recording, free to be spoilt."""
     folder = tmp_path / "recording"
     folder.mkdir()
-    source = SYNTHETIC / "two_cameras"
-    shutil.copy(source / "session.toml", folder)
-    for n in range(8):
-        for side in ("left", "right"):
-            shutil.copy(source / f"{side}{n:04d}.png", folder)
-    return folder
+    return copied(folder)
 
 
 @pytest.mark.parametrize(

@@ -98,8 +98,8 @@ MUTANTS = (
     Mutant(
         "tracking-contradictions-are-forgotten",
         "tracking/doubt.py",
-        "rules, before = data.rules, data.track.mistaken.get(CONTRADICTION, 0.0)",
-        "rules, before = data.rules, 0.0",
+        "before = track.mistaken.get(CONTRADICTION, 0.0)",
+        "before = 0.0",
         "of two cameras that contradicted each other one alone is believed in the next frame",
         (_RIVALS,),
     ),
@@ -146,8 +146,8 @@ MUTANTS = (
     Mutant(
         "tracking-near-spots-are-not-fitted",
         "tracking/refinements.py",
-        "return replace(seen, shares=shares, offsets=offsets)\n\n\ndef agreed",
-        "return replace(seen, shares=shares)\n\n\ndef agreed",
+        "return replace(seen, shares=shares, offsets=offsets) if is_more",
+        "return replace(seen, shares=shares) if is_more",
         "what is nearly met is taken for met exactly",
         ("test_tracking_refinements.py",),
     ),

@@ -172,6 +172,7 @@ class _Run:
         part, best = self._part, self._best
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
+        # without parameters of the rig, so that all rigs are held to the same
         bundle = self._bundle(part).of_poses
         _, before = result.fitted(bundle, self._task.rig, best)
         _, after = result.fitted(bundle, best.state.rig, best)

@@ -120,9 +120,13 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
     """Images in the given order as a source; they are numbered by `frame_numbers`."""
     numbers, ordered = zip(*sorted(zip(frame_numbers(paths), paths, strict=True)), strict=True)
     is_stamped = spec.times is None and all(_FIRST_STAMP <= n < _LAST_STAMP for n in numbers)
-    if is_stamped:  # nanoseconds as whole numbers, which Python rounds once
-        clock = lambda stamp: stamp / 10**9  # noqa: E731
+    clock = _time_of_stamp if is_stamped else clock
     return ImageSequence(ordered, numbers, spec.resolution, clock, is_stamped, spec.fps is not None)
+
+
+def _time_of_stamp(stamp: int) -> float:
+    """Nanoseconds as seconds."""
+    return stamp / 10**9  # of whole numbers, which Python rounds once
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:

@@ -61,9 +61,7 @@ class Second(NamedTuple):
     pose: ScoredPose | None  # None where there is nothing
     there: float  # log odds that it is there
     either: float  # that it is the body, and not the best pose
-    told: bool = (
-        False  # whether one of the two is seen to be an image in a mirror, or another thing
-    )
+    told: bool = False  # whether one of them is seen to be an image in a mirror, or another thing
 
 
 @dataclass(frozen=True)
@@ -338,7 +336,7 @@ def two_agree(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> 
     used = judged.used
     squares, degrees = (used.summed(each) for each in (used.squares, used.measurements))
     variances = squares / np.maximum(degrees, 1e-12)
-    meet = used.summed(used.coverage) >= rules.agreeing * used.images
+    meet = used.covered >= rules.agreeing
     least = max(float(variances[meet].min(initial=np.inf)), model.usual**2)
     agree = meet & (variances <= model.errors.outlying**2 * least)
     return bool(judged.residual_ratio <= 1 and np.count_nonzero(agree) > 1)

@@ -142,6 +142,11 @@ class Matches:
         return np.asarray(np.bincount(self.owner, values), dtype=np.float64)
 
     @property
+    def covered(self) -> Floats:
+        """The same of each sensor (S,): the mean of its images."""
+        return np.asarray(self.summed(self.coverage) / self.images)
+
+    @property
     def measurements(self) -> Floats:
         """Number of coordinates that are met (..., L)."""
         return np.asarray(self.met * self.dimensions * self.each_part)

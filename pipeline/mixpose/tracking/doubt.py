@@ -201,11 +201,11 @@ def _of_contradiction(data: Frame, judged: ScoredPose) -> Mistake:
     From a frame on in which one alone meets the body and another sees as much of it elsewhere, and
     until two agree.  A pose between them is farther off than chance makes it.
     """
-    rules, before = data.rules, data.track.mistaken.get(CONTRADICTION, 0.0)
-    accepted, known = rules.acceptance, (data.track.agreed, rules.acceptance, rules.judgement.noise)
-    if others_miss(judged, _noise_before(data, judged), *known):
+    track, known = data.track, (data.rules.acceptance, data.rules.judgement.noise)
+    before = track.mistaken.get(CONTRADICTION, 0.0)
+    if others_miss(judged, _noise_before(data, judged), track.agreed, *known):
         before = _as_likely_as_not(data)
-    elif before and two_agree(judged, accepted, rules.judgement.noise):
+    elif before and two_agree(judged, *known):
         before = 0.0
     return Mistake(CONTRADICTION, APART, before, 0.0 if before else -math.inf)
 

@@ -49,7 +49,7 @@ def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
 
     They may be covered or out of step, and a pose that others leave open bends to what is there.
     """
-    coverage = seen.summed(seen.coverage) / seen.images
+    coverage = seen.covered
     spare = seen.summed(seen.count) > seen.summed(seen.met)
     little = (coverage > 0) & (coverage < rules.agreeing) & spare
     names = [seen.names[k] for k in np.flatnonzero(little[seen.owner])]
@@ -63,7 +63,7 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
     residuals that are far larger than the others', more than chance would make them.
     """
     summed = seen.summed
-    agreeing = summed(seen.coverage) >= rules.agreeing * seen.images
+    agreeing = seen.covered >= rules.agreeing
     apart = ~agreeing & (summed(seen.expected) > 0)
     apart &= summed(seen.unmatched_nearby) >= rules.agreeing * summed(seen.missed)
     squares, degrees = summed(seen.squares) * agreeing, summed(seen.measurements) * agreeing
@@ -182,13 +182,13 @@ def _with_near(frame: Frame, seen: Matches) -> Matches:
         which, m = np.flatnonzero(lost[k]), points.shape[1]
         away = (points[rest] - seen.places[k, which, None, :m]) / seen.sigmas[k]
         distances = np.linalg.norm(away, axis=2)
-        for i, j in zip(*linear_sum_assignment(np.minimum(distances, reach))):
-            if distances[i, j] < reach:
-                shares[k, which[i]], offsets[k, which[i], :m] = (
-                    seen.weights[k, which[i]],
-                    away[i, j],
-                )
-    return replace(seen, shares=shares, offsets=offsets)
+        i, j = linear_sum_assignment(np.minimum(distances, reach))
+        is_near = distances[i, j] < reach
+        found = which[i[is_near]]
+        shares[k, found] = seen.weights[k, found]
+        offsets[k, found, :m] = away[i[is_near], j[is_near]]
+    is_more = np.count_nonzero(shares) > np.count_nonzero(seen.shares)
+    return replace(seen, shares=shares, offsets=offsets) if is_more else seen
 
 
 def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
