@@ -118,8 +118,10 @@ def covariance_at(covariance: Floats, arm: Floats) -> Floats:
     """A pose's covariance (..., 6, 6) at a point an arm (..., 3) in world axes from its origin."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
     J[..., range(6), range(6)] = 1.0
+    x, y, z = np.asarray(arm).T
     # a turn w moves the point by w × arm
-    J[..., :3, 3:] = np.cross(np.eye(3), np.asarray(arm)[..., None, :]).swapaxes(-1, -2)
+    J[..., 0, 4], J[..., 0, 5], J[..., 1, 5] = z.T, -y.T, x.T
+    J[..., 1, 3], J[..., 2, 3], J[..., 2, 4] = -z.T, y.T, -x.T
     return np.asarray(J @ covariance @ J.swapaxes(-1, -2))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,27 +75,20 @@ def deviations_of(blobs: Sequence[Blob], usual: float) -> Floats:
     much as its centre is off, in radii.  So are oblique ones and streaks, but several alike, and
     with all of a rim.  What little is hidden shows in grey values, beyond what noise makes.
     """
-    deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
-    residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
-    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
-    longer = [blob.length / typical[0] - 1 for blob in blobs]
-    margins = [_roughness(blob, residual) for blob in blobs]
-    if any(one > margin for one, margin in zip(longer, margins)):  # as a rule all are round
-        shapes = np.array([(blob.area, blob.length, blob.turn) for blob in blobs])
-        longer = np.minimum(longer, longer_than_alike(shapes, BLOBS.alike)).tolist()
-    for k, (blob, margin) in enumerate(zip(blobs, margins)):
-        is_cut_rim = blob.rim is not None and margin < math.inf
-        off, share = blob.off or 0.0, BLOBS.by_rim if is_cut_rim else 1.0
-        shown = share * off if off > BLOBS.usual * usual else 0.0
-        radius = math.sqrt(blob.area / math.pi)
-        deviations[k] = max(BLOBS.off_centre * radius * (longer[k] - margin), shown)
-    return deviations
-
-
-def _roughness(blob: Blob, residual: float) -> float:
-    """By how much a whole blob may be longer than others; all of a rim tells by itself."""
-    radius, rim = math.sqrt(blob.area / math.pi), blob.rim
-    if rim is None:
-        return BLOBS.rough / math.pow(radius, 1.5)
-    is_cut = rim.coverage < BLOBS.whole or rim.residual > BLOBS.exact * residual
-    return 0.0 if radius < BLOBS.large and is_cut else math.inf
+    if not blobs:
+        return np.zeros(0)
+    table = np.array([(one.area, one.length, one.turn, one.off or 0.0) for one in blobs])
+    radii, lengths, off = np.sqrt(table[:, 0] / np.pi), table[:, 1], table[:, 3]
+    longer = lengths / np.sort(lengths)[(len(blobs) + 3) // 4 - 1] - 1
+    # by how much a whole blob may be longer than others; all of a rim tells by itself
+    margins, shares = BLOBS.rough / radii**1.5, np.ones(len(blobs))
+    rims = [(k, one.rim) for k, one in enumerate(blobs) if one.rim is not None]
+    residual = statistics.median_low([rim.residual for _, rim in rims]) if rims else 0.0
+    for k, rim in rims:
+        is_cut = rim.coverage < BLOBS.whole or rim.residual > BLOBS.exact * residual
+        is_cut &= radii[k] < BLOBS.large
+        margins[k], shares[k] = (0.0, BLOBS.by_rim) if is_cut else (np.inf, 1.0)
+    if np.count_nonzero(longer > margins):  # as a rule all are round
+        longer = np.minimum(longer, longer_than_alike(table[:, :3], BLOBS.alike))
+    shown = np.where(off > BLOBS.usual * usual, shares * off, 0.0)
+    return np.asarray(np.maximum(BLOBS.off_centre * radii * (longer - margins), shown))

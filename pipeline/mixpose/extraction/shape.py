@@ -21,6 +21,8 @@ from mixpose.extraction.sampling import parts_of
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats, Indices
 
+_TINY = float(np.finfo(np.float32).tiny)
+
 # Patches of so many shapes are prepared for.
 SHAPES = 256
 
@@ -63,7 +65,7 @@ def areas_at_half(signal: NDArray[np.float32], base: Floats, peak: Floats) -> Fl
 
     Pixels from a quarter to three quarters of it count in part.
     """
-    height = np.maximum(peak - base, np.finfo(np.float32).tiny).astype(np.float32)
+    height = np.maximum(peak - base, _TINY).astype(np.float32)
     share = (signal - base.astype(np.float32)[:, None, None]) * (2 / height)[:, None, None]
     share -= np.float32(0.5)
     np.clip(share, 0, 1, out=share)

@@ -28,6 +28,8 @@ from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import cross
 
+_TINY = float(np.finfo(np.float64).tiny)
+
 
 @dataclass(frozen=True)
 class SizeRules:
@@ -187,10 +189,9 @@ def _scales(J: Floats, T_world_object: Floats, body: Body) -> Floats:
 
     Roots of areas: of a disk of its own plane, of anything else across the line of sight.
     """
-    u, v = np.moveaxis(J[..., :3], (-2, -1), (0, 1))
-    across = np.moveaxis(cross(u, v), 0, -1)
+    across = cross(J[..., 0, :3].T, J[..., 1, :3].T).T
     if body.shape == "disk" and body.node_normals is not None:
         areas = np.abs(np.vecdot(across, body.node_normals @ T_world_object[:3, :3].T))
     else:
         areas = np.linalg.norm(across, axis=-1)
-    return np.asarray(np.sqrt(np.maximum(areas, np.finfo(np.float64).tiny)))
+    return np.asarray(np.sqrt(np.maximum(areas, _TINY)))
