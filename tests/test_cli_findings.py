@@ -10,6 +10,7 @@ import pytest
 
 from mixpose.body import ASIDE, TURNED
 from mixpose.cli.findings import Findings
+from mixpose.cli.marker_offsets import Marker
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import (
@@ -209,3 +210,35 @@ def test_a_marker_is_measured_wrong_where_its_offsets_are_no_chance(
         assert told[0].startswith(
             f"marker {name} is met 1 mm off in {frames} of {frames} frames: measured wrong?"
         )
+
+
+@pytest.mark.parametrize(
+    ("frames", "since", "said"),
+    [
+        (40, 0, "met 1 mm off in 40 of 40 frames: measured wrong?"),
+        (40, 20, "met 1 mm off from frame 20 on, in 20 frames: moved?"),
+        (40, 5, "met 0.88 mm off in 40 of 40 frames: measured wrong?"),  # 5 frames tell nothing
+        (40, 35, ""),  # 5 frames may be chance
+        # stretches are of four frames by then
+        (120, 64, "met 1 mm off from frame 64 on, in 56 frames: moved?"),
+        (120, 67, "met 1 mm off from frame 68 on, in 52 frames: moved?"),
+    ],
+)
+def test_a_marker_that_moves_on_the_body_is_told_with_the_frame(
+    frames: int, since: int, said: str
+) -> None:
+    marker, rng, J = Marker(), np.random.default_rng(0), np.eye(2, 3)
+    for frame in range(frames):
+        off = np.array([float(frame >= since), 0.0]) + rng.normal(0, 0.01, 2)
+        marker.add(frame, [(1.0, off, J), (1.0, off, np.eye(3)[[0, 2]])])
+    assert (marker.oddness(1e-3, "mm") or "") == said
+
+
+def test_what_is_kept_of_a_marker_does_not_grow_and_sums_up_to_all_frames() -> None:
+    marker, J = Marker(), np.eye(2, 3)
+    for frame in range(5000):
+        marker.add(frame, [(0.5, np.array([0.0, 2.0]), J)])
+        assert len(marker.stretches) <= 32
+    whole = marker.whole
+    assert (whole.first, whole.met, whole.squares, whole.views) == (0, 5000, 1e4, 2500.0)
+    np.testing.assert_allclose(whole.shift(), [0, 2, 0], atol=1e-6)

@@ -65,6 +65,7 @@ def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and
         ("black all along", 6, 6),
         ("bumped by 3° about y from frame 20", 25, 20),
         ("marker falls off", 31, 31),
+        ("marker moves on the body", 40, 36),
         ("marker measured 20 mm wrong", 12, 12),
         ("another camera's calibration", 4, 0),
     ],

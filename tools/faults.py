@@ -283,6 +283,10 @@ FAULTS: dict[str, Fault] = {
     ),
     "marker gone": Fault(points(gone), "marker 8 .*gone"),
     "marker falls off": Fault(lambda folder: fallen(folder, 4, range(20, 40)), "marker 5 .*gone"),
+    "marker moves on the body": Fault(
+        lambda folder: fallen(folder, 3, range(20, 40), (1.2, 0.0, 1.6)),
+        "marker 4 is met 2 mm off from frame 20 on.*moved",
+    ),
     "marker measured 20 mm wrong": Fault(moved(3, (12.0, 0.0, 16.0)), "marker 4 .*measured wrong"),
     "marker measured 2 mm wrong": Fault(moved(3, (1.2, 0.0, 1.6)), "marker 4 .*measured wrong"),
     "body mirrored": Fault(
@@ -291,21 +295,32 @@ FAULTS: dict[str, Fault] = {
 }
 
 
-def fallen(folder: Path, number: int, frames: range) -> None:
-    """Paint over a marker."""
+def fallen(
+    folder: Path, number: int, frames: range, onto: tuple[float, float, float] | None = None
+) -> None:
+    """Paint over a marker, and what was there where it is once it has moved by `onto`."""
     session = load_session(folder / "session.toml")
     truth = {line.frame: line.T_world_object for line in read_poses(folder / "truth.jsonl").poses}
+    before = session.body.means[number]
     for setup in session.sensors:
         for frame in frames:
             T = truth[frame]
             assert T is not None
-            place = T[:3, :3] @ session.body.means[number] + T[:3, 3]
-            u, v = setup.sensor.project(place[None])[0][0]
+            places = np.array([before, before + (onto or 0.0)]) @ T[:3, :3].T + T[:3, 3]
+            (u, v), after = setup.sensor.project(places)[0]
             path = image(folder, setup.name, frame)
             picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             assert picture is not None
+            by = np.array([[1, 0, after[0] - u], [0, 1, after[1] - v]], np.float32)
+            size = (picture.shape[1], picture.shape[0])
+            moved = cv2.warpAffine(picture, by, size, flags=cv2.INTER_CUBIC)
+            about = cv2.circle(
+                np.zeros_like(picture), (round(float(after[0])), round(float(after[1]))), 9, 1, -1
+            )
             dark = int(np.median(picture))
             cv2.circle(picture, (round(float(u)), round(float(v))), 9, dark, -1)
+            if onto is not None:
+                picture[about > 0] = moved[about > 0]
             cv2.imwrite(str(path), picture)
 
 

@@ -12,25 +12,22 @@ from functools import cached_property
 from statistics import median
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli.body_size import BodySize, size_warnings
+from mixpose.cli.marker_offsets import MOVED, Marker, add_markers, marker_lines
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, FrameSet
+from mixpose.records import Estimate, FrameSet
 from mixpose.session import Session
 from mixpose.tracking import CHANGED, OUT_OF_STEP, TWICE, plane_views
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
-_GONE = 0.25  # of the frames in which a marker should be seen, at their end: it fell off
-_FEWEST = 10  # frames in which a marker should have been seen before anything is said of it
-_MEASURED = 4.0  # times what the other markers are off: a marker that is measured wrong
-_SURE = 100.0  # squared offset in its own noise from which that is no chance
+_FEWEST = 10  # frames that a sensor is met in before anything is said of it
 _FAR = 10.0  # times what is usual for a sensor: its features are met far off
 _AT_LEAST = 0.2  # of sigma, for that
 _USUAL = 100  # frames by which it is told what is usual
@@ -73,27 +70,6 @@ class Stretches:
         return ", ".join(parts) + (f" and {more} more" if more else "")
 
 
-class _Marker:
-    """How one marker was met."""
-
-    def __init__(self) -> None:
-        self.expected = self.met = 0
-        self.since: int | None = None  # first frame since which it was not met
-        self.missed_since = 0
-        self.normal, self.pull = np.zeros((3, 3)), np.zeros(3)
-        self.squares, self.views = 0.0, 0.0  # of whole spots, each by what it tells
-
-    def shift(self) -> Floats:
-        """Displacement in the body's axes that explains its offsets best (3,)."""
-        scale = max(float(np.trace(self.normal)), 1e-300)
-        inner = self.normal + 1e-9 * scale * np.eye(3)
-        return np.asarray(np.linalg.solve(inner, self.pull))
-
-    def systematic(self) -> float:
-        """Mean squared offset that this displacement takes away."""
-        return float(self.pull @ self.shift()) / max(self.views, 1e-12)
-
-
 class Findings:
     """What is remembered of the frames of a run."""
 
@@ -116,7 +92,7 @@ class Findings:
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
         self._doubted = Stretches()  # for whatever reason
-        self._markers: dict[str, dict[int, _Marker]] = {}
+        self._markers: dict[str, dict[int, Marker]] = {}
         self._sizes = {
             label: BodySize(session, one.body.means)
             for one in session.objects
@@ -175,7 +151,7 @@ class Findings:
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
-            self._add_markers(estimate)
+            add_markers(self._markers.setdefault(estimate.label, {}), estimate)
             if estimate.label in self._sizes:
                 self._sizes[estimate.label].add(estimate)
 
@@ -200,34 +176,6 @@ class Findings:
                 self._far[name].add(estimate.frame, self._places)
             else:
                 usual.append(off)
-
-    def _add_markers(self, estimate: Estimate) -> None:
-        T = estimate.T_world_object
-        assert T is not None
-        markers = self._markers.setdefault(estimate.label, {})
-        met: dict[int, bool] = {}
-        for name, one in estimate.offsets.items():
-            explained = estimate.sensors[name].explained or 0.0
-            if explained < 0.1:  # what it sees is not the body
-                continue
-            for k, i in enumerate(one.features.tolist()):
-                marker = markers.setdefault(i, _Marker())
-                met[i] = met.get(i, False) or bool(one.met[k])
-                if one.met[k]:
-                    J, weight = one.by_shift[k] @ T[:3, :3], float(one.weights[k])
-                    marker.normal += weight * J.T @ J
-                    marker.pull += weight * J.T @ one.offsets[k]
-                    marker.squares += weight * float(one.offsets[k] @ one.offsets[k])
-                    marker.views += weight
-        for i, is_met in met.items():
-            marker = markers[i]
-            marker.expected += 1
-            marker.met += is_met
-            if is_met:
-                marker.since, marker.missed_since = None, 0
-            else:
-                marker.since = estimate.frame if marker.since is None else marker.since
-                marker.missed_since += 1
 
     def causes(self) -> list[str]:
         """What of the session or the bodies is most likely at fault, a line each."""
@@ -263,8 +211,10 @@ class Findings:
                     f"sensor {name!r} shows the same as the frame before in frames {each.text()}, "
                     "which contradicts the others: frozen, or frames doubled?"
                 )
+        # what one marker makes is said of it
+        has_moved = any(line.endswith(MOVED) for line in self._of_markers())
         for name, each in self._far.items():
-            if each.longest >= _LONG:
+            if each.longest >= _LONG and not has_moved:
                 lines.append(
                     f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
                     f"{self._units[name]} before, in {each.count} of {total} frames: "
@@ -345,48 +295,5 @@ class Findings:
             if label not in bodies:
                 continue
             of = f" of {label!r}" if len(self._session.labels) > 1 else ""
-            means = {i: one.squares / one.views for i, one in markers.items() if one.views}
-            others = {i: [each for j, each in means.items() if j != i] for i in means}
-            typical = {i: float(np.median(each)) for i, each in others.items() if len(each) > 1}
-            told = dict[str, list[int]]()
-            for i, marker in sorted(markers.items()):
-                for text in _about(marker, typical.get(i, np.inf), self._session.unit):
-                    told.setdefault(text, []).append(i)
-            labels = bodies[label].labels
-            lines += [_of_some(text, some, labels, of) for text, some in told.items()]
+            lines += marker_lines(markers, bodies[label].labels, of, self._session.unit)
         return lines
-
-
-def _of_some(text: str, numbers: Sequence[int], labels: Sequence[str], of: str) -> str:
-    """What is odd about markers (their numbers, rising) that have it in common."""
-    names = [labels[i] for i in numbers]
-    if len(names) == 1:
-        return f"marker {names[0]}{of} is {text}"
-    in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
-    called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
-    return f"markers {called}{of} are each {text}"
-
-
-def _about(marker: _Marker, typical: float, unit: str) -> list[str]:
-    """What is odd about a marker."""
-    if marker.expected < _FEWEST:
-        return []
-    if not marker.met:
-        return [
-            f"met in none of {marker.expected} frames where it should be seen: gone, "
-            "or measured wrong?"
-        ]
-    systematic = marker.systematic()
-    own = max(marker.squares / marker.views - systematic, 1e-12)
-    # of a few frames a displacement takes up all
-    sure = systematic * marker.views / own > _SURE and marker.met >= _FEWEST
-    if sure and systematic > _MEASURED**2 * typical:
-        off = float(np.linalg.norm(marker.shift()))
-        return [
-            f"met {off:.2g} {unit} off in {marker.met} of {marker.expected} frames: measured wrong?"
-        ]
-    # one that is measured wrong is missed, too, wherever it is too far off
-    gone = marker.missed_since
-    if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
-        return [f"not met from frame {marker.since} on, in {gone} frames: gone?"]
-    return []

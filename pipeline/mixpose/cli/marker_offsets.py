@@ -1,0 +1,172 @@
+"""Markers that a run met elsewhere than the body has them, from some frame on or all along."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+from itertools import accumulate
+
+import numpy as np
+
+from mixpose.records import Estimate, Floats
+
+MOVED = "moved?"
+
+_GONE = 0.25  # of the frames in which a marker should be seen, at their end: it fell off
+_FEWEST = 10  # frames in which a marker should have been seen before anything is said of it
+_MEASURED = 4.0  # times what the other markers are off: a marker that is not where it should be
+_SURE = 100.0  # squared offset in its own noise from which that is no chance
+_KEPT = 32  # stretches of frames by whose sums it is told when a marker moved
+
+
+@dataclass
+class _Sums:
+    """Of a stretch of frames: by what displacement in the body's axes a marker is met off."""
+
+    first: int  # frame
+    met: int = 0  # frames
+    squares: float = 0.0  # of the offsets of whole spots, each by what it tells
+    views: float = 0.0
+    normal: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    pull: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def __add__(self, after: _Sums) -> _Sums:
+        return _Sums(
+            self.first,
+            self.met + after.met,
+            self.squares + after.squares,
+            self.views + after.views,
+            self.normal + after.normal,
+            self.pull + after.pull,
+        )
+
+    def shift(self) -> Floats:
+        """Displacement in the body's axes that explains its offsets best (3,)."""
+        scale = max(float(np.trace(self.normal)), 1e-300)
+        inner = self.normal + 1e-9 * scale * np.eye(3)
+        return np.asarray(np.linalg.solve(inner, self.pull))
+
+    def explained(self) -> float:
+        """How much of the squares this displacement takes away."""
+        return float(self.pull @ self.shift())
+
+
+class Marker:
+    """How one marker was met."""
+
+    def __init__(self) -> None:
+        self.expected = 0
+        self.since: int | None = None  # first frame since which it was not met
+        self.missed_since = 0
+        self.stretches: list[_Sums] = []
+        self._longest = 1  # frames that a stretch may have
+
+    def add(self, frame: int, seen: Sequence[tuple[float, Floats, Floats]] | None) -> None:
+        """Count a frame: weights, offsets and Jacobians in the body's axes, None where not met."""
+        self.expected += 1
+        if seen is None:
+            self.since = frame if self.since is None else self.since
+            self.missed_since += 1
+            return
+        self.since, self.missed_since = None, 0
+        sums = _Sums(frame, 1)
+        for weight, offset, J in seen:
+            sums.squares += weight * float(offset @ offset)
+            sums.views += weight
+            sums.normal += weight * J.T @ J
+            sums.pull += weight * J.T @ offset
+        if self.stretches and self.stretches[-1].met < self._longest:
+            self.stretches[-1] += sums
+            return
+        if len(self.stretches) == _KEPT:
+            pairs = zip(self.stretches[::2], self.stretches[1::2], strict=True)
+            self.stretches = [one + other for one, other in pairs]
+            self._longest *= 2
+        self.stretches.append(sums)
+
+    @property
+    def whole(self) -> _Sums:
+        """Sums over all frames."""
+        return reduce(_Sums.__add__, self.stretches, _Sums(0))
+
+    def displaced(self) -> tuple[_Sums, float]:
+        """The stretch up to the end in which it is elsewhere, and the variance that this leaves.
+
+        All frames, unless what shows since one of them explains surely more.
+        """
+        *others, whole = accumulate(reversed(self.stretches), lambda after, one: one + after)
+        since = [one for one in others if one.met >= _FEWEST <= whole.met - one.met]
+        latest = max(since, key=_Sums.explained, default=whole)
+        for one in (latest, whole):
+            own = max((whole.squares - one.explained()) / max(whole.views, 1e-12), 1e-12)
+            if one is whole or one.explained() - whole.explained() > _SURE * own:
+                break
+        return one, own
+
+    def oddness(self, typical: float, unit: str) -> str | None:
+        """What is odd about it in words, by how far off others are (squares a view)."""
+        if self.expected < _FEWEST:
+            return None
+        whole = self.whole
+        if not whole.met:
+            return (
+                f"met in none of {self.expected} frames where it should be seen: gone, or "
+                "measured wrong?"
+            )
+        since, own = self.displaced()
+        explained = since.explained()
+        # of a few frames a displacement takes up all
+        sure = explained / own > _SURE and since.met >= _FEWEST
+        if sure and explained > _MEASURED**2 * typical * since.views:
+            off = f"met {float(np.linalg.norm(since.shift())):.2g} {unit} off"
+            if since.met < whole.met:
+                return f"{off} from frame {since.first} on, in {since.met} frames: {MOVED}"
+            return f"{off} in {whole.met} of {self.expected} frames: measured wrong?"
+        # one that is measured wrong is missed, too, wherever it is too far off
+        gone = self.missed_since
+        if self.since is not None and gone >= max(_FEWEST, _GONE * self.expected):
+            return f"not met from frame {self.since} on, in {gone} frames: gone?"
+        return None
+
+
+def add_markers(markers: dict[int, Marker], estimate: Estimate) -> None:
+    """Count how the markers of a body are met in a frame that is ok."""
+    T = estimate.T_world_object
+    assert T is not None
+    seen: dict[int, list[tuple[float, Floats, Floats]]] = {}
+    for name, one in estimate.offsets.items():
+        if (estimate.sensors[name].explained or 0.0) < 0.1:  # what it sees is not the body
+            continue
+        for k, i in enumerate(one.features.tolist()):
+            of_marker = seen.setdefault(i, [])
+            if one.met[k]:
+                J = one.by_shift[k] @ T[:3, :3]
+                of_marker.append((float(one.weights[k]), one.offsets[k], J))
+    for i, of_marker in seen.items():
+        markers.setdefault(i, Marker()).add(estimate.frame, of_marker or None)
+
+
+def marker_lines(
+    markers: Mapping[int, Marker], labels: Sequence[str], of: str, unit: str
+) -> list[str]:
+    """What is odd about markers of a body (its name in words, `of`), a line each."""
+    wholes = {i: one.whole for i, one in markers.items()}
+    means = {i: one.squares / one.views for i, one in wholes.items() if one.views}
+    told = dict[str, list[int]]()
+    for i, marker in sorted(markers.items()):
+        others = [mean for j, mean in means.items() if j != i]
+        typical = float(np.median(others)) if i in means and len(others) > 1 else np.inf
+        if text := marker.oddness(typical, unit):
+            told.setdefault(text, []).append(i)
+    return [_of_some(text, some, labels, of) for text, some in told.items()]
+
+
+def _of_some(text: str, numbers: Sequence[int], labels: Sequence[str], of: str) -> str:
+    """What is odd about markers (their numbers, rising) that have it in common."""
+    names = [labels[i] for i in numbers]
+    if len(names) == 1:
+        return f"marker {names[0]}{of} is {text}"
+    in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
+    called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
+    return f"markers {called}{of} are each {text}"
