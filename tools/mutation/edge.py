@@ -274,8 +274,8 @@ _CHECKING = (
     Mutant(
         "checking-both-sides-are-seen",
         "checking/placement.py",
-        "np.count_nonzero(normals @ normals.T > 0, axis=1)",
-        "np.full(count, count)",
+        "np.median(np.count_nonzero(normals @ normals.T > session.body.edge_on, axis=1))",
+        "count",
         "a body with normals seems to lack the features of its back",
     ),
 )

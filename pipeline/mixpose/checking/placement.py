@@ -22,10 +22,10 @@ from mixpose.sensors import (
     PinholeCamera,
     RangeSensor,
     Sensor,
+    facing,
 )
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import count_seen, pivot_of, places
-from mixpose.simulation.visible_spots import facing
 
 Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
 
@@ -33,7 +33,6 @@ _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
 _LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
 _LARGEST_M = 20.0  # in metres: what is larger than a lorry is hardly seen as one rigid body
-_AVERTED = 0.2  # cosine: a feature that is turned away further is hardly seen
 _SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
 _TRIED = 64
 
@@ -234,9 +233,11 @@ def expected_count(setup: SensorSetup, session: Session) -> int:
     if session.start is None:
         if normals is None:
             return count
-        return int(np.median(np.count_nonzero(normals @ normals.T > 0, axis=1)))
+        return int(np.median(np.count_nonzero(normals @ normals.T > session.body.edge_on, axis=1)))
     T = session.start.T_world_object
-    seen = _seen(setup.sensor, session, T) & facing(setup.sensor, session.body, T)
+    body = session.body
+    seen = _seen(setup.sensor, session, T)
+    seen &= facing(setup.sensor, T, transform(T, body.means), body.normals, body.edge_on)
     return int(seen.sum()) if seen.sum() >= count / 2 else count
 
 
@@ -245,7 +246,7 @@ def fewest_count(setup: SensorSetup, session: Session) -> int:
     normals = session.body.normals
     if normals is None or session.start is not None:
         return expected_count(setup, session)
-    return int(np.count_nonzero(normals @ normals.T > _AVERTED, axis=1).min())
+    return int(np.count_nonzero(normals @ normals.T > session.body.edge_on, axis=1).min())
 
 
 def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:
