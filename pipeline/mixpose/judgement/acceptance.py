@@ -365,15 +365,20 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
-    """Of the poses that look the same, the one turned least against a reference, or the world."""
+    """Of those that look like poses (..., 4, 4), the ones turned least against a reference.
+
+    Or against the world.
+    """
     if len(body.symmetries) == 1:
         return T_world_object
-    R = T_world_object[:3, :3]
+    R = T_world_object[..., :3, :3]
     turned = R if T_reference is None else T_reference[:3, :3].T @ R
     # the angle grows as the trace of the difference falls
-    nearest = int((body.symmetries[:, :3, :3] * turned.T).sum(axis=(1, 2)).argmax())
+    traces = body.symmetries[:, :3, :3] * turned.swapaxes(-1, -2)[..., None, :, :]
+    nearest = traces.sum(axis=(-2, -1)).argmax(axis=-1)
     # the very same, where it is that: what was worked out for it holds
-    return T_world_object if nearest == body.identity else T_world_object @ body.symmetries[nearest]
+    is_same = not np.count_nonzero(nearest - body.identity)
+    return T_world_object if is_same else T_world_object @ body.symmetries[nearest]
 
 
 def beliefs(logs: Sequence[float]) -> list[float]:

@@ -204,13 +204,12 @@ class Frame(Setup):
         surprise = self.rules.motion.surprised(self.track.misses)
         return self.anywhere[0] + (math.log(surprise) if self.predictions else 0.0)
 
-    def expectation(self, poses: Sequence[Floats]) -> Floats:
-        """Log densities (K,) of poses (4, 4) by the body's own track, or that it is elsewhere."""
+    def expectation(self, poses: Floats) -> Floats:
+        """Log densities (K,) of poses (K, 4, 4) by its own track, or that it is elsewhere."""
         logs = np.full(len(poses), self.elsewhere)
         surprise = self.rules.motion.surprised(self.track.misses)
         for one in self.predictions:
-            alike = [nearest_alike(T, self.body, one.T_world_object) for T in poses]
-            there = np.reshape(alike, (-1, 4, 4))
+            there = nearest_alike(poses, self.body, one.T_world_object)
             near = one.log_density(there, self.free, self.rules.motion)
             logs = np.logaddexp(logs, math.log(max(1 - surprise, 1e-12)) + near)
         return logs
@@ -223,7 +222,7 @@ class Frame(Setup):
         doubt = max(self.track.alike.values(), default=-math.inf)
         if doubt > self.rules.acceptance.log_doubt:
             return np.zeros(len(poses))
-        return self.expectation([*poses]) - self.anywhere[0]
+        return self.expectation(poses) - self.anywhere[0]
 
     def away_from(self, T_world_object: Floats) -> list[Floats]:
         """How far the features (N,) of each prediction are from those at a pose.

@@ -94,7 +94,7 @@ def identify(
     poses, data = [bests[k] for k in finders], [found[k].frame for k in group]
     # by body (rows) and pose; in the last column none, as it is of one in view now and then
     rules, rows = data[0].rules, list[list[float]]()
-    there = [pose.T_world_object for pose in poses]
+    there = np.reshape([pose.T_world_object for pose in poses], (-1, 4, 4))
     for one in data:
         hidden = 0.5 if one.track.misses else rules.motion.hidden
         # one that nobody saw yet is as seldom in view as one that was is somewhere else

@@ -313,7 +313,7 @@ class AssociationLikelihood:
         covariance *= model.noise.enlargement(degrees)
         # maxima at other turns: right poses meet all features, off by the noise
         ahead = float((found.most - found.reached / 2 - found.log_odds)[0])
-        expected = float(frame.expectation([T])[0]) - frame.elsewhere
+        expected = float(frame.expectation(T[None])[0]) - frame.elsewhere
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,

@@ -121,7 +121,7 @@ class Sharing:
             some = [one for one in copies if one.kind == number]
             frames = [data[k] for k in group]
             evidence = np.array([one.evidence for one in some])
-            there = [one.T_world_object for one in some]
+            there = np.reshape([one.T_world_object for one in some], (-1, 4, 4))
             likely = np.array([evidence + one.expectation(there) for one in frames])
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 poses = some[j].T_world_object, some[j].rival
