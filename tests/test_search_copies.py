@@ -14,8 +14,8 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.search import SeenTogether, search_copies
-from mixpose.search.copies import _Candidates, _shared_out
-from mixpose.search.from_points import feature_triangles
+from mixpose.search.copies import _Candidates, _near_triples, _shared_out
+from mixpose.search.from_points import TriangulatedPoints, feature_triangles
 from mixpose.search.problem import SearchBudget
 
 Floats = NDArray[np.float64]
@@ -114,3 +114,34 @@ def test_features_on_a_line_have_no_triangles_and_are_not_found_by_them() -> Non
     line = body("line", np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [100.0, 0.5, 0.0]]))
     assert not len(feature_triangles(line, 36, 0.1)[0])
     assert search_copies(seen([line], [at(0.0)], 0), [line], ALL_FREE) == []
+
+
+@pytest.mark.parametrize(("count", "most"), [(30, 1000), (150, 1000), (150, 10**6)])
+def test_triples_of_near_points_are_those_of_the_first_points_however_many_there_are(
+    count: int, most: int
+) -> None:
+    rng = np.random.default_rng(count)
+    points = TriangulatedPoints(
+        rng.uniform(0, 100, (count, 3)),
+        np.full(count, 0.5),
+        np.zeros(count),
+        np.tile([0, 1], (count, 1)),
+        rng.integers(0, count // 2, (count, 2)),
+    )
+
+    def is_near(i: int, j: int) -> bool:
+        away = float(np.linalg.norm(points.points[i] - points.points[j]))
+        return bool(away < 40.0 + 1.0 and (points.rays[i] != points.rays[j]).all())
+
+    expected = [
+        (i, j, k)
+        for k in range(count)
+        for j in range(k)
+        for i in range(j)
+        if is_near(i, j) and is_near(i, k) and is_near(j, k)
+    ]
+    found = list(map(tuple, _near_triples(points, 40.0, most).tolist()))
+    assert len(found) == min(len(expected), most) > 10
+    # the promising ones: in the order of their last point
+    assert [k for *_, k in found] == [k for *_, k in expected][:most]
+    assert set(found) <= set(expected)

@@ -240,6 +240,27 @@ def test_fisheye_jacobian_agrees_with_central_differences_at_wide_angles() -> No
         np.testing.assert_allclose(J[..., axis], numerical, atol=1e-6)
 
 
+@pytest.mark.parametrize("degrees", [30.0, 89.0, 90.0, 91.0, 105.0, 120.0])
+def test_a_fisheye_sees_beside_and_behind_itself_as_far_as_its_image_goes(degrees: float) -> None:
+    # 125 degrees from the middle to the side, 94 down
+    sensor = FisheyeCamera(
+        np.array([[293.0, 0, 639.5], [0, 293.0, 479.5], [0, 0, 1]]), np.zeros(4), (1280, 960)
+    )
+    theta, step = np.radians(degrees), 1e-4
+    point = 500.0 * np.array([[np.sin(theta), 0.0, np.cos(theta)]])
+    y, J, visible = sensor.linearise(point)
+    assert visible.all()
+    # 293 px a radian
+    np.testing.assert_allclose(y, [[639.5 + 293.0 * theta, 479.5]], atol=1e-9)
+    numerical = [
+        (sensor.project(point + shift)[0] - sensor.project(point - shift)[0])[0] / (2 * step)
+        for shift in step * np.eye(3)
+    ]
+    np.testing.assert_allclose(J[0].T, numerical, atol=1e-6)
+    np.testing.assert_allclose(sensor.rays(y).directions, point / 500.0, atol=1e-12)
+    assert FisheyeCamera(K).project(point)[1].tolist() == [degrees < 90]  # of no known size
+
+
 def test_a_point_beyond_the_turning_angle_of_a_fisheye_is_hidden() -> None:
     # θ (1 - 0.3 θ²) turns at θ = 1.054, which is 60.4 degrees
     sensor = FisheyeCamera(K, np.array([-0.3, 0, 0, 0]))

@@ -5,19 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
-import cv2
 import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.sensors.base import hide, image_bounds, within
 from mixpose.sensors.rays import Rays, central_rays
 
-_WIDEST = np.pi / 2  # as cv2.fisheye, which divides by depth; points beside the camera are dropped
+_WIDEST = np.radians(140.0)  # from the axis: no lens shows more, whatever its image has room for
+_NEWTON = 4  # steps from a table of angles, which is right to 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class FisheyeCamera:
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
+
+    It sees as far from its axis as the radius grows and the image goes, beyond 90° too; without a
+    resolution up to 90°.
 
     Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
     """
@@ -44,11 +47,10 @@ class FisheyeCamera:
         lower, upper = image_bounds(self.resolution)
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
-        theta = np.linspace(0, _WIDEST, 2001)
+        widest = np.pi / 2 if self.resolution is None else _WIDEST
+        theta = np.linspace(0, widest, 2001)
         bad = ~(np.diff(self._radius(theta)[0]) > 0)
-        object.__setattr__(
-            self, "theta_limit", float(theta[bad.argmax()]) if bad.any() else _WIDEST
-        )
+        object.__setattr__(self, "theta_limit", float(theta[bad.argmax()]) if bad.any() else widest)
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
@@ -69,11 +71,15 @@ class FisheyeCamera:
     def rays(self, y: Floats) -> Rays:
         """Lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
-        distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        if not len(y):  # OpenCV has no empty arrays
-            return central_rays(self, y, distorted)
-        xy = cv2.fisheye.undistortPoints(distorted.reshape(-1, 1, 2), np.eye(3), self.distortion)
-        return central_rays(self, y, np.asarray(xy, dtype=np.float64).reshape(-1, 2))
+        xy = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        radius = np.hypot(xy[:, 0], xy[:, 1])
+        table = np.linspace(0, self.theta_limit, 2001)
+        theta = np.interp(radius, self._radius(table)[0], table)
+        for _ in range(_NEWTON):
+            there, slope = self._radius(theta)
+            theta = np.clip(theta - (there - radius) / np.maximum(slope, 1e-9), 0, self.theta_limit)
+        across = np.sin(theta) / np.where(radius > 0, radius, 1.0)
+        return central_rays(self, y, np.column_stack([xy * across[:, None], np.cos(theta)]))
 
     def moved(self, motion: Floats) -> Self:
         """The camera that sees points x where this one sees ``motion @ x``."""

@@ -94,11 +94,11 @@ class PinholeCamera:
         K = self.camera_matrix
         # cv2 ignores skew, so that the camera matrix is taken off before
         distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        if self.lens is None or not len(y):  # OpenCV has no empty arrays
-            return central_rays(self, y, distorted)
-        given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
-        xy = cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2)
-        return central_rays(self, y, np.asarray(xy, dtype=np.float64))
+        xy = distorted
+        if self.lens is not None and len(y):  # OpenCV has no empty arrays
+            given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
+            xy = np.asarray(cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2), float)
+        return central_rays(self, y, np.column_stack([xy, np.ones(len(xy))]))
 
     def moved(self, motion: Floats) -> Self:
         """The camera that sees points x where this one sees ``motion @ x``."""

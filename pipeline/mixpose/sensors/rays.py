@@ -62,14 +62,13 @@ class CentralCamera(Protocol):
         ...
 
 
-def central_rays(camera: CentralCamera, pixels: Floats, xy: Floats) -> Rays:
-    """Rays through the centre of projection, of normalised coordinates (M, 2) without distortion.
+def central_rays(camera: CentralCamera, pixels: Floats, directions: Floats) -> Rays:
+    """Rays through the centre of projection, along directions (M, 3) in the camera's axes.
 
     Detections outside of what the lens model explains are left out.
     """
     T_world_sensor = inverse(camera.T_sensor_world)
-    directions = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions @ T_world_sensor[:3, :3].T
     origin = T_world_sensor[:3, 3]
     focal = float(np.sqrt(abs(np.linalg.det(camera.camera_matrix[:2, :2]))))

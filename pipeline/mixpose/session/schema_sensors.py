@@ -142,7 +142,8 @@ class CameraTable(PlacedTable):
     """A camera with perspective. It needs `camera_matrix` or `calibration`."""
 
     model: Literal["pinhole", "fisheye"]
-    """The lens: OpenCV's pinhole model, or its fisheye model.
+    """The lens: OpenCV's pinhole model, or its fisheye model. The latter sees beyond 90° from its
+    axis, too, as far as the image goes.
     Example: `model = "pinhole"`"""
     camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
     """Focal lengths and principal point in px; pixel centres have integer coordinates.
