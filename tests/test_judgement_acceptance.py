@@ -138,7 +138,9 @@ def test_a_turn_that_is_hardly_known_is_not_sure() -> None:
     # 95 %: 1.96 standard deviations are 13.7 and 15.7 degrees
     for deviation_deg, expected in ((7.0, "ok"), (8.0, "ambiguous")):
         covariance = np.diag([1e-6] * 5 + [np.radians(deviation_deg) ** 2])
-        assert status(replace(SURE, covariance=covariance)) == expected
+        verdict = decide([replace(SURE, covariance=covariance)], ALL_FREE, RULES)
+        told = "" if expected == "ok" else "what is met leaves it open how the body is turned"
+        assert (verdict.status, verdict.doubt) == (expected, told)
 
 
 @pytest.mark.parametrize(("spread_deg", "expected"), [(7.0, "ok"), (8.0, "ambiguous")])

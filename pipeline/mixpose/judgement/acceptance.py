@@ -53,6 +53,7 @@ class Alternative(NamedTuple):
 
 
 _NOTHING = Alternative("", -math.inf)
+TURNS = "what is met leaves it open how the body is turned"
 
 
 class Second(NamedTuple):
@@ -163,7 +164,7 @@ def decide(
     rivals = [each for one, each in zip(ranked, odds, strict=True) if one is not best]
     against = [Alternative("", each) for each in (-best.log_evidence, *rivals)]
     if not is_turn_known(best, rules):
-        against.append(Alternative(""))
+        against.append(Alternative(TURNS))
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
