@@ -23,7 +23,7 @@ from simulated_rigs import (
 
 from mixpose.calibration import calibrate
 from mixpose.calibration.task import NOTHING, Hypotheses
-from mixpose.calibration.telling import doubts_of, lines_of
+from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.words import error_of_held
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.sensors import CalibrationError, RangeSensor
@@ -97,12 +97,58 @@ def test_lenses_that_are_held_as_exact_are_told_with_what_they_would_do() -> Non
     sensors = cameras(2)
     frames = recording(sensors, 16, 0.05)
     found = calibrate(task_of(sensors, frames, 1.0, free={1: ("pose",)}), NO_FRAME_HELD_BACK)
-    (told,) = [line for line in lines_of(found, "mm") if line.startswith("held")]
+    told, of_size = [line for line in lines_of(found, "mm") if line.startswith("held")]
+    # 820 mm from the middle and 1.4 radians from each other they are 1057 mm apart
+    assert "size of the body, as exact; 1 % of it moves sensors by up to 11 mm" in of_size
     assert "0.1 % of the focal length and by 1 px of the principal point" in told
     # a pixel turns a line of sight by a thousandth, which is a millimetre of a metre or more
     assert 0.5 < found.moved_by_lenses.max() < 5
     freed = task_of(sensors, frames, 1.0, free=dict.fromkeys(range(2), ("pose", "focal")))
     assert not calibrate(freed, NO_FRAME_HELD_BACK).moved_by_lenses.any()
+
+
+def test_of_three_cameras_two_of_which_were_bumped_none_is_named() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 14, 0.05)
+    task = bumped(bumped(task_of(sensors, frames), 0, 0.5, 4.0), 2, 0.8, 9.0)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    *lines, last = check_lines(found, "mm")
+    assert last.endswith("of 3 sensors most of which disagree no one can tell which moved")
+    assert not any("MOVED" in line for line in lines)
+
+
+def test_a_camera_that_meets_nothing_as_it_stood_has_moved() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 14, 0.05)
+    task = bumped(task_of(sensors, frames), 1, 0.8, 9.0)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    nothing = replace(found.residuals[1], before=np.nan)
+    found = replace(found, residuals={**found.residuals, 1: nothing})
+    *lines, last = check_lines(found, "mm")
+    assert last == "the calibration no longer holds: s1 moved"
+    assert "; meets nothing, calibrated anew 0.0" in lines[2]
+
+
+@pytest.mark.parametrize(("scale", "turn_deg"), [(0.1, 0.0), (1.2, 0.0), (1.0, 3.0), (1.2, 20.0)])
+def test_sensors_that_only_came_nearer_ask_for_the_size_of_the_body(
+    scale: float, turn_deg: float
+) -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 14, 0.05)
+    task = task_of(sensors, frames)
+    first = sensors[0].T_sensor_world
+    for k in (1, 2):
+        T = sensors[k].T_sensor_world @ inverse(first)
+        T[:3, 3] /= scale
+        turn = from_rotation_vector([0, np.radians(turn_deg), 0], [0, 0, 0])
+        task = replace(task, rig=task.rig.placed(k, T @ turn @ first))
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    told = [text for text in doubts_of(found, "mm") if "times as far apart" in text]
+    assert bool(told) is (scale != 1.0 and not turn_deg)
+    if told:
+        assert f"found {scale:.2g}" in told[0][:25]
+        assert f"is the body {1 / scale:.4g}"[:15] in told[0]
+    assert told == [line[10:] for line in check_lines(found, "mm") if line.startswith("doubt")]
 
 
 def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it() -> None:

@@ -171,7 +171,7 @@ class Displacement:
     shift: float
     turn_deviation_deg: float
     shift_deviation: float
-    residual_before: float  # sensor units
+    residual_before: float  # sensor units; NaN where it met nothing
     residual_after: float  # of frames that are held back where there are enough
     moved: bool
 
@@ -186,14 +186,15 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
         sd_turn, sd_shift = deviations[index]
         each = found.residuals[index]
         before, after = each.before, each.held if np.isfinite(each.held) else each.after
-        worse = bool(np.isfinite(before) and before > rules.worse * max(after, 1e-12))
+        # where it meets nothing as it was, but does now, it surely stands elsewhere
+        worse = bool(np.isfinite(after) and not before <= rules.worse * max(after, 1e-12))
         far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
         moved = worse and far
         told.append(Displacement(name, turn, shift, sd_turn, sd_shift, before, after, moved))
     return tuple(told)
 
 
-def _poses(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
+def placed_by(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
     """T_sensor_world of a sensor before and after; None of a range sensor."""
     old, new = (getattr(rig.sensors[index], "T_sensor_world", None) for rig in (before, after))
     return None if old is None or new is None else (old, new)
@@ -203,7 +204,7 @@ def _consensus(before: Rig, after: Rig) -> Floats:
     """The motion of the world (4, 4) after which most sensors stand where they stood."""
     # that of the sensor from which the others differ least: the bumped ones are outvoted
     count = len(before.names)
-    poses = [_poses(before, after, k) for k in range(count)]
+    poses = [placed_by(before, after, k) for k in range(count)]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
         return told[0] if told else _from_places(before, after)
@@ -225,7 +226,7 @@ def _from_places(before: Rig, after: Rig) -> Floats:
 
 def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
     """Turn in degrees and shift of a sensor, the new world moved into the old one by G."""
-    poses = _poses(before, after, index)
+    poses = placed_by(before, after, index)
     if poses is None:
         place = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
         return 0.0, float(np.linalg.norm(place - centre_of(before.sensors[index])))

@@ -9,14 +9,16 @@ from mixpose.calibration.result import (
     Calibration,
     Displacement,
     displacements,
+    placed_by,
     residuals_by,
 )
 from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
-from mixpose.rigid import rotation_angle_deg
+from mixpose.rigid import inverse, rotation_angle_deg
 
 _WORST = 3
+_ALONG = 0.2  # of how far sensors moved: so little is left where they only came nearer
 _ROUNDING = 1e-9  # of a degree or a length unit
 _CELLS = 4  # by which an image is divided along each side to tell its coverage
 
@@ -73,7 +75,23 @@ def _held_lines(found: Calibration, unit: str) -> list[str]:
                 f"{'held':<10}{words} they would move what was found by {moved[worst]:.2g} {unit}, "
                 f"told as ± {told[worst]:.2g} {unit}: state calibration_error, or free {kind}"
             )
-    return lines
+    return lines + _held_size(found, unit)
+
+
+def _held_size(found: Calibration, unit: str) -> list[str]:
+    """What the size of the body would do, which alone tells cameras how far apart they stand."""
+    cameras = [one for one in found.after.sensors if hasattr(one, "camera_matrix")]
+    moved = [block for block in found.blocks if block.kind == "pose" and block.sensor is not None]
+    # of all of them it is told by poses that are known
+    told_otherwise = found.after.scale != 1 or len(cameras) < len(found.after.sensors)
+    if told_otherwise or not 0 < len(moved) < len(cameras):
+        return []
+    centres = np.array([centre_of(one) for one in cameras])
+    by = 0.01 * float(np.linalg.norm(centres - centres[:, None], axis=2).max())
+    return [
+        f"{'held':<10}the size of the body, as exact; 1 % of it moves sensors by up to {by:.2g} "
+        f"{unit}: --length tells it"
+    ]
 
 
 def doubts_of(found: Calibration, unit: str) -> list[str]:
@@ -111,7 +129,35 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
                 f"{each.held:.3g} {of} in the frames held back: the others are too few or "
                 "too alike; record more"
             )
-    return told
+    return told + _of_size(found)
+
+
+def _of_size(found: Calibration) -> list[str]:
+    """That sensors stand as the session has them, but nearer to each other or farther apart.
+
+    So they do where the body is of another size than the session tells.
+    """
+    if found.after.scale != 1:
+        return []
+    each = [placed_by(found.before, found.after, k) for k in range(len(found.after.names))]
+    poses = [pair for pair in each if pair is not None]
+    told = [found.deviations[block.place][:3] for block in found.blocks if block.kind == "pose"]
+    if len(poses) < 2 or not told:
+        return []
+    # centres in the axes of the first, by the old calibration and by the new one
+    old, new = (
+        np.array([(T[0] @ inverse(one))[:3, 3] for one in T[1:]]) for T in zip(*poses, strict=True)
+    )
+    scale = float(np.vdot(old, new) / max(float(np.vdot(old, old)), 1e-300))
+    moved, left = np.linalg.norm(new - old), np.linalg.norm(new - scale * old)
+    sure = CalibrationRules().moved * float(np.linalg.norm(told))
+    if scale <= 0 or left > _ALONG * moved or not moved > sure:
+        return []
+    return [
+        f"sensors are found {scale:.4g} times as far apart as the session has them, in the same "
+        f"directions: is the body {1 / scale:.4g} times as large as [object] has it, or in another "
+        "unit?"
+    ]
 
 
 def _frames_line(found: Calibration) -> str:
@@ -235,22 +281,24 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     """Whether the calibration that a session has still holds, and which sensor was bumped."""
     told = displacements(found, CalibrationRules())
     bumped = [one.name for one in told if one.moved]
+    are_told = 2 * len(bumped) < len(told)  # most of them agree
     lines = [_frames_line(found)]
     for index, one in enumerate(told):
-        of = _unit_of(found, index, unit)
+        of, before = _unit_of(found, index, unit), one.residual_before
+        text = f"residual {before:.3g} {of}" if np.isfinite(before) else "meets nothing"
         lines.append(
-            f"{one.name:<20}{_displaced(one, unit)}; residual "
-            f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"
-            + ("  MOVED" if one.moved and len(told) > 2 else "")
+            f"{one.name:<20}{_displaced(one, unit)}; {text}, calibrated anew "
+            f"{one.residual_after:.3g} {of}" + ("  MOVED" if one.moved and are_told else "")
         )
     lines += [f"{'not known':<20}{found.after.names[k]}: shares no view" for k in found.unlinked]
     if not bumped:
         lines.append("the calibration holds")
-    elif len(told) == 2:
-        lines.append("the calibration no longer holds: of two sensors no one can tell which moved")
-    else:
+    elif are_told:
         lines.append(f"the calibration no longer holds: {', '.join(bumped)} moved")
-    return lines
+    else:
+        of = "two sensors" if len(told) == 2 else f"{len(told)} sensors most of which disagree"
+        lines.append(f"the calibration no longer holds: of {of} no one can tell which moved")
+    return [*lines, *(f"{'doubt':<10}{text}" for text in _of_size(found))]
 
 
 def _displaced(one: Displacement, unit: str) -> str:
