@@ -192,6 +192,26 @@ def test_a_report_is_no_pdf(tmp_path: Path) -> None:
     assert not (tmp_path / "report.pdf").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "instead"),
+    [
+        (["smooth", "POSES"], "smooth.csv", "name it smooth.jsonl"),
+        (["learn", "SESSION"], "body.toml", "name it body.csv"),
+        (["calibrate", "SESSION"], "rig.json", "name it rig.toml"),
+        (["align", "SESSION", "--floor", "POSES"], "floor.yml", "name it floor.toml"),
+    ],
+)
+def test_a_name_that_ends_as_another_format_does_is_refused(
+    words: list[str], name: str, instead: str, tmp_path: Path
+) -> None:
+    poses = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4), "lost")], None)
+    places = {"POSES": str(poses), "SESSION": SESSION}
+    asked = [places.get(word, word) for word in words]
+    result = command(*asked, "-o", tmp_path / name)
+    assert_one_line(result, 2, f"found the suffix {Path(name).suffix}", instead)
+    assert not (tmp_path / name).exists()
+
+
 def test_a_format_that_nothing_tells_is_asked_for(tmp_path: Path) -> None:
     poses = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4), "lost")], None)
     assert_one_line(command("convert", poses), 2, "--format: missing, where there is no -o")

@@ -13,7 +13,7 @@ from mixpose import __version__, rigid
 from mixpose.calibration.rig import centre_of
 from mixpose.cli.app_after import AlignRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import refuse_to_overwrite_but, shown, write_text
+from mixpose.cli.output import refuse_suffix, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import read_poses
@@ -38,6 +38,7 @@ def align_session(request: AlignRequest) -> None:
     rewriting.refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
+    refuse_suffix(request.output, "-o", (".toml",), "it is a session that is written")
     sources = request.source or ()
     estimates = [one for each in request.floor for one in _told(each, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))

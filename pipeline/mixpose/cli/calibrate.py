@@ -23,6 +23,7 @@ from mixpose.cli.output import (
     is_stdout,
     print_lines,
     refuse_one_for_two,
+    refuse_suffix,
     refuse_to_overwrite_but,
     shown,
     write_text,
@@ -52,6 +53,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     refuse_one_for_two(request.report, "--report", output, "-o")
     if output is not None:
+        refuse_suffix(output, "-o", (".toml",), "it is a session that is written")
         refuse_lost_code(session, output)
         if request.world is not None:
             refuse_held(session)

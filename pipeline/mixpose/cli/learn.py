@@ -7,7 +7,14 @@ from pathlib import Path
 
 from mixpose.cli.app_before import LearnRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import is_stdout, print_lines, refuse_to_overwrite_but, shown, write_text
+from mixpose.cli.output import (
+    is_stdout,
+    print_lines,
+    refuse_suffix,
+    refuse_to_overwrite_but,
+    shown,
+    write_text,
+)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import Learnt, Lesson, by_markers, learn, like
@@ -28,6 +35,7 @@ def learn_session(request: LearnRequest) -> None:
     session = load_scene(path, allow_code=request.allow_code)
     inputs = [path] if request.like is None else [path, request.like]
     refuse_to_overwrite_but(request.output, inputs, MARK)
+    refuse_suffix(request.output, "-o", (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
     if others := [one.name for one in session.sensors if one.sensor.dimension != 2]:
         warn(f"{', '.join(others)}: bodies are learnt from what cameras see, and not from this")

@@ -216,6 +216,15 @@ def is_stdout(named: Path | None) -> bool:
     return named is not None and output_of(named) is None
 
 
+def refuse_suffix(named: Path, option: str, allowed: Sequence[str], what: str) -> None:
+    """Raise a SessionError where a name ends as files do that are something else than `what`."""
+    if named.suffix and named.suffix.casefold() not in allowed:
+        raise SessionError(
+            f"{option} {named}: found the suffix {named.suffix}; {what}: name it "
+            f"{named.with_suffix(allowed[0]).name}"
+        )
+
+
 def refuse_stdout(named: Path | None, option: str, what: str, instead: str) -> None:
     """Raise a SessionError where an option names standard output, which cannot take `what`."""
     if is_stdout(named):

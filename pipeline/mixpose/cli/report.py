@@ -5,8 +5,7 @@ from __future__ import annotations
 from mixpose import __version__
 from mixpose.cli.app_after import ReportRequest
 from mixpose.cli.notices import say
-from mixpose.cli.output import refuse_to_overwrite_but, shown, write_text
-from mixpose.errors import SessionError
+from mixpose.cli.output import refuse_suffix, refuse_to_overwrite_but, shown, write_text
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.report.page import MARK, find_session, render
 
@@ -24,11 +23,7 @@ def write_report(request: ReportRequest) -> None:
     truth = None if request.truth is None else read_poses(request.truth)
     inputs = (request.poses, request.truth, find_session(poses).path)
     refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
-    if output.suffix and output.suffix.casefold() not in _PAGES:
-        raise SessionError(
-            f"-o {output}: found the suffix {output.suffix}; a report is a page for a browser: "
-            f"name it {output.with_suffix('.html').name}, and print that for a PDF"
-        )
+    refuse_suffix(output, "-o", _PAGES, "a report is a page for a browser, which prints a PDF")
     write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
     count = len({line.frame for line in poses.poses})
     say(f"{count} frame{'s' * (count != 1)} -> {shown(output)}")

@@ -11,7 +11,7 @@ import numpy as np
 from mixpose import __version__
 from mixpose.cli.app_after import SmoothRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.output import Output, refuse_suffix, refuse_to_overwrite
 from mixpose.cli.request import output_of
 from mixpose.errors import RecordingError
 from mixpose.poses.estimates import header_of
@@ -40,6 +40,8 @@ def smooth_poses(request: SmoothRequest) -> None:
         )
     if output is not None:
         refuse_to_overwrite(output, [path])
+        told = "smoothed poses are JSON lines, of which mixpose convert makes other formats"
+        refuse_suffix(output, "-o", (".jsonl", ".json", ".ndjson"), told)
     bodies = {}
     for label in dict.fromkeys(line.label for line in poses.poses):
         own = [line for line in poses.poses if line.label == label]
