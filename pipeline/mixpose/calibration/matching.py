@@ -72,6 +72,8 @@ def _neighbours(times: Sequence[float | None], gap: float) -> tuple[Indices, Flo
         near = [p for p in range(place - 3, place + 4) if 0 <= p < count and p != place]
         near = [p for p in near if 0 < abs(stamps[order[p]] - stamps[k]) <= reach * 1.5]
         near.sort(key=lambda p: abs(stamps[order[p]] - stamps[k]))
+        # of one time only one: no motion goes through two poses at once
+        near = list({stamps[order[p]]: p for p in reversed(near)}.values())[::-1]
         for node, p in enumerate(near[: _NODES - 1], start=1):
             index[k, node], away[k, node] = order[p], stamps[order[p]] - stamps[k]
     return index, away

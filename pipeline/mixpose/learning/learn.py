@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.learning.adjusting import Eyes, Learnt, adjusted
 from mixpose.learning.axes import in_principal_axes
 from mixpose.learning.bodies import find_bodies
-from mixpose.learning.points import Cloud, clouds_of, without_still
+from mixpose.learning.points import Cloud, clouds_of, without_places, without_still
 from mixpose.learning.rules import RULES
 from mixpose.records import Floats
 from mixpose.session import Session
@@ -79,12 +79,33 @@ def learn_from(
     if not any(len(cloud) for cloud in clouds):
         raise RecordingError(_seen_by_one(frames, eyes, name))
     moving, still = without_still(clouds)
-    found = find_bodies(moving, np.random.default_rng(0), progress)
-    progress("adjusting", 0, 1)
-    bodies = adjusted(found, clouds, eyes)
-    if not bodies:
+    lessons = list[Lesson]()
+    for seen, some, own in ((clouds, moving, noise), *_farther_off(clouds, still, noise, eyes)):
+        found = find_bodies(some, np.random.default_rng(0), progress)
+        progress("adjusting", 0, 1)
+        bodies = tuple(map(in_principal_axes, adjusted(found, seen, eyes)))
+        lessons.append(Lesson(bodies, len(still), len(frames), own))
+    best = max(lessons, key=lambda one: sum(int(body.frames.sum()) for body in one.bodies))
+    if not best.bodies:
         raise RecordingError(_nothing_moves(clouds, moving, still, name))
-    return Lesson(tuple(map(in_principal_axes, bodies)), len(still), len(frames), noise)
+    return best
+
+
+def _farther_off(
+    clouds: Sequence[Cloud], still: Sequence[Floats], noise: float, eyes: Eyes
+) -> Iterator[tuple[list[Cloud], list[Cloud], float]]:
+    """Clouds by the noise of what moves, without what stands still, and that noise.
+
+    Where that is surely larger: of cameras out of step lines of sight of what moves meet less
+    closely, so that they do not by the noise of all.
+    """
+    sensors, gates = eyes.rig.sensors, RULES.gate * noise * eyes.sigmas
+    rest = [without_places(cloud.seen, still, sensors, gates) for cloud in clouds if still]
+    if not any(len(points) for frame in rest for points in frame.points.values()):
+        return
+    others, wider = clouds_of(rest, sensors, eyes.sigmas)
+    if wider > RULES.unlike * noise:
+        yield others, without_still(others)[0], wider
 
 
 def _seen_by_one(frames: Sequence[SeenFrame], eyes: Eyes, name: str) -> str:

@@ -257,3 +257,15 @@ def without_still(clouds: Sequence[Cloud]) -> tuple[list[Cloud], list[Floats]]:
     taken = np.concatenate([np.zeros(0, dtype=np.intp), *(chosen for _, chosen in still)])
     left = [cloud.without(detections[taken[frame[taken] == k]]) for k, cloud in enumerate(clouds)]
     return left, [place for place, _ in still]
+
+
+def without_places(
+    frame: SeenFrame, places: Sequence[Floats], sensors: Sequence[Sensor], gates: Floats
+) -> SeenFrame:
+    """A frame without the detections that are within gates (L,) of where places (3,) are seen."""
+    points = dict(frame.points)
+    for sensor, pixels in frame.points.items():
+        y, visible = sensors[sensor].project(np.array(places))
+        away = np.linalg.norm(pixels[:, None] - y[visible], axis=2)
+        points[sensor] = pixels[(away > gates[sensor]).all(axis=1)]
+    return replace(frame, points=points)

@@ -13,6 +13,9 @@ class LearningRules:
 
     widest: float = constant(3.0, "σ_ε that rays may miss each other by where noise is not known")
     gate: float = constant(3.5, "standard deviations within which things are the same")
+    unlike: float = constant(
+        2.0, "times the noise of all, from which what moves is looked for by its own as well"
+    )
     quietest: float = constant(0.02, "of σ_ε: less noise than that is not believed")
     probes: int = constant(60, "frames that the noise of detections is told by")
     min_sine: float = constant(0.02, "of the angle between rays: less fixes no depth; as in search")
