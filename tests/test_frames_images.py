@@ -191,6 +191,13 @@ def test_truncated_jpeg_is_told_in_spite_of_the_end_of_its_preview(tmp_path: Pat
         read_image(path)
 
 
+def test_bytes_that_fill_up_between_segments_of_a_jpeg_are_no_segment(tmp_path: Path) -> None:
+    data = cv2.imencode(".jpg", PICTURE)[1].tobytes()
+    path = tmp_path / "f1.jpg"
+    path.write_bytes(data[:2] + b"\xff\xff" + data[2:])
+    np.testing.assert_array_equal(read_image(path), cv2.imdecode(np.frombuffer(data, np.uint8), 0))
+
+
 def test_wrong_byte_in_a_png_is_told_by_its_checksum(tmp_path: Path) -> None:
     path = tmp_path / "f1.png"
     save(tmp_path, path.name)

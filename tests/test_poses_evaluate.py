@@ -11,7 +11,9 @@ import pytest
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.consistency import normalised_error_squared
+from mixpose.poses.estimates import in_unit
 from mixpose.poses.evaluate import errors_to_truth, evaluate
+from mixpose.poses.instances import renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.poses.report import as_dict, as_table
@@ -181,11 +183,11 @@ def test_truth_in_another_unit_is_converted_with_its_symmetries(
     T_mm = a_pose()
     S_mm = half_turn_about((96.0, 60.0, 0.0))
 
-    def in_unit(T: Floats) -> Floats:
+    def scaled(T: Floats) -> Floats:
         return rigid.from_parts(T[:3, :3], T[:3, 3] / 1000 * per_metre)
 
     poses = file_of(line(0, T_mm @ S_mm))
-    truth = file_of(line(0, in_unit(T_mm)), unit=unit, symmetries={"board": in_unit(S_mm)[None]})
+    truth = file_of(line(0, scaled(T_mm)), unit=unit, symmetries={"board": scaled(S_mm)[None]})
     outcome = evaluate(poses, truth)
     assert outcome.unit == "mm"
     assert outcome.translation is not None
@@ -382,3 +384,24 @@ def test_a_chessboard_half_a_turn_off_is_right_and_a_tee_has_two_right_answers()
         assert outcome.frames == 1
         assert outcome.rotation_deg is not None
         assert outcome.rotation_deg.max < 1e-5
+
+
+def test_covariances_go_into_another_unit_with_their_poses() -> None:
+    covariance = np.diag([4.0, 9.0, 16.0, 1e-4, 2e-4, 3e-4])
+    covariance[0, 5] = covariance[5, 0] = 0.01
+    told = in_unit(file_of(line(0, a_pose(), covariance=covariance)), "m").poses[0].covariance
+    assert told is not None
+    np.testing.assert_allclose(np.diag(told), [4e-6, 9e-6, 16e-6, 1e-4, 2e-4, 3e-4])
+    assert told[0, 5] == pytest.approx(1e-5)
+
+
+def test_of_identical_bodies_that_is_which_stands_there_however_it_is_turned() -> None:
+    here = a_pose()
+    there = here.copy()
+    there[0, 3] += 1.0
+    truth = [replace(line(0, T), instance=k) for k, T in enumerate((here, there))]
+    # a millimetre away from each other: three radians are not farther than that
+    turned = turned_about_z(there, 170.0)
+    poses = [replace(line(0, T), instance=k) for k, T in enumerate((turned, here))]
+    told, _ = renumbered(poses, truth, {})
+    assert [one.instance for one in told] == [1, 0]

@@ -58,6 +58,7 @@ def refusal(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> str:
         ("mqtt://.there", "host: found '.there'; allowed"),
         ("ros2://tool?bridge=a..b:9090", "host: found 'a..b'; allowed"),
         ("tcp://there:9870?only=good", "only: found good; allowed: ok"),
+        ("tcp://there:9870?only=", "only: found ; allowed: ok"),
         ("osc://there:9870?rate=3", "option: found rate; allowed: only"),
         ("osc://there:9870/a*", "found '*' in the path; allowed: printable ASCII but for space"),
         ("lsl://", "found no name; allowed: lsl://tracker"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,3 +63,14 @@ def test_a_report_shows_each_sensors_features_over_time(page: str) -> None:
 
 def test_a_feature_may_be_called_by_what_would_be_a_formula(page: str) -> None:
     assert r">$\q$<" in page
+
+
+def test_features_of_lost_frames_and_of_sensors_without_a_frame_are_not_shown(poses: Path) -> None:
+    file = read_poses(poses)
+    lost, alone, *others = file.poses
+    lost = replace(lost, status="lost")
+    alone = replace(alone, sensors={"left": alone.sensors["left"]})
+    shown = series_of(replace(file, poses=(lost, alone, *others))).residuals
+    for name, first in (("left", 1), ("right", 2)):
+        values = np.array(list(shown[name].values()))
+        assert np.isnan(values).all(axis=0).tolist() == [True] * first + [False] * (4 - first)

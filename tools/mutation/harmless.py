@@ -239,4 +239,22 @@ HARMLESS: tuple[Harmless, ...] = (
         "(few,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
         "only speed: more poses are looked up, as counts are at least 1",
     ),
+    Harmless(
+        "trajectories/intensity.py",
+        "(5.0, 5, _EACH),",
+        "(5.0, 10, _EACH),",
+        "only speed: more points of a search whose later passes are as fine as before",
+    ),
+    Harmless(
+        "checking/placement.py",
+        "seen_at_best = 0",
+        "seen_at_best = 1",
+        "where one sensor sees one feature, and no more from any side, no pose is typical",
+    ),
+    Harmless(
+        "calibration/start.py",
+        "width = 4 * _BIAS_STEPS",
+        "width = 5 * _BIAS_STEPS",
+        "four deviations out a kernel is as good as zero",
+    ),
 )
