@@ -412,3 +412,25 @@ def test_what_one_camera_sees_again_and_again_is_not_surer_for_it(
     assert statuses[0] == "ambiguous"
     assert statuses[-1] == last
     assert last == "ok" or set(statuses) == {"ambiguous"}
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("start", [False, True])
+def test_of_orientations_that_look_nearly_the_same_that_is_told_which_is_met_most_closely(
+    turned: bool, start: bool, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    # two sides differ by 0.7 mm, which are as many pixels, and detections err by a tenth
+    x = (100.0**2 - 99.3**2) / (2 * 132.0)
+    points = [(-66.0, 0, 0), (66.0, 0, 0), (x, np.sqrt(100.0**2 - (66.0 + x) ** 2), 0)]
+    body = Body("triangle", tuple(PointFeature(np.array(each)) for each in points))
+    assert len(body.symmetries) == 2
+    assert 0.1 < body.asymmetry < 0.7
+    (other,) = (one for one in body.symmetries if rotation_angle_deg(one, np.eye(4)) > 90)
+    T = TRUTH @ other if turned else TRUTH
+    views = detect(pinhole_cameras, body, T, noise=0.1)
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH if start else None)
+    _, told = tracker.advance(tracker.begin(), 0, None, views)
+    assert told.status == "ok"
+    assert told.T_world_object is not None
+    is_other = bool(rotation_angle_deg(told.T_world_object, T) > 90)
+    assert is_other is (start and turned)  # a start says which is meant

@@ -13,7 +13,13 @@ from scipy.special import ndtri
 
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import default_tolerance, grid_steps, keeps_normals, symmetries
+from mixpose.body.symmetry import (
+    default_tolerance,
+    farthest_apart,
+    grid_steps,
+    keeps_normals,
+    symmetries,
+)
 from mixpose.records import Floats, Indices
 
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
@@ -166,6 +172,11 @@ class Body:
         if self.node_normals is None:
             return found
         return found[[keeps_normals(T, points, self.node_normals) for T in found]]
+
+    @cached_property
+    def asymmetry(self) -> float:
+        """How far symmetries put features from each other, at most; 0 but for rounding errors."""
+        return farthest_apart(self.symmetries, self.nodes.points)
 
     @cached_property
     def identity(self) -> int:

@@ -20,6 +20,7 @@ from mixpose.rigid import from_parts, transform
 
 SAME_NORMAL = 0.99  # cosine
 _SAME_TURN = np.radians(1.0)
+_ROUNDING = 1e-6  # of the size of a body: coordinates of so many digits
 _NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
 
 
@@ -67,6 +68,12 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
                 more = np.concatenate([rotations, nearest[None]])
                 return _closed(more, centred, tree, tolerance)
     return rotations
+
+
+def farthest_apart(motions: Floats, points: Floats) -> float:
+    """How far motions (G, 4, 4) put points (N, 3) from the nearest, at most; 0 but for rounding."""
+    off = float(cKDTree(points).query(transform(motions, points).reshape(-1, 3))[0].max())
+    return off if off > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
 
 
 def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:

@@ -204,6 +204,16 @@ class Frame(Setup):
         surprise = self.rules.motion.surprised(self.track.misses)
         return self.anywhere[0] + (math.log(surprise) if self.predictions else 0.0)
 
+    def oriented(self, T_world_object: Floats) -> Floats:
+        """Of poses that look the same the one nearest to what is known before.
+
+        Where nothing is, and orientations differ by a little, the pose itself: the one is told that
+        is met most closely.
+        """
+        if self.T_reference is None and self.body.asymmetry:
+            return T_world_object
+        return nearest_alike(T_world_object, self.body, self.T_reference)
+
     def expectation(self, poses: Floats) -> Floats:
         """Log densities (K,) of poses (K, 4, 4) by its own track, or that it is elsewhere."""
         logs = np.full(len(poses), self.elsewhere)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from mixpose.fit import Fit
-from mixpose.judgement import ScoredPose, inverted, nearest_alike
+from mixpose.judgement import ScoredPose, inverted
 from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
 from mixpose.objective import View
 from mixpose.optimise import LinearResiduals, least_squares
@@ -85,7 +85,7 @@ def fit_in_motion(
             if moved == np.inf:  # after the first climb the velocity is known
                 wide = max(by_velocity, 1.0)
             fit = climb(seen, T, beside, wide)
-            T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+            T = frame.oriented(fit.T_world_object)
             matches = fit.matches if T is fit.T_world_object else None
             expected = frame.expected(T)
         met = offsets_of(seen, matches or matches_at(seen, T), expected, wide)

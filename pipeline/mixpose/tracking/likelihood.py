@@ -26,7 +26,6 @@ from mixpose.judgement import (
     ScoredPose,
     judge,
     judge_together,
-    nearest_alike,
 )
 from mixpose.matching import Matches
 from mixpose.objective import NormalPrior, View, project_body
@@ -108,7 +107,7 @@ class MatchedLikelihood:
         are large.
         """
         frame, _ = _as_moving(self.frame, fit)
-        T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+        T = frame.oriented(fit.T_world_object)
         seen = replace(matches_at(frame, T), crowd=beside.crowd, others=beside.others)
         track = frame.track
         case = Case(frame.finest, T, track.residuals, track.rates, frame.prior(T), seen)
@@ -126,7 +125,7 @@ def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
 
 def met_at(frame: Frame, fit: Fit) -> tuple[Floats, Matches]:
     """A pose that was fitted to all sensors, and what it meets, which is less than to judge it."""
-    T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+    T = frame.oriented(fit.T_world_object)
     if fit.matches and T is fit.T_world_object and not frame.is_timed:
         return T, fit.matches
     return T, matches_at(_as_moving(frame, fit)[0], T)
@@ -134,7 +133,7 @@ def met_at(frame: Frame, fit: Fit) -> tuple[Floats, Matches]:
 
 def case_of(frame: Frame, fit: Fit, start: Start) -> Case:
     """What a pose that was fitted to a frame is judged by."""
-    T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+    T = frame.oriented(fit.T_world_object)
     prior = frame.prior(T if start.T_moved is None else start.T_moved)
     is_seen = T is fit.T_world_object and not (frame.is_timed or start.left_out)
     seen = (fit.matches, fit.noise) if is_seen else (None, None)
@@ -281,7 +280,7 @@ class AssociationLikelihood:
         T, frame, known, widths = start.T_world_object, self.frame, start.prediction, [self._noise]
         if known is None or known.spread is None:  # nothing is known: matched densities lead there
             T = MatchedLikelihood(frame).fit(start).T_world_object
-            T = nearest_alike(T, frame.body, frame.T_reference)
+            T = frame.oriented(T)
         else:
             uncertainty = np.where(frame.free, known.uncertainty, 0.0)
             levels = blur_schedule(frame.views, frame.body, T, uncertainty)

@@ -161,6 +161,9 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
                 break  # the rest are rivals of what is no rival
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
+    if ranked and frame.T_reference is None and frame.body.asymmetry:
+        best = ranked[0].T_world_object
+        yield from (Start(best @ one) for one in frame.body.symmetries)
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
