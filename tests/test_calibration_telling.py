@@ -11,9 +11,11 @@ import pytest
 from simulated_rigs import BODY, FPS, PLACES, alone, cameras, motion, recording, task_of
 
 from mixpose.calibration import Calibration, calibrate
+from mixpose.calibration.recorded import _profile_peaks
 from mixpose.calibration.result import Sights
 from mixpose.calibration.telling import lines_of
 from mixpose.fit import EstimatorOptions
+from mixpose.records import GridPattern
 from mixpose.report.calibration import render_calibration
 from mixpose.rigid import rotation_angle_deg
 from mixpose.sensors import RangeSensor
@@ -114,3 +116,12 @@ def test_places_of_range_sensors_are_told_in_the_unit_of_the_session() -> None:
 def test_a_task_fuses_frames_unless_told_otherwise_as_a_session_does() -> None:
     task = task_of(cameras(2), ())
     assert task.fuse == EstimatorOptions().fuse
+
+
+@pytest.mark.parametrize("place", [251.0, 251.3, 248.6])
+def test_ranges_of_a_profile_are_told_between_its_bins(place: float) -> None:
+    bins = 200.0 + 2.0 * np.arange(60)
+    values = np.exp(-0.5 * ((bins - place) / 6.0) ** 2)[None].astype(np.float32)
+    (found,) = _profile_peaks(GridPattern(values, np.array([200.0]), 2.0)).tolist()
+    # a parabola through three bins of a third of its width
+    assert found == pytest.approx([place], abs=0.02)

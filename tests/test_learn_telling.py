@@ -176,3 +176,10 @@ def test_a_sensor_that_meets_hardly_any_markers_is_named() -> None:
         "elsewhere, or stand elsewhere than the session says?"
     )
     assert doubts_of(replace(body, met={"a": 4.0, "b": 1.0}), "body.csv", "mm") == []
+
+
+def test_columns_of_a_table_stay_apart_however_many_decimals_deviations_ask_for() -> None:
+    # a tenth of 1e-9 is told by ten decimals, behind hundreds
+    *_, row = lines_of(learnt(turning(40, 12), -300 + POINTS, deviation=1e-9), "body", "mm")
+    name, x, *others = row.split()
+    assert (name, x, len(others)) == ("m4", "-340.0000000000", 4)

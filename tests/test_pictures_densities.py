@@ -18,7 +18,7 @@ from mixpose.objective import ObjectiveName, View
 from mixpose.pictures.finding import find
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.plots import objective_around, ranges_picture
-from mixpose.pictures.sheet import fitted_blurs
+from mixpose.pictures.sheet import _heading, fitted_blurs
 from mixpose.pictures.stages import densities_picture, panels_of, shown_box
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame
 from mixpose.rigid import transform
@@ -210,3 +210,16 @@ def test_a_range_sensor_that_found_nothing_and_faces_nothing_has_empty_axes() ->
     assert not found[0].expectation.seen.any()
     picture = ranges_picture(found, [[5.0]], body, estimate, "mm", 700, 300)
     assert picture.shape == (300, 700, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_sheet_says_whose_pose_it_shows_where_there_are_several_bodies(
+    count: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.toml"
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    path.write_text(text.replace("[object]", f"[object]\ncount = {count}"), encoding="utf-8")
+    session = mixpose.load_session(path)
+    lost = Estimate(0, None, "tool", "lost", None, None, 0.0, {})
+    one, other = (_heading(session, replace(lost, object=name)) for name in ("tool", "marker"))
+    assert (one != other).any() == (count > 1)

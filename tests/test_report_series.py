@@ -14,6 +14,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Status
+from mixpose.report import figures
 from mixpose.report.figures import TimeAxes, blank, limit
 from mixpose.report.overlays import chosen_frames
 from mixpose.report.series import (
@@ -190,3 +191,15 @@ def test_poses_of_two_objects_are_refused_in_one_line(tmp_path: Path) -> None:
     poses = read_poses(write(tmp_path / "p.jsonl", estimates, None))
     with pytest.raises(RecordingError, match="'a', 'b'; a series is of one body"):
         series_of(poses)
+
+
+def test_frames_that_took_equally_long_are_within_their_axis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4))], None)
+    series = series_of(read_poses(path))
+    figure, axes = blank()
+    monkeypatch.setattr(figures, "blank", lambda: (figure, axes))
+    figures.latency(replace(series, latency_ms=np.full(9, 30.0)))
+    low, high = axes.get_xlim()
+    assert low < 30 / 1.4 < 30 * 1.4 < high

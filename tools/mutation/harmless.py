@@ -257,4 +257,22 @@ HARMLESS: tuple[Harmless, ...] = (
         "width = 5 * _BIAS_STEPS",
         "four deviations out a kernel is as good as zero",
     ),
+    Harmless(
+        "calibration/gauge.py",
+        "along = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])",
+        "along = (p[1] - p[0]) * np.linalg.norm(p[1] - p[0])",
+        "what is across it, and in its plane, hangs on its direction alone",
+    ),
+    Harmless(
+        "design/poses.py",
+        "drawn = qmc.Halton(6, rng=np.random.default_rng(seed)).random(count)",
+        "drawn = qmc.Halton(12, rng=np.random.default_rng(seed)).random(count)",
+        "six of twelve columns are as evenly spread",
+    ),
+    Harmless(
+        "search/search.py",
+        "best, checked, done = 0.0, 0.0, skipped",
+        "best, checked, done = 0.0, 1.0, skipped",
+        "guesses that explain two detections are never enough, whether that is asked or not",
+    ),
 )

@@ -85,10 +85,16 @@ def learn_from(
         progress("adjusting", 0, 1)
         bodies = tuple(map(in_principal_axes, adjusted(found, seen, eyes)))
         lessons.append(Lesson(bodies, len(still), len(frames), own))
-    best = max(lessons, key=lambda one: sum(int(body.frames.sum()) for body in one.bodies))
+    best = max(lessons, key=_shown)
     if not best.bodies:
         raise RecordingError(_nothing_moves(clouds, moving, still, name))
     return best
+
+
+def _shown(lesson: Lesson) -> tuple[int, int]:
+    """How many markers were found, of which any may be missed, and how often they were seen."""
+    seen = np.concatenate([np.zeros(0, np.intp), *(body.frames for body in lesson.bodies)])
+    return len(seen), int(seen.sum())
 
 
 def _farther_off(
