@@ -396,12 +396,12 @@ def test_covariances_go_into_another_unit_with_their_poses() -> None:
 
 
 def test_of_identical_bodies_that_is_which_stands_there_however_it_is_turned() -> None:
+    # a millimetre from each other; turned by three radians each, they would be nearer to the other
     here = a_pose()
-    there = here.copy()
+    there = turned_about_z(here, 170.0)
     there[0, 3] += 1.0
     truth = [replace(line(0, T), instance=k) for k, T in enumerate((here, there))]
-    # a millimetre away from each other: three radians are not farther than that
-    turned = turned_about_z(there, 170.0)
-    poses = [replace(line(0, T), instance=k) for k, T in enumerate((turned, here))]
-    told, _ = renumbered(poses, truth, {})
+    poses = [replace(line(0, turned_about_z(T, 170.0)), instance=k) for k, T in enumerate([here])]
+    poses.append(replace(line(0, turned_about_z(there, -170.0)), instance=1))
+    told, _ = renumbered(poses[::-1], truth, {})
     assert [one.instance for one in told] == [1, 0]
