@@ -98,6 +98,8 @@ def test_times_of_the_session_override_those_of_the_table(tmp_path: Path) -> Non
         ("frame,u,v,wieght", "'wieght'"),
         ("frame,u,v,u", "twice"),
         ("0,1,2", "column '0'"),
+        ("frame;u;v", "column 'frame;u;v'; columns are parted by commas, 'frame,u,v'"),
+        ("frame\tu\tv", "columns are parted by commas, 'frame,u,v'"),
         ("frame;u;v", "'frame;u;v'"),
         ("frame,range", "'range'"),
     ],

@@ -27,6 +27,7 @@ from mixpose.session import load_session
         ("unit = “mm”\n".encode(), ["line 1", 'allowed: straight quotes, "..."']),
         (b"[[sensor]]\nfps = 29,97\n", ["line 2", "allowed: a decimal point, fps = 29.97"]),
         (b'[[sensor]]\nsource = "C:\\data"\n', ["line 2", "allowed: paths with /"]),
+        (b'[[sensor]]\nsource = "C:\\Users"\n', ["line 2", "allowed: paths with /"]),
         (b"[sensor]\n[sensor]\n", ["line 2", "allowed for each of several: [[sensor]]"]),
         (b"[object]\n[[object]]\n", ["line 2", "allowed for each of several: [[object]]"]),
     ],

@@ -183,7 +183,10 @@ def _warn(found: Calibration, unit: str) -> None:
             f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
             "was: record the body where both see it"
         )
-    refused = (f"not determined, stays as it was: {direction}" for direction in found.refused)
+    refused = (
+        f"not determined: {direction}: what is written of it tells nothing"
+        for direction in found.refused
+    )
     for doubt in (*doubts_of(found, unit), *refused):
         warn(doubt)
     if found.bad:

@@ -154,7 +154,8 @@ class Summary:
     def say(self, where: str) -> None:
         """Print the line, and warn of sensors that took no part or fit badly."""
         if not sum(self.statuses.values()):
-            warn("no frame was estimated: the recording has none with the numbers asked for")
+            none = "the recording has none, or none with the numbers asked for"
+            warn(f"no frame was estimated: {none}")
             return
         for warning in self.warnings():
             warn(warning)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -238,7 +239,9 @@ def _header_fault(columns: Sequence[str], coordinates: Sequence[str]) -> str | N
     unknown = [column for column in columns if column not in allowed]
     missing = [column for column in coordinates if column not in columns]
     if unknown:
-        return f"found column {unknown[0]!r}"
+        parts = re.split(r"[;\t|]", unknown[0])
+        meant = f"; columns are parted by commas, {','.join(parts)!r}" if parts[1:] else ""
+        return f"found column {unknown[0]!r}{meant}"
     if missing:
         return f"column {missing[0]!r} is missing"
     if len(set(columns)) != len(columns):

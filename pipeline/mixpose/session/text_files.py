@@ -91,7 +91,7 @@ def _hint(text: str, reason: str) -> str:
         return f"; allowed for each of several: [[{table[1]}]] in two brackets, the first too"
     if _OTHER_QUOTES.search(line):
         return '; allowed: straight quotes, "..."'
-    if "\\" in line and "in a string" in reason:
+    if "\\" in line and ("in a string" in reason or "hex value" in reason):
         return "; allowed: paths with / , or in single quotes, '...'"
     return _meant(line)
 
