@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search import LIVE, THOROUGH, SearchBudget
-from mixpose.search.from_points import TriangulatedPoints, generators_of, point_triples
+from mixpose.search.from_points import (
+    TriangulatedPoints,
+    _rays_near,
+    generators_of,
+    point_triples,
+)
 from mixpose.search.poses import count_inliers, label_image
 from mixpose.search.problem import SearchProblem, sensor_detections
 from mixpose.search.three_points import align_triples, ray_triples
@@ -91,6 +96,25 @@ def test_a_point_and_two_rays_give_each_pose_once(pinhole_cameras: list[PinholeC
     poses = next(guesses)()
     # of two rays and two features, not the other way round again; a ray that passes by is met once
     assert len(np.unique(poses.round(6), axis=0)) == len(poses) > 100
+
+
+def test_rays_beside_a_point_are_those_that_pass_nearest(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    seen = sensor_detections(detect(pinhole_cameras[:2], EIGHT, TRUTH, false=60), EIGHT)
+    problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
+    place = transform(TRUTH, EIGHT.means[:1])
+    one = np.zeros((1, 2), dtype=np.intp)
+    points = TriangulatedPoints(place, np.ones(1), np.zeros(1), one + [0, 1], one)
+    origins, directions, across, *_ = _rays_near(problem, points, 0)
+    away = place - origins
+    expected = np.linalg.norm(np.cross(away, directions), axis=1)
+    np.testing.assert_allclose(across, expected)
+    rest = [rays.select(np.arange(1, len(rays))) for _, rays in problem.cameras]
+    passing = [np.cross(place - rays.origins, rays.directions) for rays in rest]
+    every = np.sort(np.linalg.norm(np.concatenate(passing), axis=1))
+    assert len(every) > len(across) == 3 * THOROUGH.sample
+    np.testing.assert_allclose(across, every[: len(across)])
 
 
 def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
