@@ -104,17 +104,16 @@ def test_rays_beside_a_point_are_those_that_pass_nearest(
     seen = sensor_detections(detect(pinhole_cameras[:2], EIGHT, TRUTH, false=60), EIGHT)
     problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
     place = transform(TRUTH, EIGHT.means[:1])
-    one = np.zeros((1, 2), dtype=np.intp)
-    points = TriangulatedPoints(place, np.ones(1), np.zeros(1), one + [0, 1], one)
+    sensors, rays = np.array([[0, 1]]), np.array([[0, 0]])
+    points = TriangulatedPoints(place, np.ones(1), np.zeros(1), sensors, rays)
     origins, directions, across, *_ = _rays_near(problem, points, 0)
-    away = place - origins
-    expected = np.linalg.norm(np.cross(away, directions), axis=1)
-    np.testing.assert_allclose(across, expected)
-    rest = [rays.select(np.arange(1, len(rays))) for _, rays in problem.cameras]
-    passing = [np.cross(place - rays.origins, rays.directions) for rays in rest]
+    expected = np.linalg.norm(np.cross(place - origins, directions), axis=1)
+    np.testing.assert_allclose(across, expected, atol=1e-6)
+    rest = [one.select(np.arange(1, len(one))) for _, one in problem.cameras]
+    passing = [np.cross(place - one.origins, one.directions) for one in rest]
     every = np.sort(np.linalg.norm(np.concatenate(passing), axis=1))
     assert len(every) > len(across) == 3 * THOROUGH.sample
-    np.testing.assert_allclose(across, every[: len(across)])
+    np.testing.assert_allclose(across, every[: len(across)], atol=1e-6)
 
 
 def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
