@@ -64,6 +64,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "importing": ("test_import*.py",),
     "design": ("test_design.py",),
     "learning": ("test_learn*.py",),
+    "cli": ("test_cli_findings.py", "test_cli_messages.py", "test_cli*.py"),
     "calibration": ("test_calibration*.py",),
     "trajectories": ("test_smooth*.py", "test_align.py", "test_pivot*.py"),
     "runner": ("test_runner_*.py",),
