@@ -9,6 +9,7 @@ import pytest
 
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
+from mixpose.session import Session, load_session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -21,6 +22,13 @@ def copied(folder: Path) -> Path:
         for side in ("left", "right"):
             shutil.copy(source / f"{side}{n:04d}.png", folder)
     return folder
+
+
+def counted(folder: Path, count: int) -> Session:
+    """The session of two cameras with so many of its body."""
+    path, text = folder / "s.toml", (SYNTHETIC / "two_cameras" / "session.toml").read_text("utf-8")
+    path.write_text(text.replace("[object]", f"[object]\ncount = {count}"), encoding="utf-8")
+    return load_session(path)
 
 
 def report_on(session: Path, capsys: pytest.CaptureFixture[str], *, quick: bool = False) -> str:

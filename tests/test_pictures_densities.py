@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import counted
 
 import mixpose
 from mixpose.body import Body, PointFeature
@@ -216,10 +217,7 @@ def test_a_range_sensor_that_found_nothing_and_faces_nothing_has_empty_axes() ->
 def test_a_sheet_says_whose_pose_it_shows_where_there_are_several_bodies(
     count: int, tmp_path: Path
 ) -> None:
-    path = tmp_path / "s.toml"
-    text = TWO_CAMERAS.read_text(encoding="utf-8")
-    path.write_text(text.replace("[object]", f"[object]\ncount = {count}"), encoding="utf-8")
-    session = mixpose.load_session(path)
+    session = counted(tmp_path, count)
     lost = Estimate(0, None, "tool", "lost", None, None, 0.0, {})
     one, other = (_heading(session, replace(lost, object=name)) for name in ("tool", "marker"))
     assert (one != other).any() == (count > 1)

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from checked import counted
 from inspected import (
     SYNTHETIC,
     TWO_CAMERAS,
@@ -423,14 +424,11 @@ def test_a_lost_frame_with_the_right_counts_is_for_check(name: str) -> None:
 def test_of_several_bodies_it_is_told_whose_pose_is_shown(
     count: int, whose: str, tmp_path: Path
 ) -> None:
-    path = tmp_path / "s.toml"
-    text = TWO_CAMERAS.read_text(encoding="utf-8")
-    path.write_text(text.replace("[object]", f"[object]\ncount = {count}"), encoding="utf-8")
-    session = mixpose.load_session(path)
+    session = counted(tmp_path, count)
     assert len(session.labels) == count
     lost = Estimate(6, None, "a", "lost", None, None, 0.0, {})
     first, *_ = summary(session, session.body, lost, [], None)
-    assert first == f"{path}, frame 6: {whose}lost (estimated on its own)"
+    assert first == f"{session.path}, frame 6: {whose}lost (estimated on its own)"
 
 
 def test_a_small_spot_is_seen_between_the_arms_of_its_cross() -> None:

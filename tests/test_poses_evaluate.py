@@ -401,7 +401,7 @@ def test_of_identical_bodies_that_is_which_stands_there_however_it_is_turned() -
     there = turned_about_z(here, 170.0)
     there[0, 3] += 1.0
     truth = [replace(line(0, T), instance=k) for k, T in enumerate((here, there))]
-    poses = [replace(line(0, turned_about_z(T, 170.0)), instance=k) for k, T in enumerate([here])]
-    poses.append(replace(line(0, turned_about_z(there, -170.0)), instance=1))
-    told, _ = renumbered(poses[::-1], truth, {})
+    turned = turned_about_z(there, -170.0), turned_about_z(here, 170.0)
+    poses = [replace(line(0, T), instance=1 - k) for k, T in enumerate(turned)]
+    told, _ = renumbered(poses, truth, {})
     assert [one.instance for one in told] == [1, 0]

@@ -17,15 +17,16 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.checking import shared_source_warnings
 from mixpose.cli.notices import Summary
 from mixpose.poses.jsonl import read_poses
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate, Floats, Mask
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.runner import run
 from mixpose.selection import Selection
@@ -307,21 +308,24 @@ def fallen(
             T = truth[frame]
             assert T is not None
             places = np.array([before, before + (onto or 0.0)]) @ T[:3, :3].T + T[:3, 3]
-            (u, v), after = setup.sensor.project(places)[0]
+            place, after = setup.sensor.project(places)[0]
             path = image(folder, setup.name, frame)
             picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             assert picture is not None
-            by = np.array([[1, 0, after[0] - u], [0, 1, after[1] - v]], np.float32)
+            by = np.column_stack([np.eye(2), after - place]).astype(np.float32)
             size = (picture.shape[1], picture.shape[0])
             moved = cv2.warpAffine(picture, by, size, flags=cv2.INTER_CUBIC)
-            about = cv2.circle(
-                np.zeros_like(picture), (round(float(after[0])), round(float(after[1]))), 9, 1, -1
-            )
-            dark = int(np.median(picture))
-            cv2.circle(picture, (round(float(u)), round(float(v))), 9, dark, -1)
+            picture[_spot_at(place, picture)] = int(np.median(picture))
             if onto is not None:
-                picture[about > 0] = moved[about > 0]
+                there = _spot_at(after, picture)
+                picture[there] = moved[there]
             cv2.imwrite(str(path), picture)
+
+
+def _spot_at(place: Floats, picture: NDArray[Any]) -> Mask:
+    """Which pixels of a picture a marker may cover."""
+    centre = round(float(place[0])), round(float(place[1]))
+    return cv2.circle(np.zeros(picture.shape, np.uint8), centre, 9, 1, -1) > 0
 
 
 @dataclass(frozen=True)

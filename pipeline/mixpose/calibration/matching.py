@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -73,8 +74,10 @@ def _neighbours(times: Sequence[float | None], gap: float) -> tuple[Indices, Flo
         near = [p for p in near if 0 < abs(stamps[order[p]] - stamps[k]) <= reach * 1.5]
         near.sort(key=lambda p: abs(stamps[order[p]] - stamps[k]))
         # of one time only one: no motion goes through two poses at once
-        near = list({stamps[order[p]]: p for p in reversed(near)}.values())[::-1]
-        for node, p in enumerate(near[: _NODES - 1], start=1):
+        firsts: dict[float, int] = {}
+        for p in near:
+            firsts.setdefault(stamps[order[p]], p)
+        for node, p in enumerate(islice(firsts.values(), _NODES - 1), start=1):
             index[k, node], away[k, node] = order[p], stamps[order[p]] - stamps[k]
     return index, away
 

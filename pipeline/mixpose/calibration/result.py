@@ -194,7 +194,7 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
     return tuple(told)
 
 
-def placed_by(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
+def before_and_after(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
     """T_sensor_world of a sensor before and after; None of a range sensor."""
     old, new = (getattr(rig.sensors[index], "T_sensor_world", None) for rig in (before, after))
     return None if old is None or new is None else (old, new)
@@ -204,7 +204,7 @@ def _consensus(before: Rig, after: Rig) -> Floats:
     """The motion of the world (4, 4) after which most sensors stand where they stood."""
     # that of the sensor from which the others differ least: the bumped ones are outvoted
     count = len(before.names)
-    poses = [placed_by(before, after, k) for k in range(count)]
+    poses = [before_and_after(before, after, k) for k in range(count)]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
         return told[0] if told else _from_places(before, after)
@@ -226,7 +226,7 @@ def _from_places(before: Rig, after: Rig) -> Floats:
 
 def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
     """Turn in degrees and shift of a sensor, the new world moved into the old one by G."""
-    poses = placed_by(before, after, index)
+    poses = before_and_after(before, after, index)
     if poses is None:
         place = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
         return 0.0, float(np.linalg.norm(place - centre_of(before.sensors[index])))

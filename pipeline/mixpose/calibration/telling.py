@@ -8,8 +8,8 @@ from mixpose.calibration.result import (
     HELD_LENS,
     Calibration,
     Displacement,
+    before_and_after,
     displacements,
-    placed_by,
     residuals_by,
 )
 from mixpose.calibration.rig import Block, centre_of, values_of
@@ -129,17 +129,17 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
                 f"{each.held:.3g} {of} in the frames held back: the others are too few or "
                 "too alike; record more"
             )
-    return told + _of_size(found)
+    return told + _doubt_of_size(found)
 
 
-def _of_size(found: Calibration) -> list[str]:
+def _doubt_of_size(found: Calibration) -> list[str]:
     """That sensors stand as the session has them, but nearer to each other or farther apart.
 
     So they do where the body is of another size than the session tells.
     """
     if found.after.scale != 1:
         return []
-    each = [placed_by(found.before, found.after, k) for k in range(len(found.after.names))]
+    each = [before_and_after(found.before, found.after, k) for k in range(len(found.after.names))]
     poses = [pair for pair in each if pair is not None]
     told = [found.deviations[block.place][:3] for block in found.blocks if block.kind == "pose"]
     if len(poses) < 2 or not told:
@@ -298,7 +298,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     else:
         of = "two sensors" if len(told) == 2 else f"{len(told)} sensors most of which disagree"
         lines.append(f"the calibration no longer holds: of {of} no one can tell which moved")
-    return [*lines, *(f"{'doubt':<10}{text}" for text in _of_size(found))]
+    return [*lines, *(f"{'doubt':<10}{text}" for text in _doubt_of_size(found))]
 
 
 def _displaced(one: Displacement, unit: str) -> str:

@@ -132,9 +132,9 @@ def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
     report.say("object", f"{body.name}: {extent}{spread}{many}")
     alike, of = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
     within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
-    text = f"{alike} orientations look the same{within}; the pose nearest to the previous one is "
-    text += "written"
-    report.say("symmetry", of + (text if alike > 1 else "none"))
+    same = f"{alike} orientations look the same{within}" if alike > 1 else "none"
+    written = "; the pose nearest to the previous one is written" if alike > 1 else ""
+    report.say("symmetry", f"{of}{same}{written}")
 
 
 def _say_sensor(

@@ -211,15 +211,15 @@ class Findings:
                     f"sensor {name!r} shows the same as the frame before in frames {each.text()}, "
                     "which contradicts the others: frozen, or frames doubled?"
                 )
-        # what one marker makes is said of it
-        has_moved = any(line.endswith(MOVED) for line in self._of_markers())
-        for name, each in self._far.items():
-            if each.longest >= _LONG and not has_moved:
-                lines.append(
-                    f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
-                    f"{self._units[name]} before, in {each.count} of {total} frames: "
-                    f"{each.text()}: images torn or blurred, markers half hidden, or out of step?"
-                )
+        far = {name: each for name, each in self._far.items() if each.longest >= _LONG}
+        if far and any(line.endswith(MOVED) for line in self._of_markers()):
+            far = {}  # what one marker makes is said of it
+        for name, each in far.items():
+            lines.append(
+                f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
+                f"{self._units[name]} before, in {each.count} of {total} frames: "
+                f"{each.text()}: images torn or blurred, markers half hidden, or out of step?"
+            )
         return lines
 
     def _of_doubts(self) -> list[str]:

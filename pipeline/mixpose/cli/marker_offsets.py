@@ -52,6 +52,11 @@ class _Sums:
         return float(self.pull @ self.shift())
 
 
+def _left(whole: _Sums, since: _Sums) -> float:
+    """Variance of all views where those of a stretch are displaced."""
+    return max((whole.squares - since.explained()) / max(whole.views, 1e-12), 1e-12)
+
+
 class Marker:
     """How one marker was met."""
 
@@ -98,11 +103,9 @@ class Marker:
         *others, whole = accumulate(reversed(self.stretches), lambda after, one: one + after)
         since = [one for one in others if one.met >= _FEWEST <= whole.met - one.met]
         latest = max(since, key=_Sums.explained, default=whole)
-        for one in (latest, whole):
-            own = max((whole.squares - one.explained()) / max(whole.views, 1e-12), 1e-12)
-            if one is whole or one.explained() - whole.explained() > _SURE * own:
-                break
-        return one, own
+        is_surely = latest.explained() - whole.explained() > _SURE * _left(whole, latest)
+        one = latest if is_surely else whole
+        return one, _left(whole, one)
 
     def oddness(self, typical: float, unit: str) -> str | None:
         """What is odd about it in words, by how far off others are (squares a view)."""

@@ -154,8 +154,9 @@ class Summary:
     def say(self, where: str) -> None:
         """Print the line, and warn of sensors that took no part or fit badly."""
         if not sum(self.statuses.values()):
-            none = "the recording has none, or none with the numbers asked for"
-            warn(f"no frame was estimated: {none}")
+            warn(
+                "no frame was estimated: the recording has none, or none with the numbers asked for"
+            )
             return
         for warning in self.warnings():
             warn(warning)

@@ -143,7 +143,7 @@ class Matches:
 
     @property
     def covered(self) -> Floats:
-        """The same of each sensor (S,): the mean of its images."""
+        """Share of the features that face each sensor that are met (S,): the mean of its images."""
         return np.asarray(self.summed(self.coverage) / self.images)
 
     @property
