@@ -26,11 +26,11 @@ from mixpose.rigid import (
 from mixpose.sensors import RangeSensor
 from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.frame import Start
-from mixpose.tracking.likelihood import (
+from mixpose.tracking.likelihood import likelihood_of
+from mixpose.tracking.ranges import (
     AssociationTerm,
     _summed,
     are_associated,
-    likelihood_of,
     noise_ratio,
     sum_associations,
 )

@@ -17,8 +17,8 @@ _NEAR = (
     Mutant(
         "fit-blurs-whatever-the-uncertainty",
         "fit/near.py",
-        "at.J[:, 0] ** 2 @ uncertainty**2",
-        "at.J[:, 0] ** 2 @ (0 * uncertainty)",
+        "(at.J**2 @ (uncertainties**2)[:, None, :, None])",
+        "(at.J**2 @ (0 * uncertainties)[:, None, :, None])",
         "a start that is far off is looked for at the finest blur alone",
     ),
     Mutant(

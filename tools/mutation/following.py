@@ -5,7 +5,6 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _STARTS = "test_tracking_starts.py"
-_RANGES = "test_tracking_ranges.py"
 _TWIN = "test_tracking_twin.py"
 _DELAYS = "test_tracking_delays.py"
 _WINDOWS = "test_tracking_gating.py"
@@ -251,57 +250,6 @@ _GATING = (
     ),
 )
 
-_RANGE_POSTERIOR = (
-    Mutant(
-        "tracking-ranges-forget-the-noise-of-cameras",
-        "tracking/likelihood.py",
-        "before.followed(RANGES, noise, before.moments, before.biases, before.fields)",
-        "before.followed(RANGES, noise)",
-        "after a frame of ranges alone cameras are as in the first frame",
-        ("test_tracking_ranges.py",),
-    ),
-    Mutant(
-        "tracking-ranges-any-clutter",
-        "tracking/likelihood.py",
-        "false = np.maximum(found - probability * expected, 1 - probability)",
-        "false = np.full(expected.shape, 1 - probability)",
-        "ranges are believed alike however many are false",
-        (_RANGES,),
-    ),
-    Mutant(
-        "tracking-ranges-missed-for-free",
-        "tracking/likelihood.py",
-        "missed = expected * np.log(1 - probability) +",
-        "missed = 0 * expected +",
-        "poses whose tags have no range are as good as those that meet all",
-        (_RANGES,),
-    ),
-    Mutant(
-        "tracking-ranges-noise-never-learnt",
-        "tracking/likelihood.py",
-        "return max(1.0, float(np.sqrt(squares / degrees)))",
-        "return 1.0",
-        "ranges that err by more than said are believed",
-        (_RANGES,),
-    ),
-    Mutant(
-        "tracking-ranges-open-directions-unbounded",
-        "tracking/likelihood.py",
-        "information += np.diag(1 / frame.anywhere[1][free] ** 2)",
-        "information += 0",
-        "directions that ranges leave open have no bound",
-        (_RANGES,),
-    ),
-    Mutant(
-        "tracking-ranges-covariance-not-enlarged",
-        "tracking/likelihood.py",
-        "covariance *= model.noise.enlargement(degrees)",
-        "covariance *= 1.0",
-        "covariances of ranges are too small at first",
-        (_RANGES,),
-    ),
-)
-
 _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
@@ -414,7 +362,6 @@ MUTANTS = (
     *_PREDICTION,
     *_MOTION,
     *_GATING,
-    *_RANGE_POSTERIOR,
     *_TRACKER,
     *_STATIC,
     *_NOISE,

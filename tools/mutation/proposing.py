@@ -37,8 +37,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-starts-that-lead-to-nothing",
         "tracking/proposers.py",
-        "[values[order] > frame.rules.fit.near * len(frame.views)]",
-        "",
+        "near = values[order] > frame.rules.fit.near * len(frame.views)",
+        "near = values[order] > -1.0",
         "where a prediction fails in clutter a frame takes half a second",
         (_STARTS,),
     ),

@@ -8,5 +8,7 @@ from mixpose.fit.near import (
     fit_near as fit_near,
     fit_together as fit_together,
     free_mask as free_mask,
+    narrowing as narrowing,
+    widest_blurs as widest_blurs,
 )
 from mixpose.fit.probable import FitRules as FitRules

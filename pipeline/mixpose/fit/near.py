@@ -93,9 +93,15 @@ class Fit:
         cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]], **rest: Any
     ) -> Fit:
         """Where an ascent through blurs of the views ended."""
+        return cls(ascent.states[0], cls.through(views, levels), **rest)
+
+    @staticmethod
+    def through(
+        views: Sequence[View], levels: Sequence[Sequence[float]]
+    ) -> tuple[Mapping[str, float], ...]:
+        """Blurs of levels by view."""
         names = [view.name for view in views]
-        blurs = tuple([dict(zip(names, level)) for level in levels])
-        return cls(ascent.states[0], blurs, **rest)
+        return tuple([dict(zip(names, level)) for level in levels])
 
     def begins_at(self, other: Ascent, tolerance: float) -> bool:
         """Whether another ascent ended where this fit's first did, so that it leads to the same."""
@@ -104,6 +110,29 @@ class Fit:
         # what two ascents leave to be gained at one place: 0.003 σ_ε
         same = 10 * tolerance * abs(float(other.values[0]))
         return float(away @ other.last.curvature[0] @ away) < same
+
+
+def widest_blurs(
+    views: Sequence[View],
+    body: Body,
+    poses: Floats,  # (H, 4, 4)
+    uncertainties: Floats,  # (H, 6), their standard deviations
+    rules: FitRules = FitRules(),
+) -> Floats:
+    """Standard deviations (H, L) of a feature: by how much it may be off, root mean square.
+
+    None is below σ_ε, nor much wider than what a view sees.
+    """
+    at = project_body(tuple(view.sensor for view in views), body).project(poses)
+    # (L, H, n), of all coordinates
+    variances = (at.J**2 @ (uncertainties**2)[:, None, :, None])[..., 0].sum(axis=3)
+    dimensions = np.array([[view.sensor.dimension] for view in views])
+    counts = np.maximum(at.seen.sum(axis=2), 1)
+    spreads = np.sqrt((variances * at.seen).sum(axis=2) / counts / dimensions)
+    finest = np.array([[view.observation.sigma] for view in views])
+    extents = [[np.subtract(*view.observation.extent[::-1]).max()] for view in views]
+    widest = np.minimum(spreads, np.maximum(rules.widest * np.array(extents), finest))
+    return np.asarray(np.maximum(widest, finest).T)
 
 
 def blur_schedule(
@@ -115,20 +144,17 @@ def blur_schedule(
 ) -> list[list[float]]:
     """Standard deviations of a feature per level and view, from coarse to σ_ε.
 
-    The coarsest is by how much features may be off (root mean square) at a start (4, 4) with
-    standard deviations (6,).
+    The coarsest are `widest_blurs` at a start (4, 4) with standard deviations (6,).
     """
-    at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
-    variances = (at.J[:, 0] ** 2 @ uncertainty**2).sum(axis=2)  # (L, n), of all coordinates
-    dimensions = np.array([view.sensor.dimension for view in views])
-    counts = np.maximum(at.seen[:, 0].sum(axis=1), 1)
-    spreads = np.sqrt((variances * at.seen[:, 0]).sum(axis=1) / counts / dimensions)
     finest = np.array([view.observation.sigma for view in views])
-    extents = [np.subtract(*view.observation.extent[::-1]).max() for view in views]
-    widest = np.minimum(spreads, np.maximum(rules.widest * np.array(extents), finest))
-    wider = np.maximum(widest / finest, 1.0)
-    count = int(np.ceil(np.log(wider.max()) / np.log(rules.ratio)))
-    return [(finest * wider ** (k / max(count, 1))).tolist() for k in range(count, -1, -1)]
+    wider = widest_blurs(views, body, T_world_object[None], uncertainty[None], rules)[0] / finest
+    return [(finest * wider**share).tolist() for share in narrowing(float(wider.max()), rules)]
+
+
+def narrowing(wider: float, rules: FitRules = FitRules()) -> list[float]:
+    """Powers of a blur that is so much wider than σ_ε, from 1 to 0: the levels in between."""
+    count = int(np.ceil(np.log(wider) / np.log(rules.ratio)))
+    return [k / max(count, 1) for k in range(count, -1, -1)]
 
 
 def fit_near(

@@ -71,6 +71,8 @@ class Verdict:
 
     best: ScoredPose | None  # None where the frame is lost
     kept: list[tuple[ScoredPose, float]]  # poses worth telling with their beliefs, best first
+    # less likely ones that further frames may make likely, of single ranges
+    faint: tuple[tuple[ScoredPose, float], ...] = ()
     against: tuple[Alternative, ...] = ()  # the best of them
     most: float = -math.inf  # log odds against it up to which it is ok
     # detections that sensors had left where the body was sought a second time
@@ -171,7 +173,15 @@ def decide(
         if one is best or (weight >= 1 - rules.confidence and is_fixed(one, free))
     ]
     kept.sort(key=lambda each: each[0] is not best)
-    return Verdict(best, kept, tuple(against), rules.log_doubt)
+    # what three frames speak against that err as seldom as one that is ok
+    least = (1 - rules.confidence) ** 3
+    faint = tuple(
+        (one, weight)
+        for one, weight in zip(ranked, weights, strict=True)
+        if one.spread is not None and least <= weight < 1 - rules.confidence
+        if one is not best and is_fixed(one, free)
+    )
+    return Verdict(best, kept, faint, tuple(against), rules.log_doubt)
 
 
 def _odds_against(
@@ -234,7 +244,7 @@ def insert(
             is_better = _worth(new, rules, 0.01) > _worth(old, rules)
             told, other = (new, old) if is_better else (old, new)
             belief = beliefs([told.log_density, other.log_density])[1]
-            if told.spread is None and belief > 1 - rules.confidence:
+            if belief > 1 - rules.confidence:
                 told = _with_moments_of(told, other, belief, max(belief, 1 / limit), away)
             ranked[k] = told
             break
@@ -258,7 +268,8 @@ def _with_moments_of(
         )
     )
     covariance += apart * away[:, None] * away
-    return replace(told, covariance=covariance, persistent=persistent)
+    spread = None if told.spread is None else np.sqrt(covariance.diagonal())
+    return replace(told, covariance=covariance, persistent=persistent, spread=spread)
 
 
 def _worth(pose: ScoredPose, rules: AcceptanceRules, more: float = 0.0) -> tuple[bool, float]:

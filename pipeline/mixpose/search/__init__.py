@@ -9,7 +9,12 @@ from mixpose.search.from_points import (
     TriangulatedPoints as TriangulatedPoints,
     triangulate as triangulate,
 )
-from mixpose.search.poses import Descent as Descent, Stage as Stage, spread_turns as spread_turns
+from mixpose.search.poses import (
+    Descent as Descent,
+    Stage as Stage,
+    spread_turns as spread_turns,
+    unlike as unlike,
+)
 from mixpose.search.problem import (
     LIVE as LIVE,
     THOROUGH as THOROUGH,

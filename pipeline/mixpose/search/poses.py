@@ -8,6 +8,7 @@ favour poses that gather them all on one blob.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
@@ -300,7 +301,10 @@ def spread_turns(free: Mask, step: float) -> Floats:
 
 
 def _centres(problem: SearchProblem) -> Floats:
-    """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
+    """Places (C, 3) of the body's centre at which all sensors see the middle of what they see.
+
+    And as far from there as false detections and hidden features move the middle.
+    """
     radius, middles = problem.body.radius, Sum(tuple(map(_Middle, problem.detections)))
 
     def moved(places: Floats, steps: Floats) -> Floats:
@@ -313,7 +317,11 @@ def _centres(problem: SearchProblem) -> Floats:
     count = np.count_nonzero(off < off.min(initial=np.inf) + radius)
     near = places[np.argsort(off, kind="stable")[:count]]
     distinct = unlike(problem.body, from_parts(np.eye(3), near), 0.2)
-    return np.asarray(near[distinct[: problem.budget.sample // 2]])
+    near = near[distinct[: problem.budget.sample // 2]]
+    variances = [one.moments[1] ** 2 / max(len(one.points), 1) for one in problem.detections]
+    aside = math.sqrt(np.mean(variances)) * np.diag(problem.free[:3])
+    around = np.concatenate([np.zeros((1, 3)), aside, -aside])
+    return np.asarray((near[:, None] + around).reshape(-1, 3))
 
 
 def _starts(problem: SearchProblem) -> Floats:

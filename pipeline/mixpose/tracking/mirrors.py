@@ -54,7 +54,8 @@ def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bo
         if ((x - y) @ away).min() <= 0:  # no body reaches through a mirror, as other tilts would
             continue
         middle = ((x + y) / 2).mean(axis=0, keepdims=True)
-        sides = [float(view.sensor.towards(middle)[0] @ away) for view in data.views]
+        cameras = [view.sensor for view in data.views if view.sensor.dimension == 2]
+        sides = [float(camera.towards(middle)[0] @ away) for camera in cameras]
         sides = [side for side in sides if side]  # points in space are seen from nowhere
         if sides and (min(sides) > 0 or max(sides) < 0):
             found.append((_told(one, other, E, body, rules.plane), sides[0] > 0))

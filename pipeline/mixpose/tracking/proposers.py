@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.density import DRAWING
-from mixpose.fit import blur_schedule
+from mixpose.fit import blur_schedule, widest_blurs
 from mixpose.judgement import ScoredPose, is_sure
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
@@ -78,28 +78,54 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Promising poses around the first prediction, where the coarsest blurs may lead astray."""
-    if not frame.predictions or not is_doubtful(frame, ranked):
-        return
-    first, rules = frame.predictions[0], frame.rules.proposals
-    wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
-    narrow, sigmas = wide / rules.narrowing, np.array(frame.sigmas)
+    if frame.predictions and is_doubtful(frame, ranked):
+        first, rules = frame.predictions[0], frame.rules.proposals
+        wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
+        for start in _around(frame, first.T_world_object, wide, rules.kept):
+            if is_doubtful(frame, ranked):
+                yield start
+
+
+def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+    """Poses that the first prediction allows, of single ranges: there may be several maxima.
+
+    Where it leaves them less room than they err, there is one.
+    """
+    for first in frame.predictions[:1]:
+        uncertainty = np.where(frame.free, first.uncertainty, 0.0)
+        if first.spread is not None and is_wide(frame, first.T_world_object, uncertainty):
+            modes = frame.rules.ranges.modes
+            yield from _around(frame, first.T_world_object, uncertainty, modes)
+
+
+def is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
+    """Whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
+    blurs = widest_blurs(frame.views, frame.body, T_world_object[None], uncertainty[None])
+    return bool((blurs > frame.sigmas).any())
+
+
+def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> list[Start]:
+    """What poses lead to that are drawn around one with standard deviations (6,): so many at most.
+
+    Those that meet anything, the best first.
+    """
+    rules, sigmas = frame.rules.proposals, np.array(frame.sigmas)
+    narrow = wide / rules.narrowing
     stages = [
-        (tuple(level / sigmas), rules.steps, rules.kept)
-        for level in blur_schedule(frame.views, frame.body, first.T_world_object, narrow)
+        (tuple(level / sigmas), rules.steps, kept)
+        for level in blur_schedule(frame.views, frame.body, T_world_object, narrow)
     ]
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
-    drawn = perturb(first.T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
+    drawn = perturb(T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
     few = sparse(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
     descent = Descent(frame.views, few, frame.free, frame.rules.search)
-    poses = np.concatenate([first.T_world_object[None], drawn])
-    poses = descent.refine(poses, [(stages[0][0], 0, rules.kept), *stages])
+    poses = np.concatenate([T_world_object[None], drawn])
+    poses = descent.refine(poses, [(stages[0][0], 0, kept), *stages])
     values = descent.objective().value(poses)
     order = np.argsort(-values, kind="stable")
-    # those that meet anything, best first
-    for T in poses[order[values[order] > frame.rules.fit.near * len(frame.views)]]:
-        if is_doubtful(frame, ranked):
-            yield Start(T, narrow / rules.narrowing)
+    near = values[order] > frame.rules.fit.near * len(frame.views)
+    return [Start(T, narrow / rules.narrowing) for T in poses[order[near]]]
 
 
 def searched(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -262,4 +288,4 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 
-PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
+PROPOSERS: tuple[Proposer, ...] = (predicted, within, multistart, searched, look_alikes)

@@ -29,6 +29,8 @@ from mixpose.tracking.track import Branch
 def odds_beside(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """Log odds of a rival against the best pose of a frame, by the frames before as well."""
     odds = ahead(rival, best)
+    if best.spread is not None:  # single ranges, whose errors are drawn anew
+        return odds
     before = _before(data, rival, best)
     now = odds - before + max(_of_more_than_told(data, rival, best), 0.0)
     if now * before > 0:  # else they contradict each other

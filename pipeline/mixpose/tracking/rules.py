@@ -59,6 +59,13 @@ class RangeRules:
     max_features: int = constant(8, "of a body: the subsets that are summed double with each")
     stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
     min_information: float = constant(0.02, "of that of known labels, which any direction has")
+    modes: int = constant(
+        32, "starts around a prediction: 16 miss a maximum that matters in one frame of 100"
+    )
+    behind: float = constant(25.0, "nats behind the best that make no odds")
+    overlooked: float = constant(
+        0.1, "of searches do not find the right maximum, though it matters"
+    )
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,7 @@ class Track:
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
     delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
     doubted: bool = False  # whether another body may have what the last pose meets
+    elsewhere: float = -math.inf  # log odds of a better pose, of ranges, that nobody has looked at
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
     gained: float = 0.0  # log evidence of the last of them per coordinate that it met

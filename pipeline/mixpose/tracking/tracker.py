@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -173,8 +174,7 @@ class Tracker(Setup):
         """
         likelihood, ranked, fits = likelihood_of(data), list[ScoredPose](), list[Fit]()
 
-        def consider(start: Start, proposer: str) -> ScoredPose | None:
-            fit = likelihood.fit(start)
+        def consider(start: Start, fit: Fit, proposer: str) -> ScoredPose | None:
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
             fits.append(fit)
@@ -183,12 +183,12 @@ class Tracker(Setup):
             return judged
 
         for propose in self.proposers if data.views else ():
-            for start in propose(data, ranked):
-                judged = consider(start, propose.__name__)
+            for start, fit in likelihood.fits(propose(data, ranked)):
+                judged = consider(start, fit, propose.__name__)
                 if judged and likelihood.knows_detections:
                     for refine in self.refinements:
                         for better in refine(data, likelihood, judged):
-                            consider(better, refine.__name__)
+                            consider(better, likelihood.fit(better), refine.__name__)
             if quickly and not data.first_is(data.trusted, ranked):
                 break
             quickly = False
@@ -319,7 +319,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         state = data.searches[-1][1] if data.searches else Track.search
         return replace(track.missed(state, clutter), doubted=True)
     found = []
-    for one, weight in verdict.kept:
+    for one, weight in (*verdict.kept, *verdict.faint):
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
         momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
@@ -356,6 +356,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         known=is_ok
         or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
+        elsewhere=_elsewhere_after(data, best),
         gained=best.gained if is_ok else track.gained,
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
@@ -363,6 +364,14 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         twice=track.twice if verdict.second is None else verdict.second.there,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
+
+
+def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
+    """Log odds that single ranges have a better pose elsewhere, after a frame and its searches."""
+    if best.elsewhere is None:
+        return -math.inf
+    overlooked = math.log(data.rules.ranges.overlooked) if data.searches else 0.0
+    return min(best.elsewhere + overlooked, 0.0)
 
 
 def _residuals(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
