@@ -43,5 +43,6 @@ def test_examples_of_the_page_about_formats_run(tmp_path: Path) -> None:
     written = {path.name for path in tmp_path.iterdir()} - {"data"}
     assert written == {
         *("poses.jsonl", "poses.csv", "poses.tum", "truth.tum", "poses.yaml"),
+        *("bodies.jsonl", ".bodies.jsonl.state", "beside.csv"),
         *("mixpose_tracker-test.csv", "mixpose_camera-test.csv"),
     }

@@ -345,7 +345,10 @@ def test_several_objects_are_no_trajectory(
         (["--format", "tum", "--unit", "m"], "says that its unit is mm"),
         (["--format", "tum", "--unit", "inch"], "--unit inch: allowed are m, cm, mm, um"),
         (["--format", "ros2"], "--format"),
-        (["--format", "csv", "--relative-to", "left"], "belongs to --format bop or ros or tum"),
+        (
+            ["--format", "jsonl", "--relative-to", "left"],
+            "belongs to --format bop or csv or ros or tum",
+        ),
         (["--format", "tum", "--session", "s.toml"], "--session: belongs to"),
         (["--format", "tum", "--relative-to", "left"], "its session s.toml is not there"),
     ],

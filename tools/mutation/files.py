@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from mutation.mutant import Mutant
 
+_RELATIVE = "test_poses_relative.py"
+
 _PLACES = (
     Mutant(
         "units-centimetres-are-millimetres",
@@ -327,6 +329,38 @@ _FORMATS = (
         "else by_twist @ covariance @ by_twist.T",
         "else covariance",
         "poses relative to a sensor have the covariance of other axes",
+    ),
+    Mutant(
+        "poses-beside-a-body-that-errs-in-nothing",
+        "poses/estimates.py",
+        "C = line.covariance + moved @ reference.covariance @ moved.T",
+        "C = line.covariance",
+        "a tool on a patient is told surer than it is",
+        (_RELATIVE,),
+    ),
+    Mutant(
+        "poses-beside-a-body-that-does-not-turn-them",
+        "poses/estimates.py",
+        "moved[:3, 3:] = np.cross(np.eye(3), arm).T",
+        "pass",
+        "what a turn of the patient moves at the tool is not in the covariance",
+        (_RELATIVE,),
+    ),
+    Mutant(
+        "poses-beside-a-body-that-is-in-doubt",
+        "poses/estimates.py",
+        'status="ok" if line.status == reference.status == "ok" else "ambiguous"',
+        "status=line.status",
+        "a tool is ok on a patient that may be turned another way",
+        (_RELATIVE,),
+    ),
+    Mutant(
+        "cli-poses-table-without-tips",
+        "cli/run.py",
+        "tips=any(one.body.tip is not None for one in session.objects)",
+        "tips=False",
+        "tables leave out the one point that a tool is for",
+        (_RELATIVE,),
     ),
     Mutant(
         "poses-indefinite-covariance-passes",

@@ -61,7 +61,9 @@ class ConvertRequest:
     scene_id: int | None = option(None, "bop: the scene; 0.", min=0)
     obj_id: int | None = option(None, "bop: the object; 1.", min=0)
     relative_to: str | None = option(
-        None, "bop, ros, tum: relative to a camera, not the world.", metavar="SENSOR"
+        None,
+        "bop, csv, ros, tum: relative to a camera, or another body of POSES, not the world.",
+        metavar="NAME",
     )
     session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
     source: list[str] | None = option(

@@ -15,7 +15,13 @@ from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
-from mixpose.poses.estimates import first_answers, header_of, objects_of, relative_to
+from mixpose.poses.estimates import (
+    first_answers,
+    header_of,
+    objects_of,
+    relative_to,
+    relative_to_body,
+)
 from mixpose.poses.formats import ONE_TRAJECTORY
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -36,6 +42,11 @@ def convert_poses(request: ConvertRequest) -> None:
     path, name = request.poses, _format(request)
     _refuse_options_of_other_formats(name, request)
     poses = read_poses(path)
+    T_sensor_world = np.eye(4)
+    if request.relative_to in {line.label for line in poses.poses}:
+        poses = _beside(poses, request.relative_to, name)
+    elif request.relative_to is not None:
+        T_sensor_world = _T_sensor_world(poses, request.relative_to, request)
     lines = _selected(poses, name, request)
     if request.only_ok and not lines:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
@@ -52,14 +63,19 @@ def convert_poses(request: ConvertRequest) -> None:
         write_markers(poses, lines, session, name, request)
         return
     else:
-        _write(poses, lines, name, request)
+        _write(poses, lines, name, T_sensor_world, request)
     if request.output is not None:
         count = f"{len(lines)} pose{'s' * (len(lines) != 1)}"
         say(f"{count} -> {', '.join(map(str, outputs))}")
 
 
-def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
-    T_sensor_world = _T_sensor_world(poses, request)
+def _write(
+    poses: PoseFile,
+    lines: Sequence[PoseLine],
+    name: str,
+    T_sensor_world: Floats,
+    request: ConvertRequest,
+) -> None:
     frame_id = request.relative_to if name == "ros" else None
     given = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
     options = {key: value for key, value in given.items() if value is not None}
@@ -72,17 +88,41 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
             output.write(relative_to(T_sensor_world, line))
 
 
-def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
-    """What poses are moved by before they are written; identity for poses in the world."""
-    if request.relative_to is None:
-        return np.eye(4)
+def _beside(poses: PoseFile, reference: str, name: str) -> PoseFile:
+    """Poses of the other bodies of a file in the axes of one of them."""
+    if name == "bop":
+        raise SessionError(
+            f"--relative-to {reference}: is a body, and --format bop holds poses relative to a "
+            "camera; choose csv, ros or tum"
+        )
+    known = {line.frame: line for line in poses.poses if line.label == reference}
+    others = [line for line in poses.poses if line.label != reference]
+    if not others:
+        raise SessionError(f"--relative-to {reference}: {poses.path} has poses of no other body")
+    beside = tuple(relative_to_body(line, known.get(line.frame)) for line in others)
+    lost = sum(
+        one.status != "lost" and then.status == "lost"
+        for one, then in zip(others, beside, strict=True)
+    )
+    if lost:
+        warn(
+            f"{poses.path}: {lost} of {len(others)} poses are lost, as {reference!r} has none then"
+        )
+    return replace(poses, poses=beside)
+
+
+def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floats:
+    """The pose (4, 4) of a camera of the session, that poses are moved by."""
     session = session_of(poses, request.session)
     sensors = {setup.name: setup.sensor for setup in session.sensors}
     cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
-    if request.relative_to in cameras:
-        return np.asarray(cameras[request.relative_to].T_sensor_world)  # type: ignore[attr-defined]
-    allowed = f"allowed: {', '.join(cameras)}" if cameras else "the session has none"
-    raise SessionError(f"--relative-to {request.relative_to}: no such camera, {allowed}")
+    if name in cameras:
+        return np.asarray(cameras[name].T_sensor_world)  # type: ignore[attr-defined]
+    bodies = ", ".join(dict.fromkeys(line.label for line in poses.poses))
+    allowed = f"cameras are {', '.join(cameras)}" if cameras else "the session has no camera"
+    raise SessionError(
+        f"--relative-to {name}: no such camera or body; {allowed}, bodies are {bodies}"
+    )
 
 
 def _format(request: ConvertRequest) -> str:
@@ -104,7 +144,7 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
     given = {
         "--scene-id": (request.scene_id, ("bop",)),
         "--obj-id": (request.obj_id, ("bop",)),
-        "--relative-to": (request.relative_to, ("bop", "ros", "tum")),
+        "--relative-to": (request.relative_to, ("bop", "csv", "ros", "tum")),
         "--source": (request.source, ("rerun",)),
         "--measured": (request.measured or None, MARKER_FORMATS),
         "--fps": (request.fps, MARKER_FORMATS),

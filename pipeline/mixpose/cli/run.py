@@ -209,6 +209,7 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
         sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
         objects={one.body.name: one.count for one in session.objects},
+        tips=any(one.body.tip is not None for one in session.objects),
     )
 
 

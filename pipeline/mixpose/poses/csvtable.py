@@ -24,6 +24,10 @@ POSE_COLUMNS = (
 COVARIANCE_COLUMNS = tuple(
     f"cov_{rigid.TWIST_NAMES[i]}_{rigid.TWIST_NAMES[j]}" for i, j in zip(*_UPPER)
 )
+TIP_COLUMNS = (
+    *("tip_x", "tip_y", "tip_z"),
+    *("tip_cov_x_x", "tip_cov_x_y", "tip_cov_x_z", "tip_cov_y_y", "tip_cov_y_z", "tip_cov_z_z"),
+)
 SENSOR_COLUMNS = ("used", "explained", "rms")
 
 
@@ -32,7 +36,8 @@ class CsvWriter(PoseWriter):
 
     Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
     behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
-    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; confidence; score;
+    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; where a body has a tip,
+    where it is and its covariance, ``tip_<a>`` and ``tip_cov_<a>_<b>``; confidence; score;
     ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor, which the header
     names or else the first frame; latency_ms.
     """
@@ -47,7 +52,8 @@ class CsvWriter(PoseWriter):
         of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
         numbered = ["instance"] if self._numbered else []
         columns = [*FRAME_COLUMNS[:3], *numbered, *FRAME_COLUMNS[3:], *POSE_COLUMNS]
-        columns += [*COVARIANCE_COLUMNS, "confidence", "score", *of_sensors, "latency_ms"]
+        columns += [*COVARIANCE_COLUMNS, *(TIP_COLUMNS if self._header.tips else ())]
+        columns += ["confidence", "score", *of_sensors, "latency_ms"]
         rows = csv.DictWriter(self._stream, columns, lineterminator="\n")
         rows.writeheader()
         self._stream.flush()
@@ -62,6 +68,7 @@ class CsvWriter(PoseWriter):
             "status": estimate.status,
             "unit": self._header.unit,
             **_pose_cells(estimate),
+            **_tip_cells(estimate),
             "confidence": plain_or_none(estimate.confidence),
             "score": plain(1.0 if estimate.score is None else estimate.score),
             "latency_ms": plain(estimate.latency_ms or 0.0),
@@ -94,4 +101,15 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
     cells = dict(zip(POSE_COLUMNS, plain(numbers), strict=True))
     if estimate.covariance is not None:
         cells |= zip(COVARIANCE_COLUMNS, plain(estimate.covariance[_UPPER]), strict=True)
+    return cells
+
+
+def _tip_cells(estimate: Estimate) -> dict[str, Any]:
+    """Cells of the tip, as far as there is one."""
+    tip, C = estimate.tip, estimate.tip_covariance
+    if tip is None:
+        return {}
+    cells = dict(zip(TIP_COLUMNS, plain(tip)))
+    if C is not None:
+        cells |= zip(TIP_COLUMNS[3:], plain(C[np.triu_indices(3)]), strict=True)
     return cells

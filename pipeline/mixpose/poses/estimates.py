@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TypeVar
@@ -12,7 +13,7 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.units import length_ratio
 
 _Posed = TypeVar("_Posed", bound=Estimate)
@@ -33,6 +34,7 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         sensors=tuple(names),
         objects=objects_of(poses.poses),
         smoothed=found.get("smoothed", {}),
+        tips=any(line.tip_object is not None for line in poses.poses),
     )
 
 
@@ -48,6 +50,54 @@ def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
     """An estimate in the axes of a sensor, (4, 4): its pose is then T_sensor_object."""
     turn = np.asarray(np.kron(np.eye(2), T_sensor_world[:3, :3]), dtype=np.float64)
     return _changed(estimate, lambda T: T_sensor_world @ T, turn)
+
+
+def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
+    """A pose in the axes of another body, T_reference_object, as sure as both; lost without it.
+
+    Errors of the two are taken for independent of each other.
+    """
+    both = (line, reference)
+    T, T_reference = (None if one is None else one.T_world_object for one in both)
+    if reference is None or T is None or T_reference is None:
+        return replace(
+            line,
+            status="lost",
+            T_world_object=None,
+            covariance=None,
+            hypotheses=(),
+            confidence=0.0,
+            doubt=line.doubt or (reference.doubt if reference else ""),
+        )
+    back = rigid.inverse(T_reference)
+    rivals = [
+        Hypothesis(rigid.inverse(other.T_world_object) @ one.T_world_object, one.weight * weight)
+        for one in line.hypotheses or (Hypothesis(T, 1.0),)
+        for other in reference.hypotheses or (Hypothesis(T_reference, 1.0),)
+        for weight in (other.weight,)
+    ]
+    sure = line.confidence, reference.confidence
+    return replace(
+        line,
+        status="ok" if line.status == reference.status == "ok" else "ambiguous",
+        T_world_object=back @ T,
+        covariance=_of_both(line, reference, T[:3, 3] - T_reference[:3, 3]),
+        hypotheses=tuple(sorted(rivals, key=lambda one: -one.weight)) if len(rivals) > 1 else (),
+        confidence=None if None in sure else math.prod(one or 0.0 for one in sure),
+        doubt=line.doubt or reference.doubt,
+    )
+
+
+def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
+    """The covariance (6, 6) of a pose that is `arm` (3,) away from another, in the axes of that."""
+    assert reference.T_world_object is not None
+    if line.covariance is None or reference.covariance is None:
+        return None
+    turn = np.kron(np.eye(2), reference.T_world_object[:3, :3].T)
+    moved = np.eye(6)  # a turn w of the reference moves what is `arm` away from it by w × arm
+    moved[:3, 3:] = np.cross(np.eye(3), arm).T
+    C = line.covariance + moved @ reference.covariance @ moved.T
+    return np.asarray(turn @ C @ turn.T)
 
 
 def _changed(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:

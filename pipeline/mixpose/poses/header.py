@@ -27,9 +27,10 @@ class Header:
     # recordings given in place of the session's, by sensor name; the line has them only where there
     # are any
     sources: Mapping[str, str] = field(default_factory=dict)
-    # Names of all sensors of the session, in its order.  Only the CSV table needs them, for its
-    # columns; they are not written into JSON lines.
+    # Names of all sensors of the session, in its order, and whether any body has a tip.  Only the
+    # CSV table needs them, for its columns; they are not written into JSON lines.
     sensors: tuple[str, ...] = ()
+    tips: bool = False
     # Names of all bodies with how many there are of each, in the order of their pose lines; the
     # line has them only where there are several.  Empty: not known.
     objects: Mapping[str, int] = field(default_factory=dict)
