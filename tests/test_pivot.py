@@ -221,6 +221,16 @@ def test_the_covariance_of_a_tip_is_that_of_drawn_poses() -> None:
     np.testing.assert_allclose(np.cov(tips.T), expected, rtol=0.1, atol=3e-3)
 
 
+def test_frames_whose_pose_is_not_ok_are_counted(tmp_path: Path) -> None:
+    pivoting = run_of(1)
+    lines = lines_of(pivoting.poses, pivoting.covariances[0])
+    told = [replace(line, status="ambiguous") if k < 3 else line for k, line in enumerate(lines)]
+    write_poses(tmp_path / "poses.jsonl", told)
+    done = command("pivot", tmp_path / "poses.jsonl")
+    assert done.returncode == 0
+    assert f"{len(lines) - 3} frames, 0 left out, 3 not ok; directions" in done.stdout
+
+
 def test_options_that_name_nothing_are_refused(tmp_path: Path) -> None:
     pivoting = run_of(1)
     path = tmp_path / "poses.jsonl"

@@ -38,7 +38,9 @@ def pivot_poses(request: PivotRequest) -> None:
     except RecordingError as error:
         raise RecordingError(f"{path}: {tool}: {error}") from error
     unit = poses.unit or "units"
-    sys.stdout.write("\n".join(_lines(tool, request.reference, tip, unit)) + "\n")
+    frames = {line.frame for line in poses.poses if line.label == tool}
+    unsure = len(frames) - tip.frames - tip.left_out
+    sys.stdout.write("\n".join(_lines(tool, request.reference, tip, unit, unsure)) + "\n")
     _warn(tip)
     if request.into is not None:
         _put_into(request.into, tool, poses, tip)
@@ -86,18 +88,20 @@ def _known(poses: PoseFile, label: str) -> dict[int, PoseLine]:
     return {line.frame: line for line in lines}
 
 
-def _lines(tool: str, reference: str | None, tip: Tip, unit: str) -> list[str]:
+def _lines(tool: str, reference: str | None, tip: Tip, unit: str, unsure: int) -> list[str]:
+    """What is printed of a tip; `unsure` frames have no pose that is ok, of both bodies."""
     deviations = np.sqrt(tip.covariance.diagonal())
     turns = ", ".join(f"{value:.3g}" for value in tip.turns_deg[::-1])
     where = "the world" if reference is None else reference
+    not_ok = f", {unsure} not ok" if unsure else ""
     return [
         f"tip of {tool}: ({_numbers(tip.place, deviations)}) {unit}",
         f"one standard deviation: ({', '.join(f'{d:.2g}' for d in deviations)}) {unit}",
         f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in {where}",
         f"from it: {tip.residual:.3g} {unit} RMS, {tip.held_out:.3g} in frames held out; "
         f"{tip.expected:.3g} by the covariances of the poses",
-        f"{tip.frames} frames, {tip.left_out} left out; directions of the body swing by {turns} "
-        "deg RMS",
+        f"{tip.frames} frames, {tip.left_out} left out{not_ok}; directions of the body swing by "
+        f"{turns} deg RMS",
     ]
 
 
