@@ -94,6 +94,28 @@ def test_a_plane_through_many_points_keeps_origin_and_heading(up: str) -> None:
     assert found.off < 1e-9
 
 
+@pytest.mark.parametrize("count", [3, 20])
+def test_the_floor_is_level_to_what_points_err_by(count: int) -> None:
+    rng = np.random.default_rng(4)
+    places = on_floor((rng.uniform(-400, 400, size=(count, 2)) * [1.0, 0.3]).tolist())
+    told, tilts = [], []
+    for _ in range(400):
+        poses = rigid.from_parts(np.eye(3), places[:, :3, 3] + rng.normal(size=(count, 3)))
+        lines: list[Estimate] = [*lines_of(poses, np.diag([1.0] * 3 + [1e-8] * 3))]
+        found = floor_of(lines, "z", ABOVE)
+        told.append(found.tilt_deg)
+        # about the long axis of the floor, along which points spread most
+        tilts.append(np.degrees(found.T_old_new[:3, 2] @ FLOOR[:3, 1]))
+    # of 400 draws 3.5 %; the long axis of few points is not quite x
+    assert np.sqrt(np.mean(np.square(tilts))) == pytest.approx(np.mean(told), rel=0.15)
+
+
+def test_a_body_on_the_floor_is_level_as_its_turns_are_known() -> None:
+    (line,) = lines_of(FLOOR[None], np.diag([1e-4] * 3 + [4e-6] * 3))
+    assert floor_of([line], "z", ABOVE).tilt_deg == pytest.approx(np.degrees(2e-3))
+    assert floor_of([replace(line, covariance=None)], "z", ABOVE).tilt_deg == 0.0
+
+
 def test_the_tip_of_a_tool_touches_the_floor() -> None:
     tip = np.array([3.0, -8.0, -150.0])
     rng = np.random.default_rng(2)

@@ -96,6 +96,8 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
 def _tell(session: Session, floor: Floor, up: Axis) -> None:
     if floor.off is not None:
         say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
+    if floor.tilt_deg:
+        say(f"the floor is level to {floor.tilt_deg:.2g} deg, one standard deviation")
     heights = rigid.transform(rigid.inverse(floor.T_old_new), _places(session))
     if heights[:, "xyz".index(up)].mean() < 0:
         warn(

@@ -28,6 +28,8 @@ class Floor:
     by: str  # what it was found by
     # root mean square distance of the points from the floor; None where any would fit
     off: float | None = None
+    # standard deviation of its tilt about the axis that is known least; 0 of true poses
+    tilt_deg: float = 0.0
 
 
 def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
@@ -48,7 +50,7 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     if len(bodies) == 1 and rests[0]:
         T = _mean_pose(estimates)
         _require_still(estimates, T)
-        return Floor(T, f"the body {estimates[0].label!r}")
+        return Floor(T, f"the body {estimates[0].label!r}", None, _tilt_of_body(estimates, T, up))
     if all(rests):
         points = np.stack([np.mean([_point(e) for e in own], axis=0) for own in bodies.values()])
     if not all(rests) or len(points) < 3:
@@ -57,11 +59,29 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
         raise RecordingError(
             f"found {len(points)} points; allowed: one body, three points, or more in a plane"
         )
-    normal, off = _normal(points, sensors, np.mean([_covariance(e) for e in estimates], axis=0))
-    if len(points) == 3:
-        return Floor(_axes(points[0], points[1] - points[0], normal, up), "three points")
+    covariance = np.mean([_covariance(e) for e in estimates], axis=0)
+    normal, off, across = _normal(points, sensors, covariance)
+    count, errs = len(points), float(np.sqrt(normal @ covariance @ normal))
+    if count == 3:
+        T = _axes(points[0], points[1] - points[0], normal, up)
+        return Floor(T, "three points", None, float(np.degrees(errs / across)))
+    # where points are farther off the plane than they err by, it is not flat, or they lie not on it
+    errs = max(errs, off * np.sqrt(count / (count - 3)))
     T = _plane(points.mean(axis=0), normal, up)
-    return Floor(T, f"a plane through {len(points)} points", off)
+    tilt_deg = float(np.degrees(errs / across))
+    return Floor(T, f"a plane through {count} points", off, tilt_deg)
+
+
+def _tilt_of_body(estimates: Sequence[Estimate], T_mean: Floats, up: Axis) -> float:
+    """As `Floor.tilt_deg`, as one pose errs: what lasts does not become less with their number."""
+    turns = [e.covariance[3:, 3:] for e in estimates if e.covariance is not None]
+    if not turns:
+        return 0.0
+    normal = T_mean[:3, "xyz".index(up)]
+    level = np.eye(3) - np.outer(normal, normal)
+    return float(
+        np.degrees(np.sqrt(np.linalg.eigvalsh(level @ np.mean(turns, axis=0) @ level)[-1]))
+    )
 
 
 def _point(one: Estimate) -> Floats:
@@ -98,8 +118,11 @@ def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
     return np.asarray(poses[0]) if len(poses) == 1 else rigid.mean_motion(poses)
 
 
-def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float]:
-    """Upward normal of the plane of least squared distances (n, 3), and their root mean square.
+def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float, float]:
+    """Upward normal of the plane of least squared distances of points (n, 3).
+
+    Also the root mean square of these, and the root of the summed squares of how far points are
+    from their middle where they spread least within the plane.
 
     Raises a RecordingError where the points, with a covariance (3, 3) each, span none.
     """
@@ -115,7 +138,7 @@ def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats
     normal = directions[2] / np.linalg.norm(directions[2])
     if (sensors.mean(axis=0) - middle) @ normal < 0:  # up is where the sensors are
         normal = -normal
-    return normal, float(sizes[2] / np.sqrt(len(points)))
+    return normal, float(sizes[2] / np.sqrt(len(points))), float(sizes[1])
 
 
 def _plane(middle: Floats, normal: Floats, up: Axis) -> Floats:
