@@ -17,7 +17,7 @@ from mixpose import rigid
 from mixpose.poses.estimates import relative_to_body
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter, read_poses
-from mixpose.records import Estimate, Hypothesis, SensorReport
+from mixpose.records import Estimate, SensorReport
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 PLACES = {"patient": [40.0, -20.0, 900.0], "tool": [90.0, 30.0, 860.0]}
@@ -96,16 +96,10 @@ def test_the_covariance_is_that_of_errors_of_both(tmp_path: Path) -> None:
 
 def test_what_either_body_leaves_open_is_left_open(tmp_path: Path) -> None:
     tool, patient = estimate("tool", 3), estimate("patient", 3)
-    assert tool.T_world_object is not None
-    assert patient.T_world_object is not None
-    other = rigid.perturb(patient.T_world_object, np.array([0, 0, 0, 0, 0, 2.0]))
-    rivals = Hypothesis(patient.T_world_object, 0.7), Hypothesis(other, 0.3)
-    told = both(tmp_path, tool, replace(patient, status="ambiguous", hypotheses=rivals))
+    told = both(tmp_path, tool, replace(patient, status="ambiguous", confidence=0.7))
     assert told.status == "ambiguous"
-    assert [one.weight for one in told.hypotheses] == pytest.approx([0.7, 0.3])
-    np.testing.assert_allclose(
-        told.hypotheses[1].T_world_object, rigid.inverse(other) @ tool.T_world_object, atol=1e-9
-    )
+    assert told.confidence == pytest.approx(0.7 * 0.9999)
+    assert both(tmp_path, tool, replace(patient, filled=True)).filled
     assert both(tmp_path, tool, lost("patient", 3)).status == "lost"
     assert both(tmp_path, lost("tool", 3), patient).status == "lost"
     line = read_poses(written(tmp_path / "alone.jsonl", tool)).poses[0]
@@ -141,6 +135,9 @@ def test_convert_writes_the_other_bodies_in_the_axes_of_one(tmp_path: Path) -> N
     [
         (("--format", "bop", "--relative-to", "tool"), "is a body, and --format bop holds"),
         (("-o", "a.jsonl", "--relative-to", "tool"), "belongs to --format bop or csv or ros"),
+        (("-o", "a.csv", "--relative-to", "spoon"), "no body, which are patient, tool; "),
+        (("-o", "a.csv", "--relative-to", "tool", "--object", "tool"), "told relative to"),
+        (("-o", "a.csv", "--relative-to", "tool", "--session", "s.toml"), "which needs none"),
     ],
 )
 def test_what_poses_cannot_be_relative_to_is_told(

@@ -282,7 +282,7 @@ def test_second_derivatives_are_differences_of_gradients_at_every_pose_of_a_batc
     T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
     views = views_at(T, np.random.default_rng(1))
     tracker = Tracker.create(TROLLEY, EstimatorOptions())
-    term = AssociationTerm(tracker.data(tracker.begin(), 0, None, views), 1.0)
+    term = AssociationTerm(tracker.data(tracker.begin(), 0, None, views), 1.0, second=True)
     poses = perturb(T, 0.02 * np.random.default_rng(2).standard_normal((3, 6)))
     batch = term.linearise(poses)
     assert batch.hessian is not None

@@ -197,8 +197,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers.py",
-        "(*frame.predictions, frame.beside)",
-        "(*frame.predictions[:1], frame.beside)",
+        "for one in (*likely, frame.beside)",
+        "for one in (*likely[:1], frame.beside)",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),

@@ -58,8 +58,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-maxima-forgotten",
         "tracking/tracker.py",
-        "(*verdict.kept, *verdict.faint)",
-        "verdict.kept",
+        "sorted(verdict.faint if fuse else (), key=lambda each: -each[1])",
+        "list[tuple[ScoredPose, float]]()",
         "where frames tell that another turn is right, that has to be found anew in one of them",
         (_MAXIMA,),
     ),
@@ -106,7 +106,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-same-maximum-many-times",
         "tracking/ranges.py",
-        "for k in order[unlike(frame.body, ends[order], cell)]:",
+        "for k in order[unlike(frame.body, ends[order], cell, whole=True)]:",
         "for k in order:",
         "poses that are one are judged as often as starts lead to them",
         (_MAXIMA,),
@@ -114,8 +114,8 @@ MUTANTS = (
     Mutant(
         "search-ranges-from-the-middle-alone",
         "search/poses.py",
-        "around = np.concatenate([np.zeros((1, 3)), aside, -aside])",
-        "around = np.zeros((1, 3))",
+        "[np.zeros((1, 3)), aside, -aside] if aside.any()",
+        "[np.zeros((1, 3))] if aside.any()",
         "false ranges move the middle, and with it all places that are tried",
         (_MAXIMA,),
     ),

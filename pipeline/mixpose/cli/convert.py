@@ -44,6 +44,10 @@ def convert_poses(request: ConvertRequest) -> None:
     poses = read_poses(path)
     T_sensor_world = np.eye(4)
     if request.relative_to in {line.label for line in poses.poses}:
+        if request.relative_to == request.object:
+            raise SessionError(f"--object {request.object}: is what poses are told relative to")
+        if request.session is not None:
+            raise SessionError("--session: found beside a body at --relative-to, which needs none")
         poses = _beside(poses, request.relative_to, name)
     elif request.relative_to is not None:
         T_sensor_world = _T_sensor_world(poses, request.relative_to, request)
@@ -95,7 +99,10 @@ def _beside(poses: PoseFile, reference: str, name: str) -> PoseFile:
             f"--relative-to {reference}: is a body, and --format bop holds poses relative to a "
             "camera; choose csv, ros or tum"
         )
-    known = {line.frame: line for line in poses.poses if line.label == reference}
+    own = [line for line in poses.poses if line.label == reference]
+    known = {line.frame: line for line in first_answers(own)}
+    if len(known) < len(own):
+        warn(f"{poses.path}: several right answers for {reference!r}; the first is taken")
     others = [line for line in poses.poses if line.label != reference]
     if not others:
         raise SessionError(f"--relative-to {reference}: {poses.path} has poses of no other body")
@@ -113,12 +120,15 @@ def _beside(poses: PoseFile, reference: str, name: str) -> PoseFile:
 
 def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floats:
     """The pose (4, 4) of a camera of the session, that poses are moved by."""
-    session = session_of(poses, request.session)
+    bodies = ", ".join(dict.fromkeys(line.label for line in poses.poses))
+    try:
+        session = session_of(poses, request.session)
+    except SessionError as error:
+        raise SessionError(f"--relative-to {name}: no body, which are {bodies}; {error}") from error
     sensors = {setup.name: setup.sensor for setup in session.sensors}
     cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
     if name in cameras:
         return np.asarray(cameras[name].T_sensor_world)  # type: ignore[attr-defined]
-    bodies = ", ".join(dict.fromkeys(line.label for line in poses.poses))
     allowed = f"cameras are {', '.join(cameras)}" if cameras else "the session has no camera"
     raise SessionError(
         f"--relative-to {name}: no such camera or body; {allowed}, bodies are {bodies}"

@@ -5,6 +5,7 @@ from mixpose.fit.near import (
     Fit as Fit,
     SearchName as SearchName,
     blur_schedule as blur_schedule,
+    blurs_by_view as blurs_by_view,
     fit_near as fit_near,
     fit_together as fit_together,
     free_mask as free_mask,

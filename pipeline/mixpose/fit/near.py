@@ -93,15 +93,7 @@ class Fit:
         cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]], **rest: Any
     ) -> Fit:
         """Where an ascent through blurs of the views ended."""
-        return cls(ascent.states[0], cls.through(views, levels), **rest)
-
-    @staticmethod
-    def through(
-        views: Sequence[View], levels: Sequence[Sequence[float]]
-    ) -> tuple[Mapping[str, float], ...]:
-        """Blurs of levels by view."""
-        names = [view.name for view in views]
-        return tuple([dict(zip(names, level)) for level in levels])
+        return cls(ascent.states[0], blurs_by_view(views, levels), **rest)
 
     def begins_at(self, other: Ascent, tolerance: float) -> bool:
         """Whether another ascent ended where this fit's first did, so that it leads to the same."""
@@ -110,6 +102,14 @@ class Fit:
         # what two ascents leave to be gained at one place: 0.003 σ_ε
         same = 10 * tolerance * abs(float(other.values[0]))
         return float(away @ other.last.curvature[0] @ away) < same
+
+
+def blurs_by_view(
+    views: Sequence[View], levels: Sequence[Sequence[float]]
+) -> tuple[Mapping[str, float], ...]:
+    """Blurs of levels, by the names of views."""
+    names = [view.name for view in views]
+    return tuple([dict(zip(names, level)) for level in levels])
 
 
 def widest_blurs(

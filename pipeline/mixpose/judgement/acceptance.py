@@ -173,8 +173,8 @@ def decide(
         if one is best or (weight >= 1 - rules.confidence and is_fixed(one, free))
     ]
     kept.sort(key=lambda each: each[0] is not best)
-    # what three frames speak against that err as seldom as one that is ok
-    least = (1 - rules.confidence) ** 3
+    # a pose that is less likely needs more than three frames that err as seldom as one that is ok
+    least = max((1 - rules.confidence) ** 3, 1e-12)
     faint = tuple(
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)

@@ -68,7 +68,7 @@ class CsvWriter(PoseWriter):
             "status": estimate.status,
             "unit": self._header.unit,
             **_pose_cells(estimate),
-            **_tip_cells(estimate),
+            **(_tip_cells(estimate) if self._header.tips else {}),
             "confidence": plain_or_none(estimate.confidence),
             "score": plain(1.0 if estimate.score is None else estimate.score),
             "latency_ms": plain(estimate.latency_ms or 0.0),

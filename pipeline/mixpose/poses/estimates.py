@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TypeVar
@@ -13,7 +12,7 @@ from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.records import Estimate, Floats
 from mixpose.units import length_ratio
 
 _Posed = TypeVar("_Posed", bound=Estimate)
@@ -55,11 +54,10 @@ def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
 def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
     """A pose in the axes of another body, T_reference_object, as sure as both; lost without it.
 
-    Errors of the two are taken for independent of each other.
+    Errors of the two are taken for independent of each other.  What else either may be is left out.
     """
-    both = (line, reference)
-    T, T_reference = (None if one is None else one.T_world_object for one in both)
-    if reference is None or T is None or T_reference is None:
+    T = line.T_world_object
+    if reference is None or T is None or reference.T_world_object is None:
         return replace(
             line,
             status="lost",
@@ -67,24 +65,16 @@ def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
             covariance=None,
             hypotheses=(),
             confidence=0.0,
-            doubt=line.doubt or (reference.doubt if reference else ""),
         )
-    back = rigid.inverse(T_reference)
-    rivals = [
-        Hypothesis(rigid.inverse(other.T_world_object) @ one.T_world_object, one.weight * weight)
-        for one in line.hypotheses or (Hypothesis(T, 1.0),)
-        for other in reference.hypotheses or (Hypothesis(T_reference, 1.0),)
-        for weight in (other.weight,)
-    ]
-    sure = line.confidence, reference.confidence
+    T_reference, own, other = reference.T_world_object, line.confidence, reference.confidence
     return replace(
         line,
         status="ok" if line.status == reference.status == "ok" else "ambiguous",
-        T_world_object=back @ T,
+        T_world_object=rigid.inverse(T_reference) @ T,
         covariance=_of_both(line, reference, T[:3, 3] - T_reference[:3, 3]),
-        hypotheses=tuple(sorted(rivals, key=lambda one: -one.weight)) if len(rivals) > 1 else (),
-        confidence=None if None in sure else math.prod(one or 0.0 for one in sure),
-        doubt=line.doubt or reference.doubt,
+        hypotheses=(),
+        confidence=None if own is None or other is None else own * other,
+        filled=line.filled or reference.filled,
     )
 
 

@@ -256,13 +256,13 @@ class Descent:
         return perturb(poses, twists * np.minimum(1.0, 0.35 / np.maximum(longest, 1e-12))[:, None])
 
 
-def unlike(body: Body, poses: Floats, cell: float) -> Indices:
+def unlike(body: Body, poses: Floats, cell: float, *, whole: bool = False) -> Indices:
     """Indices, ascending, of poses (H, 4, 4) that do not put the body where an earlier one does.
 
-    Of very many, about: places of features are the same within cells whose side is a share `cell`
-    of the body's radius.
+    Of very many, about: places of three features, or of the `whole` body, are the same within cells
+    whose side is a share `cell` of the body's radius.
     """
-    corners = body.means[[0, len(body) // 2, -1]]
+    corners = body.means if whole else body.means[[0, len(body) // 2, -1]]
     places = transform(poses, corners).reshape(len(poses), corners.size)
     cells = np.round(places / (cell * body.radius)).astype(np.int64)
     keys = cells @ np.random.default_rng(0).integers(1, 2**40, cells.shape[1])
@@ -303,7 +303,7 @@ def spread_turns(free: Mask, step: float) -> Floats:
 def _centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see.
 
-    And as far from there as false detections and hidden features move the middle.
+    Of single ranges also those to which false ranges may have moved the middle from.
     """
     radius, middles = problem.body.radius, Sum(tuple(map(_Middle, problem.detections)))
 
@@ -318,9 +318,14 @@ def _centres(problem: SearchProblem) -> Floats:
     near = places[np.argsort(off, kind="stable")[:count]]
     distinct = unlike(problem.body, from_parts(np.eye(3), near), 0.2)
     near = near[distinct[: problem.budget.sample // 2]]
-    variances = [one.moments[1] ** 2 / max(len(one.points), 1) for one in problem.detections]
-    aside = math.sqrt(np.mean(variances)) * np.diag(problem.free[:3])
-    around = np.concatenate([np.zeros((1, 3)), aside, -aside])
+    if any(one.view.sensor.dimension != 1 or not len(one.points) for one in problem.detections):
+        return np.asarray(near)
+    # their unit is that of places
+    variances = [one.moments[1] ** 2 / len(one.points) for one in problem.detections]
+    aside = math.sqrt(np.mean(variances)) * np.eye(3)[problem.free[:3]]
+    around = np.concatenate(
+        [np.zeros((1, 3)), aside, -aside] if aside.any() else [np.zeros((1, 3))]
+    )
     return np.asarray((near[:, None] + around).reshape(-1, 3))
 
 

@@ -167,8 +167,8 @@ class Frame(Setup):
         terms, spreads = [math.log(surprise) + anywhere[0]], [anywhere[1]]
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
-            weight = max((1 - surprise) * one.weight, 1e-12)
-            terms.append(math.log(weight) + float(one.log_density(T, self.free, rules)))
+            near = float(one.log_density(T, self.free, rules))
+            terms.append(one.log_belief(surprise) + near)
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
@@ -221,7 +221,7 @@ class Frame(Setup):
         for one in self.predictions:
             there = nearest_alike(poses, self.body, one.T_world_object)
             near = one.log_density(there, self.free, self.rules.motion)
-            logs = np.logaddexp(logs, math.log(max(1 - surprise, 1e-12)) + near)
+            logs = np.logaddexp(logs, one.log_belief(surprise) + near)
         return logs
 
     def gains(self, poses: Floats) -> Floats:

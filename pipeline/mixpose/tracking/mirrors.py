@@ -48,13 +48,13 @@ def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bo
     """
     a, b, found, body = one.T_world_object, other.T_world_object, [], data.body
     x, rules = transform(a, body.means), data.rules.look_alikes
+    cameras = [view.sensor for view in data.views if view.sensor.dimension == 2]
     for E in _onto_itself(body, rules.alike):
         y = transform(b @ E @ inverse(a), x)
         away = (x - y).mean(axis=0)
         if ((x - y) @ away).min() <= 0:  # no body reaches through a mirror, as other tilts would
             continue
         middle = ((x + y) / 2).mean(axis=0, keepdims=True)
-        cameras = [view.sensor for view in data.views if view.sensor.dimension == 2]
         sides = [float(camera.towards(middle)[0] @ away) for camera in cameras]
         sides = [side for side in sides if side]  # points in space are seen from nowhere
         if sides and (min(sides) > 0 or max(sides) < 0):

@@ -31,6 +31,7 @@ from mixpose.search import (
     sparse,
 )
 from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.ranges import are_associated
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -41,11 +42,15 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
 
     Or where it was found with all bodies at once.
     """
+    least = 0.0 if _are_ranges(frame) else 1 - frame.rules.acceptance.confidence
+    likely = [one for one in frame.predictions if one.weight >= least]
     return frame.starts or [
-        Start(one.T_world_object, one.uncertainty, one)
-        for one in (*frame.predictions, frame.beside)
-        if one
+        Start(one.T_world_object, one.uncertainty, one) for one in (*likely, frame.beside) if one
     ]
+
+
+def _are_ranges(frame: Frame) -> bool:
+    return are_associated(frame.views, frame.body, frame.rules.ranges)
 
 
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
@@ -89,18 +94,19 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Poses that the first prediction allows, of single ranges: there may be several maxima.
 
-    Where it leaves them less room than they err, there is one.
+    Where it is narrower than the noise there is only one.
     """
-    for first in frame.predictions[:1]:
+    for first in frame.predictions[:1] if _are_ranges(frame) else ():
         uncertainty = np.where(frame.free, first.uncertainty, 0.0)
-        if first.spread is not None and is_wide(frame, first.T_world_object, uncertainty):
+        if first.spread is not None and _is_wide(frame, first.T_world_object, uncertainty):
             modes = frame.rules.ranges.modes
             yield from _around(frame, first.T_world_object, uncertainty, modes)
 
 
-def is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
+def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
     """Whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
-    blurs = widest_blurs(frame.views, frame.body, T_world_object[None], uncertainty[None])
+    given = T_world_object[None], uncertainty[None], frame.rules.fit
+    blurs = widest_blurs(frame.views, frame.body, *given)
     return bool((blurs > frame.sigmas).any())
 
 

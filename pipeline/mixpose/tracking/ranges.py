@@ -14,7 +14,6 @@ counts for one that no search has found yet.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -23,20 +22,20 @@ import numpy as np
 from scipy.special import chdtri, expit
 
 from mixpose.body import Body
-from mixpose.fit import Fit, narrowing, widest_blurs
+from mixpose.fit import Fit, blurs_by_view, narrowing, widest_blurs
 from mixpose.judgement import DetectionModel, ScoredPose, judge, nearest_alike
 from mixpose.matching import Matches
-from mixpose.objective import View, project_body
+from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
-from mixpose.rigid import perturb, twist_between
+from mixpose.rigid import perturb
 from mixpose.search import is_pointlike, unlike
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.rules import RangeRules
 
 # under this name the noise of single ranges is remembered, of all of them together
 RANGES = ("",)
-_STEPS = 5  # at ranges that err by more than they do: none has to arrive
+_STEPS = 5  # at ranges that err by more than they do: these ascents need not converge
 
 
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
@@ -157,10 +156,10 @@ class AssociationTerm:
 
     frame: Frame
     noise: float  # in σ_ε
-    second: bool = True  # whether second derivatives are given, which are differences of gradients
+    second: bool  # whether second derivatives are given, which are differences of gradients
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Second-order models at poses (H, 4, 4), whose curvature is that of known labels."""
+        """Models at poses (H, 4, 4), with the curvature of known labels, and second derivatives."""
         if not self.second:
             found = self._sum(poses)
             return Quadratic(found.log_odds, found.gradient, found.information)
@@ -194,25 +193,19 @@ class ExpectedTerm:
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
-        frame, free = self.frame, self.frame.free
-        logs, aways = [np.full(len(poses), frame.elsewhere)], [np.zeros((len(poses), 6))]
-        informations = [np.zeros(6)]
+        frame, nothing = self.frame, np.zeros((len(poses), 6, 6))
+        surprise = frame.rules.motion.surprised(frame.track.misses)
+        known = [Quadratic(np.full(len(poses), frame.elsewhere), nothing[..., 0], nothing, nothing)]
         for one in frame.predictions:
             if one.spread is None:  # a step or two tell no covariance
                 continue
             there = nearest_alike(poses, frame.body, one.T_world_object)
-            away = twist_between(one.T_world_object, there)
-            information = np.where(free, 1 / np.maximum(one.uncertainty, 1e-12) ** 2, 0.0)
-            peak = math.log(max(one.weight, 1e-300))
-            peak += 0.5 * float(np.log(information[free] / (2 * math.pi)).sum())
-            logs.append(peak - 0.5 * away**2 @ information)
-            aways.append(away)
-            informations.append(information)
-        chosen, rows = np.argmax(logs, axis=0), np.arange(len(poses))
-        information = np.array(informations)[chosen]
-        C = information[..., None] * np.eye(6)
-        pull = -information * np.array(aways)[chosen, rows]
-        return Quadratic(np.array(logs)[chosen, rows], pull, C, C)
+            prior = NormalPrior(one.T_world_object, one.uncertainty, frame.free).linearise(there)
+            deviations = one.uncertainty[frame.free]
+            peak = one.log_belief(surprise) - float(np.log(np.sqrt(2 * np.pi) * deviations).sum())
+            known.append(prior._replace(value=prior.value + peak))
+        chosen, rows = np.argmax([one.value for one in known], axis=0), np.arange(len(poses))
+        return Quadratic._make(np.stack(parts)[chosen, rows] for parts in zip(*known, strict=True))
 
 
 class AssociationLikelihood:
@@ -228,25 +221,25 @@ class AssociationLikelihood:
     def fits(self, starts: Iterable[Start]) -> Iterator[tuple[Start, Fit]]:
         """Climb the posterior from all starts at once, and give what they lead to, the best first.
 
-        Of ends that are one none but the first, and none that makes no odds beside the best.
+        Ends at one place are given once; those too far behind the best are left out.
         """
         begun = list(starts)
         if not begun:
             return
-        frame, (ends, values, widths) = self.frame, self._climb(begun)
+        frame, (ends, values, levels) = self.frame, self._climb(begun)
         order = np.argsort(-values, kind="stable")
         cell = 0.1 * min(frame.sigmas) / frame.body.radius
-        blurs = Fit.through(frame.views, np.outer(widths, frame.sigmas).tolist())
-        for k in order[unlike(frame.body, ends[order], cell)]:
+        for k in order[unlike(frame.body, ends[order], cell, whole=True)]:
             if values[k] > values[order[0]] - frame.rules.ranges.behind:
-                yield begun[k], Fit(ends[k], blurs)
+                widths = np.outer(levels[k], frame.sigmas).tolist()
+                yield begun[k], Fit(ends[k], blurs_by_view(frame.views, widths))
 
     def fit(self, start: Start) -> Fit:
         """Climb the posterior, at first with ranges that err as far as the start may be off."""
         return next(self.fits([start]))[1]
 
-    def _climb(self, starts: Sequence[Start]) -> tuple[Floats, Floats, list[float]]:
-        """Where starts lead to (H, 4, 4), with what log density, by errors of ranges in σ_ε."""
+    def _climb(self, starts: Sequence[Start]) -> tuple[Floats, Floats, list[list[float]]]:
+        """Where starts lead to (H, 4, 4), their log densities, and through what errors, in σ_ε."""
         frame = self.frame
         poses = np.array([one.T_world_object for one in starts])
         unsure = [np.zeros(6) if one.uncertainty is None else one.uncertainty for one in starts]
@@ -264,7 +257,8 @@ class AssociationLikelihood:
             poses[some] = ascend(term, poses[some], perturb, frame.free, few).states
         term = self._posterior(self._noise, second=False)
         end = ascend(term, poses, perturb, frame.free, many)
-        return frame.oriented(end.states), end.values, [*widths, self._noise]
+        own = [[*(w for w in widths if begin >= w * (1 - 1e-9)), self._noise] for begin in begins]
+        return frame.oriented(end.states), end.values, own
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by the sum over all associations, and by what the track expects."""
@@ -277,7 +271,8 @@ class AssociationLikelihood:
         noise = model.noise.memory * before.of(RANGES) + [[squares], [degrees]]
         covariance, volume = self._covariance(T, found)
         # right poses meet all features, off by the noise but for what they are fitted to it
-        ahead = float((found.most - (found.reached - count) / 2 - found.log_odds)[0])
+        spare = np.maximum(found.reached - count, 0.0)
+        ahead = float((found.most - spare / 2 - found.log_odds)[0])
         expected = float(frame.expectation(T[None])[0]) - frame.elsewhere
         return replace(
             judge(frame.finest, T, frame.free, model),
@@ -289,7 +284,7 @@ class AssociationLikelihood:
         )
 
     def _covariance(self, T: Floats, found: AssociationSum) -> tuple[Floats, float]:
-        """Of a pose (6, 6), as wide as holds where it may be, and the log volume of its peak."""
+        """Of a pose (6, 6), wide enough for where else it may be; the log volume of its peak."""
         frame, free, rules = self.frame, self.frame.free, self.frame.rules
         inner, known = np.ix_(free, free), frame.track.residuals.of(RANGES)
         # a direction that all of it leaves open is as uncertain as anywhere
@@ -305,7 +300,7 @@ class AssociationLikelihood:
         for twist in twists[likely > missed]:
             pull = weights @ twist
             squares = float(twist @ pull)
-            # its ellipsoid holds what is as likely as that a pose which is ok is wrong
+            # its ellipsoid holds what is likelier than that a pose which is ok is wrong
             if squares > limit:
                 wider = 1 / limit - 1 / squares
                 C += wider * np.outer(twist, twist)

@@ -2,7 +2,7 @@
 
 Errors of a session and of its detections are alike in frames that follow each other, so that what
 tells two poses apart does not add up from frame to frame: of all frames the one counts that tells
-most, and not their product.
+most, and not their product.  Single ranges are the exception: their errors are drawn anew.
 
 A pose may leave as many detections as another meets in their place, one step of a grid aside, or
 turned.  That these lie by chance as the body's features would is far less likely than that the body
@@ -29,7 +29,7 @@ from mixpose.tracking.track import Branch
 def odds_beside(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """Log odds of a rival against the best pose of a frame, by the frames before as well."""
     odds = ahead(rival, best)
-    if best.spread is not None:  # single ranges, whose errors are drawn anew
+    if best.spread is not None:  # single ranges
         return odds
     before = _before(data, rival, best)
     now = odds - before + max(_of_more_than_told(data, rival, best), 0.0)

@@ -233,8 +233,10 @@ class WindowedScene:
         """In which part of each image the bodies are expected, one window around all of them."""
         windows: dict[str, Box] = {}
         for k, tracked in enumerate(self.scene.bodies):
+            least = 1 - tracked.rules.acceptance.confidence
             predictions = tracked.predictions(tracks[k], frame, time_s)
-            for name, box in self._expectations[k].windows(predictions).items():
+            likely = [one for one in predictions if one.weight >= least]
+            for name, box in self._expectations[k].windows(likely).items():
                 a, b, c, d = windows.get(name, box)
                 windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])
         return windows

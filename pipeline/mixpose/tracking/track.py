@@ -21,6 +21,9 @@ from mixpose.tracking.motion import Course, Distances, MotionRules, RandomWalk, 
 from mixpose.tracking.sizes import Sizes
 from mixpose.tracking.static_clutter import StaticClutter
 
+LEAST_BELIEF = 1e-12
+"""In a branch: what is less likely is as good as what nobody thought of."""
+
 
 @dataclass(frozen=True)
 class Branch:
@@ -37,6 +40,10 @@ class Branch:
     deviation: Floats | None = None  # (6,), the same, where anybody asks for velocities at moments
     course: Course | None = None  # for its velocity at a moment, there
     other: float | None = None  # log odds of another thing there, if it was seen beside the body
+
+    def log_belief(self, surprise: float) -> float:
+        """Logarithm of the belief that the body is here, where it is elsewhere by a `surprise`."""
+        return math.log(max((1 - surprise) * self.weight, LEAST_BELIEF))
 
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
         """Of poses (..., 4, 4) before the frame that this predicts, in directions that are free."""
@@ -136,7 +143,9 @@ class Track:
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
     delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
     doubted: bool = False  # whether another body may have what the last pose meets
-    elsewhere: float = -math.inf  # log odds of a better pose, of ranges, that nobody has looked at
+    # log odds of a better pose, of single ranges, that nobody has looked at: where they are high it
+    # is searched for
+    elsewhere: float = -math.inf
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
     gained: float = 0.0  # log evidence of the last of them per coordinate that it met

@@ -318,22 +318,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
         state = data.searches[-1][1] if data.searches else Track.search
         return replace(track.missed(state, clutter), doubted=True)
-    found = []
-    for one, weight in (*verdict.kept, *verdict.faint):
-        # what may be mere clutter counts as little in the next frame
-        belief = weight * float(expit(one.log_evidence))
-        momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
-        spread = one.spread if data.options.fuse else None
-        T, second = one.T_world_object, verdict.second
-        other = data.other_at(T)
-        if second and one is second.pose:
-            other = -second.either
-        elif second and second.told and one is best:
-            other = second.either
-        branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
-        is_new = one.proposer == SECOND_POSE
-        alike = None if is_new else [each.T_body_other for each in congruent(data, one)]
-        found.append((branch, alike))
+    found = _branches(data, verdict, best)
     used = best.used
     met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
@@ -368,10 +353,38 @@ def followed(data: Frame, verdict: Verdict) -> Track:
 
 def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
     """Log odds that single ranges have a better pose elsewhere, after a frame and its searches."""
-    if best.elsewhere is None:
+    if best.elsewhere is None or not data.options.fuse:
         return -math.inf
-    overlooked = math.log(data.rules.ranges.overlooked) if data.searches else 0.0
+    is_searched = any(report.refined for report, _ in data.searches)
+    overlooked = math.log(data.rules.ranges.overlooked) if is_searched else 0.0
     return min(best.elsewhere + overlooked, 0.0)
+
+
+def _branches(
+    data: Frame, verdict: Verdict, best: ScoredPose
+) -> list[tuple[Branch, list[Floats] | None]]:
+    """Poses to be followed, the best first, and motions to what looks the same, as `follow` has it.
+
+    Of single ranges, where frames are not kept apart, unlikely ones too.
+    """
+    found, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
+    faint = sorted(verdict.faint if fuse else (), key=lambda each: -each[1])
+    for one, weight in (*verdict.kept, *faint[: data.rules.ranges.modes]):
+        # what may be mere clutter counts as little in the next frame
+        belief = weight * float(expit(one.log_evidence))
+        momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
+        spread = one.spread if fuse else None
+        T, second = one.T_world_object, verdict.second
+        other = data.other_at(T)
+        if second and one is second.pose:
+            other = -second.either
+        elif second and second.told and one is best:
+            other = second.either
+        branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
+        is_new = one.proposer == SECOND_POSE
+        alike = None if is_new else [each.T_body_other for each in congruent(data, one)]
+        found.append((branch, alike))
+    return found
 
 
 def _residuals(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
