@@ -162,5 +162,44 @@ def test_frames_are_simulated_where_a_system_determines_anything(tmp_path: Path)
     )
     assert done.returncode == 0, done.stderr
     alone, beside = done.stdout.split("\ncamera: ")
-    assert "simulated" not in alone.split("\n\n")[-1]
-    assert "simulated" in beside
+    assert "simulated nothing: no pose is determined" in alone
+    assert "simulated 2 frames at 1 pose" in beside
+
+
+def test_what_is_said_of_one_sensor_counts_more_than_of_all(tmp_path: Path) -> None:
+    # in whatever order it stands
+    of_system = ("two_cameras:*=0.3", "left=0.1", "*=9")
+    for said in (("left=0.1", "*=0.3"), ("*=0.3", "left=0.1"), of_system):
+        noise = [word for text in said for word in ("--noise", text)]
+        done = command("design", TWO_CAMERAS, *noise, "--count", "2", cwd=tmp_path)
+        assert "features err by left 0.1 px, right 0.3 px" in done.stdout
+
+
+def test_of_several_bodies_it_is_said_which_is_judged() -> None:
+    several = TWO_CAMERAS.parents[1] / "several_bodies" / "session.toml"
+    done = command("design", several, "--count", "2")
+    assert "'tool' alone is judged, the first of tool, reference, rod" in done.stderr
+
+
+def test_the_tip_of_the_session_is_judged_unless_another_is_given(tmp_path: Path) -> None:
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    (tmp_path / "s.toml").write_text(
+        text.replace("[object]\n", "[object]\ntip = [0, 0, -100]\n"), encoding="utf-8"
+    )
+    for more, tip in (((), "(0, 0, -100)"), (("--tip", "1,2,3"), "(1, 2, 3)")):
+        done = command("design", "s.toml", "--count", "2", *more, cwd=tmp_path)
+        assert f"errors of the tip {tip} mm" in done.stdout
+
+
+def test_simulated_frames_are_told_with_their_poses_and_none_where_nothing_is_determined(
+    tmp_path: Path,
+) -> None:
+    done = command("design", TWO_CAMERAS, "--count", "3", "--monte-carlo", "4")
+    assert "simulated 4 frames at 1 pose (4 ok): errors" in done.stdout
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    markers = text[text.index("points = [") : text.index("# Near")]
+    line = text.replace(markers, "points = [[0, 0, 0], [50, 0, 0], [80, 0, 0]]\n\n")
+    (tmp_path / "line.toml").write_text(line, encoding="utf-8")
+    done = command("design", "line.toml", "--count", "1", "--monte-carlo", "4", cwd=tmp_path)
+    assert "open      not determined at 1 pose: 0" in done.stdout
+    assert "simulated nothing: no pose is determined" in done.stdout

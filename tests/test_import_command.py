@@ -34,6 +34,15 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     assert "is there already" in again.stderr
 
 
+def test_a_unit_that_a_format_has_itself_is_not_the_one_that_is_said(tmp_path: Path) -> None:
+    (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    warnings = gather([tmp_path / "chain.yaml"], "m", "mm").warnings
+    assert "--lengths mm: is not used, as translations of chain.yaml are in m" in warnings[0]
+    assert not any(
+        "not used" in one for one in gather([tmp_path / "chain.yaml"], "m", None).warnings
+    )
+
+
 def test_cameras_of_a_chain_go_by_their_numbers_not_by_their_places(tmp_path: Path) -> None:
     first, step = texts.kalibr().split("cam1:")
     links = {f"cam{n}": f"cam{n}:{step}" for n in range(1, 12)}

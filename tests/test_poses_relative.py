@@ -181,3 +181,13 @@ def test_tables_tell_where_the_tip_is(tmp_path: Path) -> None:
             tip = [float(row[f"tip_{axis}"]) for axis in "xyz"]
             np.testing.assert_allclose(tip, line["tip"], rtol=1e-9)
             assert float(row["tip_cov_y_z"]) == pytest.approx(line["tip_covariance"][1][2])
+
+
+def test_a_file_that_says_no_unit_is_taken_for_the_other_and_that_is_told(tmp_path: Path) -> None:
+    poses = written(tmp_path / "poses.jsonl", estimate("tool", 0))
+    bare = tmp_path / "bare.jsonl"
+    bare.write_text("\n".join(poses.read_text().splitlines()[1:]), encoding="utf-8")
+    told = command("evaluate", poses, bare)
+    assert told.returncode == 0
+    assert "bare.jsonl: no header says the unit of its lengths; taken for mm" in told.stderr
+    assert command("evaluate", poses, poses).stderr == ""

@@ -20,10 +20,10 @@ from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.poses import from_spread_orientations
 from mixpose.search.problem import SearchProblem, sensor_detections
-from mixpose.sensors import RangeSensor
+from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Frame, Start
-from mixpose.tracking.proposers import within
+from mixpose.tracking.proposers import predicted, within
 from mixpose.tracking.ranges import AssociationLikelihood, sum_associations
 from mixpose.tracking.rivals import odds_beside
 
@@ -173,3 +173,51 @@ def test_an_ellipsoid_holds_where_a_pose_is_if_one_detection_is_false() -> None:
     assert np.vecdot(some @ information, some).max() > 4 * limit
     C, _ = likelihood._covariance(T, found)
     assert np.vecdot(some @ np.linalg.inv(C), some).max() < limit * (1 + 1e-6)
+
+
+def test_frames_that_are_kept_apart_leave_nothing_to_the_next() -> None:
+    ((body, _, views),) = moving(101, 1)
+    tracker = Tracker.create(body, EstimatorOptions(fuse=False))
+    track, _ = tracker.advance(tracker.begin(), 0, 0.0, views)
+    assert min(one.weight for one in track.branches) >= 1e-3 * (1 - 1e-6)
+    assert track.elsewhere == -np.inf
+
+
+def test_a_pose_is_expected_as_much_as_the_prediction_is_believed() -> None:
+    _, data = second_frame(101)
+    first = data.predictions[0]
+    T = first.T_world_object[None]
+    whole, little = (
+        replace(data, predictions=[replace(first, weight=weight)]).expectation(T)[0]
+        for weight in (1.0, 1e-2)
+    )
+    # of the rest, that it is anywhere, there is next to nothing so near
+    assert whole - little == pytest.approx(np.log(100), abs=0.01)
+
+
+def test_beside_a_camera_poses_that_are_hardly_likely_are_no_starts() -> None:
+    _, data = second_frame(101)
+    K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    camera = PinholeCamera(K, np.zeros(5), (640, 480), np.eye(4))
+    seen = View("camera", camera, Observation(PointPattern(np.zeros((1, 2)), np.ones(1)), 1.0))
+    assert len(predicted(data, [])) == len(data.predictions)
+    beside = data.seen_otherwise(views=[*data.views, seen])
+    assert 0 < len(predicted(beside, [])) < len(data.predictions)
+    assert list(within(beside, [])) == []
+
+
+def test_fewer_ranges_than_directions_tell_nothing_of_a_pose_elsewhere() -> None:
+    ((body, T, views),) = moving(101, 1)
+    some = []
+    for view in views:
+        pattern = view.observation.pattern
+        assert isinstance(pattern, PointPattern)
+        one = Observation(PointPattern(pattern.points[:1], np.ones(1)), SIGMA)
+        some.append(replace(view, observation=one))
+    tracker = Tracker.create(body, EstimatorOptions())
+    data = tracker.data(tracker.begin(), 0, 0.0, some)
+    likelihood = AssociationLikelihood(data)
+    judged = likelihood.judge(likelihood.fit(Start(T)), Start(T))
+    # three are met exactly, which no other pose does better; several tags may have one range
+    assert judged.elsewhere is not None
+    assert judged.elsewhere < 0

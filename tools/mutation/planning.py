@@ -139,6 +139,30 @@ _DESIGN = (
         "seen_at = np.array([0.0, 0.0, -abs(depth)])",
         "the advice is to put a camera with its back to the body",
     ),
+    Mutant(
+        "cli-design-noise-of-all-last",
+        "cli/design.py",
+        'sorted(given, key=lambda text: ("*" not in text, ":" in text))',
+        "given",
+        "what is said of all sensors, and last, takes the place of what is said of one",
+        ("test_design_command.py",),
+    ),
+    Mutant(
+        "cli-design-without-the-tip-of-the-session",
+        "cli/design.py",
+        "tip=sessions[0].body.tip if asked.tip is None",
+        "tip=None if asked.tip is None",
+        "a tool is judged at its origin, although its tip is known",
+        ("test_design_command.py",),
+    ),
+    Mutant(
+        "cli-evaluate-takes-units-in-silence",
+        "cli/app_after.py",
+        "if file.unit is None and found.unit is not None:",
+        "if file.unit is not None and found.unit is None:",
+        "a truth in metres without a header is compared as millimetres, and nothing says so",
+        ("test_poses_relative.py",),
+    ),
 )
 
 MUTANTS = (*_FORMATS, *_IMPORTING, *_DESIGN)

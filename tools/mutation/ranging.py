@@ -119,4 +119,28 @@ MUTANTS = (
         "false ranges move the middle, and with it all places that are tried",
         (_MAXIMA,),
     ),
+    Mutant(
+        "tracking-ranges-unlikely-poses-expected-as-likely-ones",
+        "tracking/frame.py",
+        "logs = np.logaddexp(logs, one.log_belief(surprise) + near)",
+        "logs = np.logaddexp(logs, near)",
+        "where the track is most likely wrong a better pose elsewhere is not looked for",
+        (_MAXIMA,),
+    ),
+    Mutant(
+        "tracking-ranges-unlikely-poses-before-cameras",
+        "tracking/proposers.py",
+        "least = 0.0 if _are_ranges(frame) else",
+        "least = 0.0 if True else",
+        "a camera that sees again is asked for every maximum that ranges had left",
+        (_MAXIMA,),
+    ),
+    Mutant(
+        "tracking-ranges-few-are-too-few",
+        "tracking/ranges.py",
+        "spare = np.maximum(found.reached - count, 0.0)",
+        "spare = found.reached - count",
+        "fewer ranges than directions are searched again in every frame",
+        (_MAXIMA,),
+    ),
 )

@@ -22,10 +22,16 @@ def evaluate(
     """Errors of poses against the truth, modulo the object's symmetries."""
     from json import dumps  # noqa: PLC0415
 
-    from mixpose.poses.evaluate import evaluate_files  # noqa: PLC0415
+    from mixpose.cli.notices import warn  # noqa: PLC0415
+    from mixpose.poses.evaluate import evaluate as compared  # noqa: PLC0415
+    from mixpose.poses.jsonl import read_poses  # noqa: PLC0415
     from mixpose.poses.report import as_dict, as_table  # noqa: PLC0415
 
-    found = evaluate_files(poses, truth)
+    files = [read_poses(path) for path in (poses, truth)]
+    found = compared(*files)
+    for file in files:
+        if file.unit is None and found.unit is not None:
+            warn(f"{file.path}: no header says the unit of its lengths; taken for {found.unit}")
     text = dumps(as_dict(found), indent=2) if json else as_table(found)
     sys.stdout.write(text.rstrip("\n") + "\n")
 

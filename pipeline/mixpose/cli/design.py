@@ -13,7 +13,7 @@ import numpy as np
 from mixpose.checking import with_image_sizes
 from mixpose.cli import output
 from mixpose.cli.app_before import DesignRequest
-from mixpose.cli.notices import say
+from mixpose.cli.notices import say, warn
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
@@ -39,12 +39,16 @@ def design_sessions(asked: DesignRequest) -> None:
                 f"{paths[0]}, to compare them"
             )
     _require_room(asked, paths)
+    for path, session in zip(paths, sessions, strict=True):
+        if len(session.objects) > 1:
+            bodies = ", ".join(one.body.name for one in session.objects)
+            warn(f"{path}: {session.body.name!r} alone is judged, the first of {bodies}")
     # of each its own, or that of its folder
     stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
     names = [s if stems.count(s) == 1 else f"{s} ({k + 1})" for k, s in enumerate(stems)]
     request = Request(
         poses=_poses(sessions[0], asked),
-        tip=None if asked.tip is None else _three("--tip", asked.tip),
+        tip=sessions[0].body.tip if asked.tip is None else _three("--tip", asked.tip),
         noises=_noises(asked.noise or (), sessions, names),
         runs=asked.monte_carlo,
         seed=asked.seed,
@@ -130,7 +134,8 @@ def _noises(
 ) -> dict[tuple[int | None, str], float]:
     """``SENSOR=NUMBER`` for all systems, ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
     noises: dict[tuple[int | None, str], float] = {}
-    for text in given:
+    # what is said of fewer systems and sensors counts more, wherever it stands
+    for text in sorted(given, key=lambda text: ("*" not in text, ":" in text)):
         place, _, number = text.rpartition("=")
         system, _, sensor = place.rpartition(":")
         value = as_number(number)

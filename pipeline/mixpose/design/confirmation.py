@@ -34,6 +34,7 @@ class Confirmation:
     """Errors of simulated frames beside those that were predicted."""
 
     frames: int  # estimated, lost ones included
+    poses: int  # at which they were simulated
     statuses: dict[str, int]
     # (6,): root mean square error over the predicted one, per direction; NaN where held or open
     ratios: Floats
@@ -225,6 +226,7 @@ def _compared(
     parts = errors[:, :3], errors[:, 3:], errors[:, :3] + np.cross(errors[:, 3:], arms)
     return Confirmation(
         frames=sum(statuses.values()),
+        poses=len(prediction.poses),
         statuses=dict(statuses),
         ratios=ratios,
         overall=float(np.sqrt(squares.mean() / len(free))) if len(errors) else math.nan,

@@ -53,11 +53,14 @@ def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:
     if summary.undetermined:
         listed = ", ".join(map(str, summary.undetermined[:_NOTED]))
         more = ", ..." if len(summary.undetermined) > _NOTED else ""
-        yield "open", f"not determined at {len(summary.undetermined)} poses: {listed}{more}"
+        count = len(summary.undetermined)
+        yield "open", f"not determined at {count} pose{'s' * (count != 1)}: {listed}{more}"
     yield from _told_of_sensors(system)
     yield "alike", _alike_text(summary)
     if system.confirmation is not None:
         yield "simulated", _confirmation_text(system.confirmation, plan)
+    elif study.request.runs:
+        yield "simulated", "nothing: no pose is determined"
     if system.move is not None:
         name, gain = plan.body.labels[system.move.marker], _gain(system.move.error, system.error)
         yield "marker", f"moving {name} by {_vector(system.move.shift)} {unit} gains {gain}"
@@ -142,9 +145,10 @@ def _alike_text(summary: Summary) -> str:
 def _confirmation_text(found: Confirmation, plan: Plan) -> str:
     statuses = ", ".join(f"{n} {status}" for status, n in sorted(found.statuses.items()))
     ratios = ", ".join(f"{TWIST_NAMES[k]} {found.ratios[k]:.3f}" for k in np.flatnonzero(plan.free))
+    poses = f"{found.poses} pose{'s' * (found.poses != 1)}"
     return (
-        f"{found.frames} frames ({statuses}): errors are {found.overall:.3f} times the predicted "
-        f"(by chance 1 ± {found.chance:.3f}); {ratios}"
+        f"{found.frames} frames at {poses} ({statuses}): errors are {found.overall:.3f} times the "
+        f"predicted (by chance 1 ± {found.chance:.3f}); {ratios}"
     )
 
 

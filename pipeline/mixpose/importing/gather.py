@@ -91,7 +91,8 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
     (fixed,) = {camera.unit for camera in rig.cameras}
     notes = "; ".join(dict.fromkeys(camera.note for camera in rig.cameras if camera.note))
     if fixed is not None:
-        return fixed, f"translations of {name} are in {fixed}, by its format", ""
+        told = f"translations of {name} are in {fixed}, by its format"
+        return fixed, told, f"--lengths {lengths}: is not used, as {told}" if lengths else ""
     if lengths is not None:
         return lengths, f"translations of {name} are in {lengths}, as --lengths said", ""
     guess = f"translations of {name} are taken to be in {unit}, which the file does not say"

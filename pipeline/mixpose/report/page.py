@@ -217,8 +217,9 @@ def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
             value = "open" if np.isinf(middle) else f"± {_short(middle)}{unit}"
             note = f"; open in {count} frames" if count else ""
             found.append(Figure(name, value, f"median of the least certain axis{note}"))
-    if np.isfinite(series.score).any():
-        found.append(Figure("score", _median(series.score), "median; 1 is best"))
+    posed = series.score[[status != "lost" for status in series.status]]
+    if np.isfinite(posed).any():
+        found.append(Figure("score", _median(posed), "median of frames with a pose; 1 is best"))
     if np.isfinite(series.latency_ms).any():
         slow = float(np.nanpercentile(series.latency_ms, 95))
         value = f"{_median(series.latency_ms)} ms"
