@@ -130,8 +130,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-poses-before-cameras",
         "tracking/proposers.py",
-        "least = 0.0 if _are_ranges(frame) else",
-        "least = 0.0 if True else",
+        "if len(likely) > 1 and not _are_ranges(frame):",
+        "if False:",
         "a camera that sees again is asked for every maximum that ranges had left",
         (_MAXIMA,),
     ),

@@ -175,13 +175,13 @@ def decide(
     kept.sort(key=lambda each: each[0] is not best)
     # a pose that is less likely needs more than three frames that err as seldom as one that is ok
     least = max((1 - rules.confidence) ** 3, 1e-12)
-    faint = tuple(
+    faint = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
         if one.spread is not None and least <= weight < 1 - rules.confidence
         if one is not best and is_fixed(one, free)
-    )
-    return Verdict(best, kept, faint, tuple(against), rules.log_doubt)
+    ]
+    return Verdict(best, kept, tuple(faint), tuple(against), rules.log_doubt)
 
 
 def _odds_against(

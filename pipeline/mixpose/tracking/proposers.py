@@ -42,8 +42,10 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
 
     Or where it was found with all bodies at once.
     """
-    least = 0.0 if _are_ranges(frame) else 1 - frame.rules.acceptance.confidence
-    likely = [one for one in frame.predictions if one.weight >= least]
+    likely = frame.predictions
+    if len(likely) > 1 and not _are_ranges(frame):  # of which unlikely ones are followed too
+        least = 1 - frame.rules.acceptance.confidence
+        likely = [one for one in likely if one.weight >= least]
     return frame.starts or [
         Start(one.T_world_object, one.uncertainty, one) for one in (*likely, frame.beside) if one
     ]
@@ -96,11 +98,13 @@ def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
     Where it is narrower than the noise there is only one.
     """
-    for first in frame.predictions[:1] if _are_ranges(frame) else ():
-        uncertainty = np.where(frame.free, first.uncertainty, 0.0)
-        if first.spread is not None and _is_wide(frame, first.T_world_object, uncertainty):
-            modes = frame.rules.ranges.modes
-            yield from _around(frame, first.T_world_object, uncertainty, modes)
+    first = frame.predictions[0] if frame.predictions else None
+    if first is None or first.spread is None or not _are_ranges(frame):
+        return []
+    uncertainty = np.where(frame.free, first.uncertainty, 0.0)
+    if not _is_wide(frame, first.T_world_object, uncertainty):
+        return []
+    return _around(frame, first.T_world_object, uncertainty, frame.rules.ranges.modes)
 
 
 def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
