@@ -44,11 +44,8 @@ def convert_poses(request: ConvertRequest) -> None:
     poses = read_poses(path)
     T_sensor_world = np.eye(4)
     if request.relative_to in {line.label for line in poses.poses}:
-        if request.relative_to == request.object:
-            raise SessionError(f"--object {request.object}: is what poses are told relative to")
-        if request.session is not None:
-            raise SessionError("--session: found beside a body at --relative-to, which needs none")
-        poses = _beside(poses, request.relative_to, name)
+        _refuse_of_other_references(name, request)
+        poses = _beside(poses, request.relative_to)
     elif request.relative_to is not None:
         T_sensor_world = _T_sensor_world(poses, request.relative_to, request)
     lines = _selected(poses, name, request)
@@ -92,13 +89,21 @@ def _write(
             output.write(relative_to(T_sensor_world, line))
 
 
-def _beside(poses: PoseFile, reference: str, name: str) -> PoseFile:
-    """Poses of the other bodies of a file in the axes of one of them."""
+def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
+    """Refuse what goes with poses relative to a camera, and not to a body."""
     if name == "bop":
         raise SessionError(
-            f"--relative-to {reference}: is a body, and --format bop holds poses relative to a "
-            "camera; choose csv, ros or tum"
+            f"--relative-to {request.relative_to}: is a body, and --format bop holds poses "
+            "relative to a camera; choose csv, ros or tum"
         )
+    if request.relative_to == request.object:
+        raise SessionError(f"--object {request.object}: is what poses are told relative to")
+    if request.session is not None:
+        raise SessionError("--session: found beside a body at --relative-to, which needs none")
+
+
+def _beside(poses: PoseFile, reference: str) -> PoseFile:
+    """Poses of the other bodies of a file in the axes of one of them."""
     own = [line for line in poses.poses if line.label == reference]
     known = {line.frame: line for line in first_answers(own)}
     if len(known) < len(own):

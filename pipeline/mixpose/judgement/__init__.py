@@ -1,6 +1,7 @@
 """Judgement: which features a pose meets, what that is worth, and whether it is believed."""
 
 from mixpose.judgement.acceptance import (
+    LEAST_BELIEF as LEAST_BELIEF,
     AcceptanceRules as AcceptanceRules,
     Alternative as Alternative,
     Second as Second,

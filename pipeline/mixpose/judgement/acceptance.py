@@ -21,6 +21,9 @@ from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import twist_between
 
+LEAST_BELIEF = 1e-12
+"""In a pose: what is less likely is as good as what nobody thought of."""
+
 
 @dataclass(frozen=True)
 class AcceptanceRules:
@@ -174,7 +177,7 @@ def decide(
     ]
     kept.sort(key=lambda each: each[0] is not best)
     # a pose that is less likely needs more than three frames that err as seldom as one that is ok
-    least = max((1 - rules.confidence) ** 3, 1e-12)
+    least = max((1 - rules.confidence) ** 3, LEAST_BELIEF)
     faint = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)

@@ -32,6 +32,7 @@ from mixpose.search import (
 )
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.ranges import are_associated
+from mixpose.tracking.track import worth_telling
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -43,9 +44,8 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
     Or where it was found with all bodies at once.
     """
     likely = frame.predictions
-    if len(likely) > 1 and not _are_ranges(frame):  # of which unlikely ones are followed too
-        least = 1 - frame.rules.acceptance.confidence
-        likely = [one for one in likely if one.weight >= least]
+    if len(likely) > 1 and not _are_ranges(frame):
+        likely = worth_telling(likely, frame.rules.acceptance.confidence)
     return frame.starts or [
         Start(one.T_world_object, one.uncertainty, one) for one in (*likely, frame.beside) if one
     ]

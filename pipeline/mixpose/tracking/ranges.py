@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -159,7 +160,7 @@ class AssociationTerm:
     second: bool  # whether second derivatives are given, which are differences of gradients
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Models at poses (H, 4, 4), with the curvature of known labels, and second derivatives."""
+        """Models at poses (H, 4, 4), with the curvature of known labels."""
         if not self.second:
             found = self._sum(poses)
             return Quadratic(found.log_odds, found.gradient, found.information)
@@ -201,8 +202,7 @@ class ExpectedTerm:
                 continue
             there = nearest_alike(poses, frame.body, one.T_world_object)
             prior = NormalPrior(one.T_world_object, one.uncertainty, frame.free).linearise(there)
-            deviations = one.uncertainty[frame.free]
-            peak = one.log_belief(surprise) - float(np.log(np.sqrt(2 * np.pi) * deviations).sum())
+            peak = one.log_belief(surprise) + one.log_peak(frame.free)
             known.append(prior._replace(value=prior.value + peak))
         chosen, rows = np.argmax([one.value for one in known], axis=0), np.arange(len(poses))
         return Quadratic._make(np.stack(parts)[chosen, rows] for parts in zip(*known, strict=True))
@@ -251,13 +251,13 @@ class AssociationLikelihood:
         levels = [widest**share for share in narrowing(widest, frame.rules.fit)]
         widths = [one for one in levels if one > self._noise]
         few, many = (NewtonOptions(n, tolerance=1e-7) for n in (_STEPS, 30))
-        for width in widths:
-            some = begins >= width * (1 - 1e-9)
+        through = begins[:, None] >= np.array(widths) * (1 - 1e-9)  # (H, W)
+        for width, some in zip(widths, through.T, strict=True):
             term = self._posterior(width, second=False)
             poses[some] = ascend(term, poses[some], perturb, frame.free, few).states
         term = self._posterior(self._noise, second=False)
         end = ascend(term, poses, perturb, frame.free, many)
-        own = [[*(w for w in widths if begin >= w * (1 - 1e-9)), self._noise] for begin in begins]
+        own = [[*compress(widths, some), self._noise] for some in through.tolist()]
         return frame.oriented(end.states), end.values, own
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:

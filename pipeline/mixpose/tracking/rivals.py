@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mixpose.judgement import ScoredPose, ahead, odds_of
+from mixpose.judgement import LEAST_BELIEF, ScoredPose, ahead, odds_of
 from mixpose.matching import Matches
 from mixpose.records import Floats
 from mixpose.tracking.frame import Frame
@@ -43,7 +43,7 @@ def _before(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     if len(data.predictions) < 2:
         return 0.0
     a, b = (_expected(data, one.T_world_object) for one in (rival, best))
-    return math.log(max(a.weight, 1e-12) / max(b.weight, 1e-12)) if a and b else 0.0
+    return math.log(max(a.weight, LEAST_BELIEF) / max(b.weight, LEAST_BELIEF)) if a and b else 0.0
 
 
 def _expected(data: Frame, T_world_object: Floats) -> Branch | None:

@@ -60,10 +60,10 @@ class RangeRules:
     stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
     min_information: float = constant(0.02, "of that of known labels, which any direction has")
     modes: int = constant(
-        32, "starts around a prediction: 16 miss a maximum that matters in one frame of 100"
+        32, "starts around a prediction: 16 left a right maximum unseen in 2 frames of 440"
     )
     behind: float = constant(25.0, "nats that ends of climbs are behind the best, and make no odds")
-    overlooked: float = constant(0.1, "share of searches that miss a right maximum: 9 of 90")
+    overlooked: float = constant(0.1, "share of searches that miss a right maximum: 9 of 89")
 
 
 @dataclass(frozen=True)

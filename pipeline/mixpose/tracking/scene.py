@@ -37,7 +37,7 @@ from mixpose.tracking.mirrors import is_flat
 from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
-from mixpose.tracking.track import Branch, Companion, Track
+from mixpose.tracking.track import Branch, Companion, Track, worth_telling
 from mixpose.tracking.tracker import Tracker, followed
 
 Box: TypeAlias = tuple[int, int, int, int]
@@ -233,9 +233,8 @@ class WindowedScene:
         """In which part of each image the bodies are expected, one window around all of them."""
         windows: dict[str, Box] = {}
         for k, tracked in enumerate(self.scene.bodies):
-            least = 1 - tracked.rules.acceptance.confidence
             predictions = tracked.predictions(tracks[k], frame, time_s)
-            likely = [one for one in predictions if one.weight >= least]
+            likely = worth_telling(predictions, tracked.rules.acceptance.confidence)
             for name, box in self._expectations[k].windows(likely).items():
                 a, b, c, d = windows.get(name, box)
                 windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])

@@ -12,7 +12,14 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import ClutterRates, Prior, RememberedNoise, Shape, nearest_alike
+from mixpose.judgement import (
+    LEAST_BELIEF,
+    ClutterRates,
+    Prior,
+    RememberedNoise,
+    Shape,
+    nearest_alike,
+)
 from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
@@ -20,9 +27,6 @@ from mixpose.search import SearchState
 from mixpose.tracking.motion import Course, Distances, MotionRules, RandomWalk, per_kind
 from mixpose.tracking.sizes import Sizes
 from mixpose.tracking.static_clutter import StaticClutter
-
-LEAST_BELIEF = 1e-12
-"""In a branch: what is less likely is as good as what nobody thought of."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,10 @@ class Branch:
         """Logarithm of the belief that the body is here, where it is elsewhere by a `surprise`."""
         return math.log(max((1 - surprise) * self.weight, LEAST_BELIEF))
 
+    def log_peak(self, free: Mask) -> float:
+        """Logarithm of the largest normal density, where the pose before is a prior."""
+        return -float(np.log(math.sqrt(2 * math.pi) * self.uncertainty[free]).sum())
+
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> Floats:
         """Of poses (..., 4, 4) before the frame that this predicts, in directions that are free."""
         away = twist_between(self.T_world_object, T_world_object)
@@ -52,13 +60,18 @@ class Branch:
         squares = (off.reshape(*off.shape[:-1], 2, 3) ** 2).sum(axis=-1)  # of shifts, and of turns
         count, volume = int(free.sum()), float(np.log(self.uncertainty[free]).sum())
         if self.spread is not None:
-            exponents = -0.5 * squares.sum(axis=-1)
-            return np.asarray(exponents - 0.5 * count * math.log(2 * math.pi) - volume)
+            return np.asarray(self.log_peak(free) - 0.5 * squares.sum(axis=-1))
         # from a step or two, which are as wide in all directions of a kind: errors are Student's
         n, p = rules.known_from, free.reshape(2, 3).sum(axis=1)
         peak = float((gammaln((n + p) / 2) - gammaln(n / 2)).sum())
         tails = 0.5 * np.log1p(squares / n) @ (n + p)
         return np.asarray(peak - 0.5 * count * math.log(n * math.pi) - tails - volume)
+
+
+def worth_telling(branches: Sequence[Branch], confidence: float) -> list[Branch]:
+    """Branches without the unlikely ones that single ranges leave for further frames of ranges."""
+    least = 1 - confidence
+    return [one for one in branches if one.spread is None or one.weight >= least]
 
 
 @dataclass(frozen=True)
