@@ -97,12 +97,32 @@ def test_a_run_resumes_with_the_same_recording_only(
     assert poses.read_bytes() == whole
 
 
+def test_a_run_resumes_with_the_same_step_and_labels_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = tmp_path / "poses.jsonl"
+    to_file = ["run", SESSION, "-o", str(poses), "--stop"]
+    said(capsys, 0, *to_file, "3", "--step", "2", "--labels")
+    header = json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+    assert header["options"] == {"step": 2, "labels": True}
+    before = poses.read_bytes()
+    for others in ([], ["--labels", "--step", "3"], ["--step", "2"]):
+        line = said(capsys, 2, *to_file, "6", "--resume", *others)
+        now = " ".join(others) or "no --source, --step or --labels"
+        assert f"was written with --labels --step 2, this run has {now}; give the same" in line
+        assert poses.read_bytes() == before
+    said(capsys, 0, *to_file, "6", "--resume", "--labels", "--step", "2")
+    frames = [json.loads(line)["frame"] for line in poses.read_text("utf-8").splitlines()[1:]]
+    assert frames == [0, 2, 4]
+
+
 def test_a_run_of_the_sessions_own_recording_names_no_sources(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses = tmp_path / "poses.jsonl"
     said(capsys, 0, "run", SESSION, "-o", str(poses), "--stop", "1")
-    assert "sources" not in json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+    header = json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+    assert not {"sources", "options"} & set(header)
 
 
 def test_the_shell_completes_commands_and_options() -> None:

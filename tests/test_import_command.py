@@ -43,6 +43,21 @@ def test_a_unit_that_a_format_has_itself_is_not_the_one_that_is_said(tmp_path: P
     )
 
 
+def test_lengths_of_a_table_are_those_of_the_session_and_that_is_said(tmp_path: Path) -> None:
+    (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    (tmp_path / "marks.csv").write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
+    files = [tmp_path / "marks.csv", tmp_path / "chain.yaml"]
+    taken = "lengths of marks.csv are taken to be in mm, the session's unit"
+    plain, other = gather(files, "mm", None), gather(files, "mm", "m")
+    assert taken in plain.remarks
+    assert not any("marks.csv" in one for one in plain.warnings)
+    (told,) = [one for one in other.warnings if "marks.csv" in one]
+    assert told == (
+        f"--lengths m: is of calibrations; {taken}: write tables in mm, or add --unit m"
+    )
+    assert f"# {taken}" in session_text(plain, tmp_path / "session.toml")
+
+
 def test_cameras_of_a_chain_go_by_their_numbers_not_by_their_places(tmp_path: Path) -> None:
     first, step = texts.kalibr().split("cam1:")
     links = {f"cam{n}": f"cam{n}:{step}" for n in range(1, 12)}

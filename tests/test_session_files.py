@@ -58,6 +58,10 @@ def test_no_file_and_a_folder(tmp_path: Path) -> None:
         ("name,x,y,z\na,0,0,0\nb,1,zero,0\n", ["line 3, column y", 'found "zero"']),
         ("name,x,y,z\na,0,0,0\nb,1,0,nan\n", ["line 3, column z", 'found "nan"']),
         ("name,x,y,z\na,0,0,0\nb,1,0,0\n", ["found 2 features"]),
+        (
+            "name,x,y,z\nA 1,0,0,0\nB,1,0,0\nA  1,0,1,0\n",
+            ["line 4", "found the name 'A 1' again, of line 2"],
+        ),
         ("name,x,y,z,s\na,0,0,0,1\nb,1,0,0,-1\nc,0,1,0,1\n", ["sigma[1]", "found -1"]),
     ],
 )

@@ -46,6 +46,12 @@ class RunRequest:
     pause: bool = False
 
     @property
+    def options(self) -> dict[str, int | bool]:
+        """What is not the default of the options that all lines of a file have to share."""
+        step, labels = self.selection.step, self.labels
+        return {**({"step": step} if step != 1 else {}), **({"labels": True} if labels else {})}
+
+    @property
     def ahead_s(self) -> float:
         """How far poses that are published are foretold.
 

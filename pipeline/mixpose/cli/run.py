@@ -40,7 +40,7 @@ def run_session(path: Path, request: RunRequest) -> None:
 def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     session = load_session(path, allow_code=request.allow_code)
     replaced = named_sources(request.sources)
-    header = header_of(session, replaced)
+    header = header_of(session, replaced, request.options)
     opened = open_sources(session, replaced)
     outputs = written_paths(request.output, request.format, header.labels)
     for each in outputs:
@@ -197,8 +197,14 @@ def _inputs(session: Session) -> Iterator[Path]:
             yield setup.times
 
 
-def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Header:
-    """The first line of the poses of a session, with the recordings given in place of its own."""
+def header_of(
+    session: Session,
+    sources: Mapping[str, str] | None = None,
+    options: Mapping[str, int | bool] | None = None,
+) -> Header:
+    """The first line of the poses of a session, with the recordings given in place of its own, and
+    what else was asked for that the lines hang on.
+    """
     return Header(
         unit=session.unit,
         session=str(session.path),
@@ -207,6 +213,7 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
         seed=session.estimator.seed,
         symmetries={one.body.name: one.body.symmetries for one in session.objects},
         sources=sources or {},
+        options=options or {},
         sensors=tuple(setup.name for setup in session.sensors),
         objects={one.body.name: one.count for one in session.objects},
         tips=any(one.body.tip is not None for one in session.objects),

@@ -6,7 +6,7 @@ import sys
 from dataclasses import fields
 
 from mixpose.cli.app_simulate import SimulateRequest
-from mixpose.cli.notices import bar
+from mixpose.cli.notices import bar, warn
 from mixpose.cli.output import refuse_stdout
 from mixpose.errors import SessionError
 from mixpose.session import load_session
@@ -41,13 +41,17 @@ def simulate_session(request: SimulateRequest) -> None:
     refuse_stdout(folder, "-o", "a recording", "a folder, as -o recording")
     session = load_session(request.session)
     with bar("simulating", options.frames) as moved:
-        simulate(
+        unused = simulate(
             session,
             folder,
             options,
             overwrite=overwrite,
             progress=lambda done: moved(completed=done),
         )
+    if unused:
+        kinds = {one.name: one.metadata for one in fields(SimulateRequest)}
+        told = [next(iter(kinds[name]["names"]), f"--{name.replace('_', '-')}") for name in unused]
+        warn(f"{', '.join(told)}: no sensor or body of this session has what that is about")
     count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr

@@ -61,7 +61,7 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             f"{placed[0].files[0]}; import them one by one"
         )
     cameras: list[CalibratedCamera] = []
-    remarks, warnings = [], []
+    remarks, warnings = _of_tables(bodies, unit, lengths)
     for rig in rigs:
         stated, remark, warning = _stated_unit(rig, unit, lengths)
         remarks.append(remark)
@@ -80,6 +80,22 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
         remarks=tuple(filter(None, remarks)),
         warnings=(*filter(None, warnings), *_odd(cameras)),
     )
+
+
+def _of_tables(
+    bodies: Sequence[Path], unit: Unit, lengths: Unit | None
+) -> tuple[list[str], list[str]]:
+    """Remarks and warnings about the lengths of tables, which a session reads as they are."""
+    tables = [path.name for path in bodies if path.suffix.lower() not in READERS]
+    if not tables:
+        return [], []
+    remark = f"lengths of {', '.join(tables)} are taken to be in {unit}, the session's unit"
+    if lengths in (None, unit):
+        return [remark], []
+    return [remark], [
+        f"--lengths {lengths}: is of calibrations; {remark}: write tables in {unit}, or add --unit "
+        f"{lengths}"
+    ]
 
 
 def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str, str]:

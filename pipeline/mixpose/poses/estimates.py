@@ -30,6 +30,7 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         seed=found.get("seed", 0),
         symmetries=poses.symmetries,
         sources=poses.sources,
+        options=found.get("options", {}),
         sensors=tuple(names),
         objects=objects_of(poses.poses),
         smoothed=found.get("smoothed", {}),

@@ -12,6 +12,9 @@ Which right answer a pose is held against
     Answers whose rotations are alike (within `TIE_DEG`: marks in a row, taken for their
     neighbours) differ in position; the nearest of these counts.
 
+A pose that was foretold is held against the truth of the moment that it is for (see
+`mixpose.poses.foretold`).
+
 Rotation and position errors of a frame belong to the same right answer.  The error is the twist
 that leads from the right answer to the pose, in the order and axes of `mixpose.rigid`; the
 position error is that of the object's origin.
@@ -37,6 +40,7 @@ from mixpose.poses.consistency import (
     normalised_error_squared,
 )
 from mixpose.poses.estimates import in_unit
+from mixpose.poses.foretold import truth_of_then
 from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -145,6 +149,7 @@ def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | Non
     if all(line.instance is None for line in truth.poses):
         return poses, None
     unit = poses.unit or truth.unit
+    truth = truth_of_then(truth, poses)
     symmetries = {**poses.symmetries, **truth.symmetries}
     lines, swaps = renumbered(poses.poses, in_unit(truth, unit).poses, symmetries)
     return replace(poses, poses=lines), swaps
@@ -185,7 +190,7 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
     `evaluate`.
     """
     unit = poses.unit or truth.unit
-    truth = in_unit(truth, unit)
+    truth = in_unit(truth_of_then(truth, poses), unit)
     symmetries = {**poses.symmetries, **truth.symmetries}
     answers: dict[FrameKey, list[Floats]] = {}
     for line in truth.poses:

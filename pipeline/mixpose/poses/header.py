@@ -27,6 +27,9 @@ class Header:
     # recordings given in place of the session's, by sensor name; the line has them only where there
     # are any
     sources: Mapping[str, str] = field(default_factory=dict)
+    # what else the run was asked for that its lines hang on, as `step` and `labels`; the line has
+    # it only where that is not the default
+    options: Mapping[str, int | bool] = field(default_factory=dict)
     # Names of all sensors of the session, in its order, and whether any body has a tip.  Only the
     # CSV table needs them, for its columns; they are not written into JSON lines.
     sensors: tuple[str, ...] = ()

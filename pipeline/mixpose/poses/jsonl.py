@@ -47,6 +47,7 @@ def header_line(header: Header) -> dict[str, Any]:
     sometimes = {
         "objects": header.objects if len(header.labels) > 1 else {},
         "sources": header.sources,
+        "options": header.options,
         "smoothed": header.smoothed,
     }
     return {
@@ -207,8 +208,8 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
 
     What follows it is a half-written line, to be cut off. None where no frame is whole or no file
     is there: the caller writes the file afresh. Raises SessionError if the file is of another
-    session, seed, unit, recording or version of mixpose, and RecordingError if it is not a poses
-    file.
+    session, seed, unit, recording, step or version of mixpose, or if one of the two has labels, and
+    RecordingError if it is not a poses file.
     """
     path = Path(path)
     if not path.exists():
@@ -261,7 +262,7 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
                 f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
                 f"{line[key]!r}; leave out --resume to start afresh, or name another file with -o"
             )
-    before, now = (_sources_text(each.get("sources")) for each in (found, line))
+    before, now = (_options_text(each) for each in (found, line))
     if before != now:
         raise SessionError(
             f"--resume: {path} was written with {before}, this run has {now}; give the same, or "
@@ -269,10 +270,14 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
         )
 
 
-def _sources_text(sources: object) -> str:
-    if not isinstance(sources, dict) or not sources:
-        return "no --source"
-    return " ".join(f"--source {name}={sources[name]}" for name in sorted(sources))
+def _options_text(header: Mapping[str, Any]) -> str:
+    """What a run was asked for, as it is typed."""
+    sources, options = (header.get(key) for key in ("sources", "options"))
+    each = sorted(sources.items()) if isinstance(sources, dict) else []
+    words = [f"--source {name}={path}" for name, path in each]
+    each = sorted(options.items()) if isinstance(options, dict) else []
+    words += [f"--{name}" if value is True else f"--{name} {value}" for name, value in each]
+    return " ".join(words) or "no --source, --step or --labels"
 
 
 def _read_bytes(path: Path) -> bytes:

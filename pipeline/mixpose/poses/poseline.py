@@ -25,6 +25,7 @@ class PoseLine(Estimate):
     """A pose line as read; one without a score, as of a truth file, counts as certain."""
 
     line: int = 0  # where it stands in the file, from 1
+    ahead_s: float = 0.0  # how much later than its frame the pose is, of one that was foretold
 
 
 _Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -78,6 +79,7 @@ class _Pose(_Line):
     points: dict[str, _Point] = {}
     tip: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     filled: bool = False
+    ahead_s: Annotated[float, Field(ge=0)] = 0.0
 
 
 class _Header(_Line):
@@ -87,6 +89,8 @@ class _Header(_Line):
     symmetries: dict[str, list[_Matrix4]] = {}
     objects: dict[str, Annotated[int, Field(ge=1, le=10**6)]] = {}
     sources: dict[str, str] = {}
+    options: dict[str, bool | int] = {}
+    smoothed: dict[str, dict[str, Any]] = {}
 
 
 _Checked = TypeVar("_Checked", bound=_Line)

@@ -233,9 +233,9 @@ def read_markers(path: Path) -> Markers:
         _check_header(header)
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
         values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
-    if not len(values):
-        raise BadKeyError(f"{path.name}: found no markers below the header")
-    names = tuple(row[0].strip() for _, row in rows[1:])
+        if not len(values):
+            raise BadKeyError("found no markers below the header")
+        names = _names_of([(line, row[0]) for line, row in rows[1:]])
     spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
     sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
     return Markers(values[:, :3], sigma, names)
@@ -253,6 +253,19 @@ def _check_header(header: list[str]) -> None:
 def _learnt(header: list[str]) -> int:
     """How many columns at the end are those of a body that was learnt."""
     return len(LEARNT_COLUMNS) if tuple(header[-len(LEARNT_COLUMNS) :]) == LEARNT_COLUMNS else 0
+
+
+def _names_of(cells: list[tuple[int, str]]) -> tuple[str, ...]:
+    """Names of markers, of cells with their lines; no two the same."""
+    lines: dict[str, int] = {}
+    for line, cell in cells:
+        name = " ".join(cell.split())
+        if name and lines.setdefault(name, line) != line:
+            raise BadKeyError(
+                f"line {line}: found the name {name!r} again, of line {lines[name]}; allowed: a "
+                "name of its own for each marker, or none"
+            )
+    return tuple(cell.strip() for _, cell in cells)
 
 
 def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:

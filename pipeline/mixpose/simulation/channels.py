@@ -16,7 +16,7 @@ from mixpose.session import SensorSetup, Session
 from mixpose.simulation import render
 from mixpose.simulation.motion import Motion, Shutter
 from mixpose.simulation.naming import SourceFiles
-from mixpose.simulation.options import Purpose, SimulationOptions, generator
+from mixpose.simulation.options import Output, Purpose, SimulationOptions, generator
 from mixpose.simulation.render import DetectionWriter, ProfileWriter, SensorWriter
 from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.visible_spots import View, brightness_levels
@@ -35,6 +35,7 @@ _COORDINATES = {1: ("range",), 2: ("u", "v"), 3: ("x", "y", "z")}  # of tables
 class Channel:
     """One sensor of a recording."""
 
+    gives: Output
     files: SourceFiles
     view: View
     options: SimulationOptions  # as they hold for this sensor
@@ -103,7 +104,8 @@ class Planner:
             return render.VideoWriter(files, folder, options, form, self.fps)
 
         bounds = setup.sensor.lower, setup.sensor.upper
-        return Channel(files, self._view(setup, bounds, spot_sigma, index), options, start)
+        view = self._view(setup, bounds, spot_sigma, index)
+        return Channel("images", files, view, options, start)
 
     def _profiles(self, setup: SensorSetup, files: SourceFiles, index: int) -> Channel:
         options, range_min, bin_size = self.options, setup.range_min, setup.bin_size
@@ -119,7 +121,9 @@ class Planner:
             )
         form = render.ProfileFormat(bins, range_min, bin_size, width)
         view = self._view(setup, (np.maximum(nearest, range_min), farthest), width, index)
-        return Channel(files, view, options, lambda at: ProfileWriter(files, at, options, form))
+        return Channel(
+            "profiles", files, view, options, lambda at: ProfileWriter(files, at, options, form)
+        )
 
     def _table(self, setup: SensorSetup, files: SourceFiles) -> Channel:
         sensor, sigma, options = setup.sensor, setup.extract.sigma, self.options
@@ -134,6 +138,7 @@ class Planner:
         view = View(sensor, *bounds, np.ones(len(self.body)), spacing)
         coordinates = _COORDINATES[sensor.dimension]
         return Channel(
+            "pixels" if sensor.dimension == 2 else "lengths",
             files,
             view,
             replace(options, brightness_spread=0.0),

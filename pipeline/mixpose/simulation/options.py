@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -15,11 +15,14 @@ from mixpose.limits import MOST_DETECTIONS
 
 DEFAULT_FPS = 25.0
 
+Output: TypeAlias = Literal["images", "profiles", "pixels", "lengths"]
+"""What a sensor gives: images, range profiles, or a table of detections in px or in lengths."""
+
 Rule: TypeAlias = tuple[float, float, bool, str]
 
 # squares of larger numbers, and quotients of smaller ones, cannot be reckoned with
 _LARGEST, _SMALLEST = 1e12, 1e-12
-_MOST_COMPANIONS = 1000
+_MOST_COMPANIONS = 100
 
 # least and most of a number, whether it is a whole one, and that in words
 _NOT_NEGATIVE: Rule = 0, _LARGEST, False, f"a number of at least 0, at most {_LARGEST:g}"
@@ -31,13 +34,19 @@ _FEW: Rule = 0, _MOST_COMPANIONS, True, f"a whole number from 0 to {_MOST_COMPAN
 _FALSE: Rule = 0, MOST_DETECTIONS, False, f"a number from 0 to {MOST_DETECTIONS}"
 _FRAMES: Rule = 1, math.inf, True, "a whole number from 1"
 _SIGMA: Rule = 0.1, 1e4, False, "a number of at least 0.1 px, at most 1e4 px"
+_SECOND: Rule = 0, 1, False, "seconds from 0 to 1"
 _QUALITY: Rule = 1, 100, False, "a quality from 1 to 100"
 _ANY: Rule = -_LARGEST, _LARGEST, False, f"a number from {-_LARGEST:g} to {_LARGEST:g}"
 
 
-def _option(default: Any, rule: Rule) -> Any:
-    """A field of numbers that follow a rule."""
-    return field(default=default, metadata={"rule": rule})
+_IMAGES: tuple[Output, ...] = ("images",)
+_CAMERAS: tuple[Output, ...] = ("images", "pixels")
+_ALL: tuple[Output, ...] = get_args(Output)
+
+
+def _option(default: Any, rule: Rule | None, of: tuple[Output, ...] = _ALL) -> Any:
+    """A field of numbers that follow a rule, and what sensors give that it has a say in."""
+    return field(default=default, metadata={"rule": rule, "of": of})
 
 
 @dataclass(frozen=True)
@@ -49,16 +58,18 @@ class SimulationOptions:
     seed: int = _option(0, _COUNT)
     fps: float | None = _option(None, _POSITIVE)  # None takes that of the session, or else 25
     # grey level without features; below 0 the camera clips most of its noise at black
-    background: float = _option(10.0, _ANY)
-    noise: float = _option(2.0, _NOT_NEGATIVE)  # standard deviation of every pixel, grey levels
-    shot_noise: float = _option(0.02, _NOT_NEGATIVE)  # variance per grey level of signal
+    background: float = _option(10.0, _ANY, _IMAGES)
+    noise: float = _option(
+        2.0, _NOT_NEGATIVE, _IMAGES
+    )  # standard deviation of every pixel, grey levels
+    shot_noise: float = _option(0.02, _NOT_NEGATIVE, _IMAGES)  # variance per grey level of signal
     # standard deviation of a feature's spot, px; None is `spot_sigma` of the sensor's [extract]
     # where that is given, else 1.6
-    spot_sigma: float | None = _option(None, _SIGMA)
+    spot_sigma: float | None = _option(None, _SIGMA, _IMAGES)
     # peak of a feature's spot above the background, grey levels
-    brightness: float = _option(170.0, _POSITIVE)
+    brightness: float = _option(170.0, _POSITIVE, _IMAGES)
     # standard deviation from feature to feature, as a share
-    brightness_spread: float = _option(0.1, _NOT_NEGATIVE)
+    brightness_spread: float = _option(0.1, _NOT_NEGATIVE, ("images", "profiles"))
     # false features per frame and sensor: the whole part always, the rest by chance
     clutter: float = _option(0.0, _FALSE)
     hidden: float = _option(0.0, _PROBABILITY)  # that a feature is, in each view anew
@@ -78,45 +89,59 @@ class SimulationOptions:
     # in which the slow part of the motion comes round, more or less
     period_s: float = _option(4.0, _POSITIVE)
     # standard deviation of detections in a camera's table, px
-    pixel_noise: float = _option(0.1, _NOT_NEGATIVE)
+    pixel_noise: float = _option(0.1, _NOT_NEGATIVE, ("pixels",))
     # standard deviation of detections in tables of ranges and clouds, length units; None is `sigma`
     # of its [extract], of clouds a fifth of it
-    range_noise: float | None = _option(None, _NOT_NEGATIVE)
+    range_noise: float | None = _option(None, _NOT_NEGATIVE, ("lengths",))
     # standard deviation of a feature's peak in a range profile, length units; None is `spot_sigma`
     # of the sensor's [extract] where that is given, else one and a half bins
-    range_width: float | None = _option(None, _POSITIVE)
+    range_width: float | None = _option(None, _POSITIVE, ("profiles",))
     # height of a peak divided by the standard deviation of the profile's noise
-    range_snr: float = _option(30.0, _POSITIVE)
+    range_snr: float = _option(30.0, _POSITIVE, ("profiles",))
     # seconds from the first row of a camera to its last, and for which a row collects light; None
     # is what the session states of each camera
-    readout: float | None = _option(None, _NOT_NEGATIVE)
-    exposure: float | None = _option(None, _NOT_NEGATIVE)
+    readout: float | None = _option(None, _SECOND, _CAMERAS)
+    exposure: float | None = _option(None, _SECOND, _CAMERAS)
     # seconds that sensors are late without knowing, by name; the others are as late as the session
     # states
     delay: Mapping[str, float] = field(default_factory=dict)
     # seconds by which sensors differ that have tables of times, as these say: the last is this much
     # later than the first
     out_of_step: float = _option(0.0, _NOT_NEGATIVE)
-    lamps: int = _option(0, _FEW)  # behind the body
-    others: int = _option(0, _FEW)  # bodies with as many markers
-    occluder: int = _option(0, _FEW)  # dark bars that swing before it
+    lamps: int = _option(0, _FEW, _CAMERAS)  # behind the body
+    others: int = _option(0, _FEW, _CAMERAS)  # bodies with as many markers
+    occluder: int = _option(0, _FEW, _CAMERAS)  # dark bars that swing before it
     # brightness of mirror images in a table below the body, as a share; 0 without one
-    mirror: float = _option(0.0, _PROBABILITY)
-    jpeg: int | None = _option(None, _QUALITY)  # of the compression that images went through
-    bayer: bool = False  # images come from a colour sensor, its colours interpolated
+    mirror: float = _option(0.0, _PROBABILITY, _CAMERAS)
+    jpeg: int | None = _option(
+        None, _QUALITY, _IMAGES
+    )  # of the compression that images went through
+    bayer: bool = _option(
+        False, None, _IMAGES
+    )  # images come from a colour sensor, its colours interpolated
     # by which the last camera was turned after its calibration
-    turned_camera_deg: float = _option(0.0, _ANY)
+    turned_camera_deg: float = _option(0.0, _ANY, _CAMERAS)
     away_from: int | None = _option(None, _COUNT)  # frames after which the body is gone
 
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
-            if value is None or "rule" not in one.metadata:
+            rule: Rule | None = one.metadata.get("rule")
+            if value is None or rule is None:
                 continue
-            least, most, is_whole, allowed = one.metadata["rule"]
+            least, most, is_whole, allowed = rule
             is_allowed = math.isfinite(value) and least <= value <= most
             if not is_allowed or (is_whole and value != int(value)):
                 raise SessionError(f"simulate: {one.name}: found {value}; allowed: {allowed}")
+
+    def unused(self, given: Collection[Output], *, is_exact: bool) -> tuple[str, ...]:
+        """Names of options that ask for something, in a session whose sensors give nothing of it.
+
+        Where features `is_exact`, none can be displaced.
+        """
+        asked = [one for one in fields(self) if getattr(self, one.name) != one.default]
+        idle = [one.name for one in asked if not {*one.metadata.get("of", _ALL)} & {*given}]
+        return (*idle, "deform") if self.deform and is_exact else tuple(idle)
 
 
 class Purpose(IntEnum):

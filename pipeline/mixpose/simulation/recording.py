@@ -54,8 +54,10 @@ def simulate(
     *,
     overwrite: bool = False,
     progress: Progress | None = None,
-) -> None:
+) -> tuple[str, ...]:
     """Write a recording that the session plays, with the true poses beside it.
+
+    Returns the names of options that ask for what none of its sensors gives.
 
     The folder, made if it is not there, then holds ``session.toml``, the marker and calibration
     files that it names, frames for the source of each sensor, and ``truth.jsonl``. The same
@@ -74,6 +76,8 @@ def simulate(
         raise SessionError(
             f"simulate: {error.filename or folder}: cannot be written: {error.strerror}"
         ) from error
+    given = {channel.gives for channel in plan.channels}
+    return options.unused(given, is_exact=session.body.spread == 0)
 
 
 def _plan(session: Session, options: SimulationOptions) -> _Plan:
