@@ -204,7 +204,7 @@ def test_one_function_differentiates_a_projection_by_the_pose() -> None:
     }
     assert across == {
         "objective/projection.py:pose_jacobian",
-        "judgement/information.py:with_wide_turn",  # the arc of the origin by a wide turn
+        "judgement/nonlinear.py:with_wide_turn",  # the arc of the origin by a wide turn
         "search/from_points.py:_meetings",  # lines by their Pluecker coordinates
         "search/poses.py:label_image",  # axes of a plane
         "search/three_points.py:_shape",  # triangles and conics

@@ -43,6 +43,10 @@ from mixpose.judgement.information import (
     invert_information as invert_information,
     inverted as inverted,
 )
+from mixpose.judgement.nonlinear import (
+    with_likely_turns as with_likely_turns,
+    with_wide_turn as with_wide_turn,
+)
 from mixpose.judgement.mistakes import (
     APART as APART,
     Mistake as Mistake,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy.linalg.lapack import dposv
 from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
 
-_LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
 _SMALLEST = 1e-14  # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
 
 
@@ -70,26 +68,6 @@ def invert_information(information: Floats, free: Mask) -> Floats:
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     return covariance
-
-
-def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -> Floats:
-    """A covariance (6, 6), wider where a turn may be so wide that the origin goes along an arc.
-
-    By a turn ω about the middle of the features (N, 3) the origin, l away, goes by ω × l, but for
-    ω² l/2 towards the axis and ω³ l/6 back.  At the 3.3 σ of 99.9 % these are 5.4 σ² l and 6 σ³ l:
-    2.7 deviations of 4 σ⁴ l² and 5 σ⁶ l², which an ellipsoid of six dimensions (4.7) still holds.
-    """
-    turns = covariance[3:, 3:]
-    if not _LEAST_TURN**2 < np.trace(turns) < math.inf:
-        return covariance
-    variances, axes = np.linalg.eigh(turns)
-    lever = -T_world_object[:3, :3] @ points.mean(axis=0)
-    along = np.cross(axes[:, -1], lever)
-    inwards = np.cross(along, axes[:, -1])
-    wider, squared = covariance.copy(), float(variances[-1])
-    wider[:3, :3] += 4 * squared**2 * np.outer(inwards, inwards)
-    wider[:3, :3] += 5 * squared**3 * np.outer(along, along)
-    return wider
 
 
 def log_determinants(information: Floats, least: Floats) -> Floats:

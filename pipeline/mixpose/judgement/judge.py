@@ -13,7 +13,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.judgement.clutter import ClutterRates
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
-from mixpose.judgement.information import information_of, inverted, with_wide_turn
+from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
@@ -191,7 +191,7 @@ def judge_together(
         ScoredPose(
             case.T_world_object,
             whole[k],
-            with_wide_turn(covariance, case.T_world_object, case.body.means),
+            covariance,
             float(evidence[k]),
             noise=remembered,
             log_missed=rules.detection.log_missed,

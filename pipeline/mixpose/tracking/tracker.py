@@ -15,10 +15,9 @@ from scipy.special import expit
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
-from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
-from mixpose.rigid import covariance_at, from_parts
+from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
+from mixpose.rigid import from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.arguments import pose_meant, require_meant
@@ -31,6 +30,7 @@ from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent, predicted
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
+from mixpose.tracking.telling import covariance_told, offsets_of, residuals_of
 from mixpose.tracking.track import Branch, Track, predict
 from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, left_by, with_second
 
@@ -208,7 +208,7 @@ class Tracker(Setup):
         shown = best or next(iter(ranked), None)
         used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
-        reports |= shown.reports(_residuals(used, body) if used else {}) if shown else {}
+        reports |= shown.reports(residuals_of(used, body) if used else {}) if shown else {}
         rivals = verdict.kept if verdict.status == "ambiguous" else ()
         origin = best.proposer if best else ""
         if data.is_found_at_once and origin == predicted.__name__:
@@ -219,7 +219,7 @@ class Tracker(Setup):
             object=body.name,
             status=verdict.status,
             T_world_object=best.T_world_object @ at if best else None,
-            covariance=self._at_origin(best) if best else None,
+            covariance=covariance_told(data, best, self.origin) if best else None,
             score=shown.score if shown else 0.0,
             confidence=verdict.confidence,
             sensors=reports,
@@ -232,19 +232,13 @@ class Tracker(Setup):
             guesses=data.searches[-1][0] if data.searches else None,
             delays=after.delays.seconds,
             doubt=verdict.doubt,
-            measured=partial(_offsets, used, shown.variances) if shown and used else dict,
+            measured=partial(offsets_of, used, shown.variances) if shown and used else dict,
         )
 
     @cached_property
     def _T_body_origin(self) -> Floats:
         """The frame (4, 4) that poses are told of, in that of `body`."""
         return from_parts(np.eye(3), self.origin)
-
-    def _at_origin(self, pose: ScoredPose) -> Floats:
-        """The covariance (6, 6) of a pose, of its origin."""
-        if not self.origin.any():
-            return pose.covariance
-        return covariance_at(pose.covariance, pose.T_world_object[:3, :3] @ self.origin)
 
 
 def estimate_pose(
@@ -385,34 +379,3 @@ def _branches(
         alike = None if is_new else [each.T_body_other for each in congruent(data, one)]
         found.append((branch, alike))
     return found
-
-
-def _residuals(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
-    """How far off each sensor met the features in view; None for those that it missed."""
-    off = used.sigmas[:, None] * np.sqrt(used.squared)
-    rows = zip(off.tolist(), used.shares.tolist(), used.weights.tolist(), strict=True)
-    return {
-        name: {label: r if s else None for label, r, s, w in zip(body.labels, *row) if w}
-        for name, row in zip(used.names, rows, strict=True)
-    }
-
-
-def _offsets(used: Matches, variances: Floats) -> dict[str, Offsets]:
-    """By how much each sensor met the features of a body whose features are points.
-
-    Noise has variances (L,), σ_ε².
-    """
-    offsets = {}
-    for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
-        i = np.flatnonzero(used.weights[k])
-        y, by_shift = sigma * used.offsets[k, i, :m], used.J[k, i, :m, :3]
-        by, places = used.detections[k, i], used.places[k, i, :m]
-        alike = (by[:, None] == by) & (by >= 0)[:, None]
-        shared = alike.sum(axis=1) > 1
-        # offsets of two that share a detection are those of their middle
-        middle = alike @ places / np.maximum(alike.sum(axis=1), 1)[:, None]
-        observed = np.where(shared[:, None], middle, places) + y
-        met = used.shares[k, i] > 0
-        weights = variances[k] / (variances[k] + used.extra[k, i])
-        offsets[name] = Offsets(i, met, y, sigma * by_shift, observed, shared, weights)
-    return offsets

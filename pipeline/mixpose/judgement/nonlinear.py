@@ -1,0 +1,151 @@
+"""Ellipsoids that hold the pose where what a sensor sees is not linear in how it is turned.
+
+A covariance is the curvature of the likelihood at the pose.  Of wide turns that is not all: the
+origin goes along an arc, and the likelihood may fall more slowly than at the pose, as of a flat
+body that nearly faces its one camera, where turns to either side look almost alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from mixpose.matching import Matches
+from mixpose.objective import BodyProjection
+from mixpose.records import Floats, Mask
+from mixpose.rigid import perturb, twist_between
+
+_LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
+_WIDEST_TURN = 1.0  # rad: what is turned by more is another pose
+_HELD = float(chdtri(6, 1e-3))  # squared deviations of the ellipsoid of 99.9 %
+_RAYS = 12
+# as far as that ellipsoid, and up to eight times; between two, the likelihood is as good as normal
+_REACHES = 1.4 ** np.arange(7)
+
+
+def with_likely_turns(
+    covariance: Floats,  # (6, 6)
+    T_world_object: Floats,  # (4, 4)
+    seen: Matches,  # there, by the sensors that took part
+    variances: Floats,  # (L,) of their noise, σ_ε²
+    projection: BodyProjection,  # of these sensors
+    free: Mask,
+) -> Floats:
+    """A covariance (6, 6) whose ellipsoid of 99.9 % holds all turns that are as likely as its edge.
+
+    Turns are tried in the plane of the two that are least known, on rays, with all else as is
+    likeliest then.  Where a twist x at the edge of what is likely is m > h squared deviations away,
+    h at the ellipsoid's edge, the covariance grows by (1/h − 1/m) x xᵀ, which puts it there.
+    """
+    if not _LEAST_TURN**2 < np.trace(covariance[3:, 3:]) < math.inf:
+        return covariance
+    profile = _Profile.about(covariance, T_world_object, seen, variances, projection, free)
+    if profile is None:
+        return covariance
+    angles = np.arange(_RAYS) * (2 * np.pi / _RAYS)
+    rays = math.sqrt(_HELD) * np.array([np.cos(angles), np.sin(angles)]).T
+    likely = profile.fallen(rays)[0] < _HELD
+    if not np.count_nonzero(likely):
+        return covariance
+    rays = rays[likely]
+    fallen, poses = profile.fallen((rays[:, None] * _REACHES[:, None]).reshape(-1, 2))
+    fallen, wider = fallen.reshape(len(rays), -1), covariance.copy()
+    for away, own in zip(fallen, poses.reshape(*fallen.shape, 4, 4), strict=True):
+        beyond = int(np.argmax(away >= _HELD)) if away.max() >= _HELD else len(away)
+        x = twist_between(T_world_object, own[max(beyond - 1, 0)])
+        inner = np.ix_(free, free)
+        m = float(x[free] @ np.linalg.solve(wider[inner], x[free]))
+        if m > _HELD:
+            wider[inner] += (1 / _HELD - 1 / m) * np.outer(x[free], x[free])
+    return wider
+
+
+def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -> Floats:
+    """A covariance (6, 6), wider where a turn may be so wide that the origin goes along an arc.
+
+    By a turn ω about the middle of the features (N, 3) the origin, l away, goes by ω × l, but for
+    ω² l/2 towards the axis and ω³ l/6 back.  At the 3.3 σ of 99.9 % these are 5.4 σ² l and 6 σ³ l:
+    2.7 deviations of 4 σ⁴ l² and 5 σ⁶ l², which an ellipsoid of six dimensions (4.7) still holds.
+    """
+    turns = covariance[3:, 3:]
+    if not _LEAST_TURN**2 < np.trace(turns) < math.inf:
+        return covariance
+    variances, axes = np.linalg.eigh(turns)
+    lever = -T_world_object[:3, :3] @ points.mean(axis=0)
+    along = np.cross(axes[:, -1], lever)
+    inwards = np.cross(along, axes[:, -1])
+    wider, squared = covariance.copy(), float(variances[-1])
+    wider[:3, :3] += 4 * squared**2 * np.outer(inwards, inwards)
+    wider[:3, :3] += 5 * squared**3 * np.outer(along, along)
+    return wider
+
+
+@dataclass(frozen=True)
+class _Profile:
+    """The likelihood by two turns, with all else as is likeliest then."""
+
+    T_world_object: Floats
+    seen: Matches
+    weights: Floats  # (R,) of the offsets, R = 2 L N
+    projection: BodyProjection
+    plane: Floats  # (6, 2) twists by the two turns, each of one standard deviation
+    rest: Floats  # (6, k - 2) by all other directions
+    curvature: Floats  # (2, 2) of the likelihood at the pose, of noise that is known
+
+    @classmethod
+    def about(
+        cls,
+        covariance: Floats,
+        T_world_object: Floats,
+        seen: Matches,
+        variances: Floats,
+        projection: BodyProjection,
+        free: Mask,
+    ) -> _Profile | None:
+        """Of the turns that are least known; None where none is unsure enough to matter."""
+        inner = np.ix_(free, free)
+        scale = np.sqrt(np.maximum(covariance[inner].diagonal(), 1e-300))
+        values, vectors = np.linalg.eigh(covariance[inner] / np.outer(scale, scale))
+        roots = np.zeros((6, len(scale)))
+        roots[free] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-12))
+        _, turns, axes = np.linalg.svd(roots[3:])
+        if not turns[0] > _LEAST_TURN or len(scale) < 3:
+            return None
+        weights = (seen.shares / (variances[:, None] + seen.extra)).ravel().repeat(2)
+        by_axis = roots @ axes.T
+        J = seen.J.reshape(-1, 6) @ by_axis
+        H = J.T @ (weights[:, None] * J)
+        curvature = H[:2, :2] - H[:2, 2:] @ np.linalg.pinv(H[2:, 2:]) @ H[2:, :2]
+        given = T_world_object, seen, weights, projection
+        return cls(*given, by_axis[:, :2], by_axis[:, 2:], curvature)
+
+    def fallen(self, turns: Floats) -> tuple[Floats, Floats]:
+        """By how much −2 ln p falls (K,) at turns (K, 2), in deviations, and the poses (K, 4, 4).
+
+        Of noise as the covariance has it, which is not known as well as the curvature has it.
+        """
+        poses = perturb(self.T_world_object, turns @ self.plane.T)
+        for _ in range(2):
+            r, J = self._at(poses)
+            by_rest = J @ self.rest
+            rows = (self.weights[:, None] * by_rest).swapaxes(1, 2)
+            # out of view nothing else holds the rest
+            information = rows @ by_rest + 1e-6 * np.eye(by_rest.shape[2])
+            moved = np.linalg.solve(information, rows @ r[..., None])[..., 0]
+            poses = perturb(poses, moved @ self.rest.T)
+        here = self._at(self.T_world_object[None])[0]
+        fallen = self._at(poses)[0] ** 2 @ self.weights - here**2 @ self.weights
+        known = np.vecdot(turns @ self.curvature, turns)
+        wide = np.linalg.norm(turns @ self.plane[3:].T, axis=1) > _WIDEST_TURN
+        return np.where(wide, np.inf, fallen * (np.vecdot(turns, turns) / known)), poses
+
+    def _at(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Offsets (K, R) from what is met, in σ_ε, and Jacobians (K, R, 6) of the places."""
+        at, seen = self.projection.project(poses), self.seen
+        sigmas = seen.sigmas[:, None, None, None]
+        r = (seen.places - at.y.swapaxes(0, 1)) / sigmas[:, 0] + seen.offsets
+        J = (at.J / sigmas[..., None]).swapaxes(0, 1)
+        return r.reshape(len(poses), -1), J.reshape(len(poses), -1, 6)
