@@ -38,7 +38,7 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, meet_the_same, mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import odds_beside
 
@@ -100,11 +100,9 @@ def _seen_beside(a: ScoredPose, b: ScoredPose) -> str:
     """
     if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
         return ""
-    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
-    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
-    met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
-    if shared >= 0.5 * met.sum():
+    if meet_the_same(a, b):
         return ""
+    met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
     return TWICE if np.minimum(met, other).sum() >= 0.5 * other.sum() else APART
 
 

@@ -178,6 +178,16 @@ class Frame(Setup):
         there = self._prior(T_world_object, self.predictions[:1], self.track.misses)
         return there[0] > self.anywhere[0]
 
+    def is_expected(self, T_world_object: Floats) -> bool:
+        """Whether a pose is as likely, before the frame, as one that is not in doubt.
+
+        By the likeliest; where nothing was seen before, any.
+        """
+        if not self.predictions:
+            return True
+        there = self.prior(self.predictions[0].T_world_object)[0] - self.prior(T_world_object)[0]
+        return there < -self.rules.acceptance.log_doubt
+
     def rival(
         self,
         best: ScoredPose,

@@ -69,6 +69,10 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
+    # or misses some where the frames before let nobody expect it
+    is_far |= any(
+        one.coverage < 1 and not frame.is_expected(one.T_world_object) for one in ranked[:1]
+    )
     # or is far less evident than the one before, by what it meets
     is_far |= any(one.gained < rules.proposals.fallen * track.gained for one in ranked[:1])
     if frame.first_is(frame.trusted, ranked) and not is_far:
