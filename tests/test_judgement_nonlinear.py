@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matches import Seen, matches_of
@@ -68,8 +70,8 @@ def test_the_ellipsoid_of_a_board_before_one_camera_holds_it_as_often_as_it_says
     T_true = from_rotation_vector(turn, np.array([5.0, -8.0, distance]))
     wide, plain = [], []
     for seed in range(300):
-        T, *seen = fitted(T_true, seed)
-        before, after = covariances(T, *seen)
+        T, found, projection = fitted(T_true, seed)
+        before, after = covariances(T, found, projection)
         plain.append(squares(T_true, T, before))
         wide.append(squares(T_true, T, after))
         # it holds all that the curvature allows
@@ -83,10 +85,38 @@ def test_the_ellipsoid_of_a_board_before_one_camera_holds_it_as_often_as_it_says
 
 def test_a_pose_whose_turns_are_known_is_as_sure_as_the_curvature_says() -> None:
     turn = np.radians(50) * np.array([0.6, 0.8, 0.0])
-    T, *seen = fitted(from_rotation_vector(turn, np.array([0.0, 0.0, 120.0])), 1)
-    before, after = covariances(T, *seen)
+    T, found, projection = fitted(from_rotation_vector(turn, np.array([0.0, 0.0, 120.0])), 1)
+    before, after = covariances(T, found, projection)
     assert np.degrees(np.sqrt(before[3:, 3:].trace())) < 0.5
     assert after is before
+
+
+@pytest.mark.parametrize("larger", [0.5, 2.0, 8.0])
+def test_how_well_noise_is_known_makes_no_turn_likelier(larger: float) -> None:
+    """Where what is seen is linear in turns, their ellipsoid is that of the covariance."""
+    turn = np.radians(50) * np.array([0.6, 0.8, 0.0])
+    T, found, projection = fitted(from_rotation_vector(turn, np.array([5.0, -8.0, 2000.0])), 6)
+    before = larger * covariances(T, found, projection)[0]
+    assert np.sqrt(before[3:, 3:].trace()) > 0.01
+    after = with_likely_turns(before, T, found, np.array([NOISE**2]), projection, FREE)
+    assert after[3:, 3:].trace() < 1.1 * before[3:, 3:].trace()
+
+
+def test_what_no_turn_explains_makes_none_less_likely() -> None:
+    """Offsets that no pose takes away are there at all turns alike."""
+    T, found, projection = fitted(from_rotation_vector([0.04, 0.05, 0], [0, 0, 500.0]), 2)
+    J, variances = found.J[0].reshape(-1, 6), np.array([NOISE**2])
+    before = NOISE**2 * np.linalg.inv(J.T @ J)
+    r = np.random.default_rng(5).normal(size=len(J))
+    r -= J @ np.linalg.lstsq(J, r)[0]
+    sizes = []
+    for squared in (0.01, 18.0):  # of the 22.5 by which a likely turn may be worse
+        rest = r * np.sqrt(squared * NOISE**2 / (r @ r))
+        seen = replace(found, offsets=rest.reshape(found.offsets.shape))
+        after = with_likely_turns(before, T, seen, variances, projection, FREE)
+        sizes.append(after[3:, 3:].trace() / before[3:, 3:].trace())
+    assert min(sizes) > 1.3
+    assert max(sizes) < 1.5 * min(sizes)
 
 
 def test_directions_that_are_held_stay_so() -> None:

@@ -77,19 +77,25 @@ def test_each_frame_is_held_against_its_own_moment() -> None:
     assert max(float(np.linalg.norm(twist[:3])) for twist in twists[:39] if twist is not None) < 0.1
 
 
-def test_identical_bodies_keep_their_numbers_by_the_truth_of_then() -> None:
-    now, then = moving(60)
-    apart = np.zeros((4, 4))
-    apart[0, 3] = 50.0  # less than the way of the body in its swing
+def test_identical_bodies_have_the_numbers_of_then() -> None:
+    """Two that pass one another are where the other one was a moment before."""
+
+    def place(number: int, time_s: float) -> Floats:
+        T = np.eye(4)
+        T[0, 3] = (1 - 2 * number) * (400.0 * (time_s - 0.41))  # they meet in frame 10
+        return T
+
     truth, poses = [], []
-    for k in range(60):
+    for k in range(20):
         for number in (0, 1):
-            place = number * apart
-            truth.append(pose_line(k, now[k] + place, None, instance=number))
-            poses.append(pose_line(k, then[k] + place, None, instance=1 - number, ahead_s=AHEAD))
+            now, then = (place(number, 0.04 * k + later) for later in (0.0, AHEAD))
+            truth.append(pose_line(k, now, None, instance=number))
+            poses.append(pose_line(k, then, None, instance=1 - number, ahead_s=AHEAD))
     found = evaluate(file_of(poses), file_of(truth, "truth.jsonl"))
     assert found.translation is not None
-    assert found.translation.max < 0.1
+    assert found.translation.max < 1e-6
+    assert found.swaps is not None
+    assert found.swaps.count == 0
 
 
 def test_nothing_is_known_within_a_gap_of_the_truth() -> None:

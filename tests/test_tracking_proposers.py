@@ -26,7 +26,7 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.proposers import PROPOSERS, look_alikes
+from mixpose.tracking.proposers import PROPOSERS, is_doubtful, look_alikes
 from mixpose.tracking.refinements import REFINEMENTS
 
 Floats = NDArray[np.float64]
@@ -215,6 +215,29 @@ def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body()
     # a camera by itself is asked whatever it meets: a wrong tilt may be why it meets little
     few = view_of("camera", camera, camera.project(transform(T, PLATE.means[:2]))[0])
     assert len(tilts([few])) == 1
+
+
+@pytest.mark.parametrize("hidden", [0, 1])
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0])
+def test_what_nobody_expected_and_misses_features_is_looked_for_elsewhere(
+    pinhole_cameras: list[PinholeCamera], hidden: int, turn_deg: float
+) -> None:
+    """A pose that is sure, and meets 7 of 8 features, is where the body was, or turned by much."""
+    T = TRUTH @ from_rotation_vector([0.0, 0.0, np.radians(turn_deg)], np.zeros(3))
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for frame in range(6):
+        views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.1, seed=frame)
+        track, _ = tracker.advance(track, frame, None, views)
+    # features that are hidden are the same in all frames: no more are missed than before
+    views = detect(pinhole_cameras, EIGHT, T, noise=0.1, seed=9, hidden=hidden)
+    data = tracker.data(track, 6, None, views)
+    likelihood, start = likelihood_of(data), Start(T, data.close)
+    judged = likelihood.judge(likelihood.fit(start), start)
+    assert rotation_angle_deg(judged.T_world_object, T) < 1.0
+    assert (judged.coverage < 1) == (hidden > 0)
+    assert data.is_expected(judged.T_world_object) == (turn_deg == 0)
+    assert is_doubtful(data, [judged]) == (turn_deg > 0 and hidden > 0)
 
 
 def test_of_what_is_surely_clutter_no_look_alikes_are_asked_for() -> None:

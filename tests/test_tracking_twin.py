@@ -15,6 +15,7 @@ from mixpose.judgement import ScoredPose
 from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector
 from mixpose.tracking import TWICE, Scene, Tracker
+from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.mirrors import IN_A_MIRROR, mirrored
@@ -260,6 +261,19 @@ def test_no_body_reaches_through_a_mirror() -> None:
     # and what is not flat has no mirror image that looks like it
     data, one, other = frame_of(SOLID, T, in_mirror(T))
     assert mirrored(data, one, other)[0] == -np.inf
+
+
+def test_what_two_poses_explain_alike_is_in_no_mirror() -> None:
+    """A mirror image is seen beside the body; of two tilts of a small body the one is no image."""
+    T = at(-60.0)
+    data, one, other = frame_of(FLAT, T, in_mirror(T))
+    assert [each for each, _ in decided(data, [one, other]).kept] == [one]
+    # of the features in two cameras half are met by the same detections, then all
+    for alike in (1, 2):
+        by = other.matches.detections.copy()
+        by[:alike] = one.matches.detections[:alike]
+        same = replace(other, matches=replace(other.matches, detections=by))
+        assert {id(each) for each, _ in decided(data, [one, same]).kept} == {id(one), id(same)}
 
 
 def test_a_solid_body_that_looks_the_same_in_a_mirror_is_told_from_its_image() -> None:

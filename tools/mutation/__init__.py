@@ -25,6 +25,7 @@ from mutation import (
     rivalry,
     searching,
     trajectories,
+    turning,
 )
 from mutation.mutant import Mutant
 
@@ -51,4 +52,5 @@ MUTANTS: tuple[Mutant, ...] = (
     *rivalry.MUTANTS,
     *planning.MUTANTS,
     *trajectories.MUTANTS,
+    *turning.MUTANTS,
 )

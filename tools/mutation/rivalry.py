@@ -65,9 +65,9 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-covariance-of-the-middle",
-        "tracking/tracker.py",
-        "if not self.origin.any():",
-        "if True:",
+        "tracking/telling.py",
+        "covariance = covariance_at(covariance, T[:3, :3] @ origin)",
+        "covariance_at(covariance, T[:3, :3] @ origin)",
         "a tip that is far from the markers seems to be known as well as they are",
         (_RIVALS,),
     ),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.special import chdtri
@@ -67,19 +68,23 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
     """A covariance (6, 6), wider where a turn may be so wide that the origin goes along an arc.
 
     By a turn ω about the middle of the features (N, 3) the origin, l away, goes by ω × l, but for
-    ω² l/2 towards the axis and ω³ l/6 back.  At the 3.3 σ of 99.9 % these are 5.4 σ² l and 6 σ³ l:
-    2.7 deviations of 4 σ⁴ l² and 5 σ⁶ l², which an ellipsoid of six dimensions (4.7) still holds.
+    ω × (ω × l)/2 towards the axis and ω³ l/6 back.  At the 3.3 σ of 99.9 % these are 5.4 σ² l and
+    6 σ³ l: 2.7 deviations of 4 σ⁴ l² and 5 σ⁶ l², which an ellipsoid of six dimensions (4.7) still
+    holds.  Turns about two axes at once are as wide together: half as much of their product.
     """
     turns = covariance[3:, 3:]
     if not _LEAST_TURN**2 < np.trace(turns) < math.inf:
         return covariance
-    variances, axes = np.linalg.eigh(turns)
-    lever = -T_world_object[:3, :3] @ points.mean(axis=0)
-    along = np.cross(axes[:, -1], lever)
-    inwards = np.cross(along, axes[:, -1])
-    wider, squared = covariance.copy(), float(variances[-1])
-    wider[:3, :3] += 4 * squared**2 * np.outer(inwards, inwards)
-    wider[:3, :3] += 5 * squared**3 * np.outer(along, along)
+    variances, columns = np.linalg.eigh(turns)
+    axes, lever = columns.T, -T_world_object[:3, :3] @ points.mean(axis=0)
+    along = np.cross(axes, lever)
+    twice = np.cross(axes[:, None], along)  # about an axis, then about another one
+    wider, deviations = covariance.copy(), np.sqrt(np.maximum(variances, 0.0))
+    for a, b in combinations_with_replacement(range(3), 2):
+        inwards = twice[a, b] + twice[b, a]
+        wider[:3, :3] += (deviations[a] * deviations[b]) ** 2 * np.outer(inwards, inwards)
+    back = math.sqrt(5) * deviations[:, None] ** 3 * along
+    wider[:3, :3] += back.T @ back
     return wider
 
 

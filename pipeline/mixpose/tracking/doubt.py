@@ -38,7 +38,7 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, meet_the_same, mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import odds_beside
 
@@ -100,16 +100,30 @@ def _seen_beside(a: ScoredPose, b: ScoredPose) -> str:
     """
     if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
         return ""
-    if meet_the_same(a, b):
+    if _meet_the_same(a, b):
         return ""
     met, other = (np.count_nonzero(one.matches.detections >= 0, axis=1) for one in (a, b))
     return TWICE if np.minimum(met, other).sum() >= 0.5 * other.sum() else APART
+
+
+def _meet_the_same(a: ScoredPose, b: ScoredPose) -> bool:
+    """Whether two poses of a frame explain the same detections, half of what the first one meets.
+
+    What is not in view twice may be turned in two ways, and is in no mirror.
+    """
+    if a.matches.names != b.matches.names:
+        return False
+    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
+    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
+    return bool(shared >= 0.5 * np.count_nonzero(a.matches.detections >= 0))
 
 
 def _in_mirrors(data: Frame, verdict: Verdict) -> list[ScoredPose]:
     """Poses that show others in a mirror."""
     images = list[ScoredPose]()
     for (one, _), (other, _) in combinations(verdict.kept, 2):
+        if _meet_the_same(one, other):
+            continue
         odds, is_first = mirrored(data, one, other)
         if odds > -data.rules.acceptance.log_doubt:
             images.append(other if is_first else one)

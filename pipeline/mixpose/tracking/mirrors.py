@@ -41,23 +41,11 @@ def is_flat(data: Setup) -> bool:
     return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
-def meet_the_same(a: ScoredPose, b: ScoredPose) -> bool:
-    """Whether two poses explain the same detections, by half of what the first one meets."""
-    if a.matches.names != b.matches.names:
-        return False
-    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
-    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
-    return bool(shared >= 0.5 * np.count_nonzero(a.matches.detections >= 0))
-
-
 def mirrored(data: Frame, one: ScoredPose, other: ScoredPose) -> tuple[float, bool]:
     """Log odds that one of two poses shows the other in a mirror; and whether `one` is the body.
 
-    A second body is as likely as a mirror, before the poses are looked at.  What a mirror shows is
-    seen beside the body.
+    A second body is as likely as a mirror, before the poses are looked at.
     """
-    if meet_the_same(one, other):
-        return -math.inf, True
     a, b, found, body = one.T_world_object, other.T_world_object, [], data.body
     x, rules = transform(a, body.means), data.rules.look_alikes
     cameras = [view.sensor for view in data.views if view.sensor.dimension == 2]

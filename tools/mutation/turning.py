@@ -1,0 +1,156 @@
+"""Mutants of wide turns: ellipsoids that hold them, tilts that look alike, poses ahead of time."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_NONLINEAR, _TWIN = "test_judgement_nonlinear.py", "test_tracking_twin.py"
+_TILTS, _PROPOSERS = "test_tracking_tilts.py", "test_tracking_proposers.py"
+_FORETOLD, _OPTIONS = "test_poses_foretold.py", "test_simulation_options.py"
+
+MUTANTS = (
+    Mutant(
+        "judgement-likely-turns-are-left-out",
+        "judgement/nonlinear.py",
+        "likely = profile.fallen(rays)[0] < _HELD",
+        "likely = profile.fallen(rays)[0] < 0",
+        "a flat body that faces its one camera is said to be turned as exactly as it is not",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "judgement-likely-turns-with-all-else-as-it-was",
+        "judgement/nonlinear.py",
+        "poses = perturb(poses, moved @ self.rest.T)",
+        "poses = perturb(poses, 0 * moved @ self.rest.T)",
+        "turns are unlikely, as the body does not move with them",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "judgement-likely-turns-half-as-far",
+        "judgement/nonlinear.py",
+        "(1 / _HELD - 1 / m) * np.outer",
+        "(0.1 / _HELD - 0.1 / m) * np.outer",
+        "the ellipsoid grows, and does not hold what is likely",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "judgement-likely-turns-as-if-nothing-moved",
+        "judgement/nonlinear.py",
+        "fallen = self._at(poses)[0] ** 2 @ self.weights - here**2 @ self.weights",
+        "fallen = self._at(poses)[0] ** 2 @ self.weights",
+        "what the pose itself is off by counts against all turns",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "judgement-turns-are-always-known",
+        "judgement/nonlinear.py",
+        "return np.where(wide, np.inf, fallen * (np.vecdot(turns, turns) / known)), poses",
+        "return np.where(wide, np.inf, fallen), poses",
+        "where noise is not known well, the ellipsoid grows for no reason or not at all",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "tracking-covariance-of-the-curvature-alone",
+        "tracking/telling.py",
+        "covariance = with_likely_turns(covariance, *given)",
+        "with_likely_turns(covariance, *given)",
+        "ellipsoids of poses hold only what the curvature allows",
+        (_TILTS, "test_tracking.py"),
+    ),
+    Mutant(
+        "tracking-origins-go-straight",
+        "tracking/telling.py",
+        "return with_wide_turn(covariance, T, data.body.means - origin)",
+        "return covariance",
+        "the origin of a body that may turn about a line of features is said to be exact",
+        (_TILTS,),
+    ),
+    Mutant(
+        "judgement-turns-about-one-axis-only",
+        "judgement/nonlinear.py",
+        "combinations_with_replacement(range(3), 2):",
+        "[(2, 2)]:",
+        "an origin aside of a board that may be turned about two axes is said to be exact",
+        (_TILTS,),
+    ),
+    Mutant(
+        "tracking-tilts-are-images-of-one-another",
+        "tracking/doubt.py",
+        "        if _meet_the_same(one, other):\n            continue\n",
+        "",
+        "of two tilts of a small flat body the right one is dropped, and the wrong one is ok",
+        (_TWIN, _TILTS),
+    ),
+    Mutant(
+        "tracking-unexpected-poses-convince",
+        "tracking/proposers.py",
+        "one.coverage < 1 and not frame.is_expected(one.T_world_object)",
+        "False",
+        "a pose that jumps where nobody expects it is believed though it misses features",
+        (_PROPOSERS,),
+    ),
+    Mutant(
+        "tracking-everything-is-expected",
+        "tracking/frame.py",
+        "return there < -self.rules.acceptance.log_doubt",
+        "return there < 100",
+        "a body turned by a quarter from one frame to the next is as was expected",
+        (_PROPOSERS,),
+    ),
+    Mutant(
+        "poses-foretold-are-held-against-their-frame",
+        "poses/evaluate.py",
+        "truth = in_unit(truth_of_then(truth, poses), unit)",
+        "truth = in_unit(truth, unit)",
+        "poses that were foretold rightly are said to be wrong by what the body moved",
+        (_FORETOLD,),
+    ),
+    Mutant(
+        "poses-foretold-numbers-by-their-frame",
+        "poses/evaluate.py",
+        "    truth = truth_of_then(truth, poses)\n    symmetries",
+        "    symmetries",
+        "identical bodies are numbered by where they were before",
+        (_FORETOLD,),
+    ),
+    Mutant(
+        "poses-foretold-through-gaps",
+        "poses/foretold.py",
+        "_GAP * usual) + 1",
+        "_GAP * usual * 100) + 1",
+        "the truth is made up for frames that it does not have",
+        (_FORETOLD,),
+    ),
+    Mutant(
+        "poses-resumed-with-another-step",
+        "poses/jsonl.py",
+        '        "options": header.options,\n',
+        "",
+        "one file has poses of every frame and of every second one, with labels and without",
+        ("test_cli_messages.py",),
+    ),
+    Mutant(
+        "session-names-twice",
+        "session/marker_files.py",
+        "if name and lines.setdefault(name, line) != line:",
+        "if False:",
+        "two markers of one name are taken for markers without names",
+        ("test_session_files.py",),
+    ),
+    Mutant(
+        "importing-lengths-of-tables-in-silence",
+        "importing/gather.py",
+        "    if lengths in (None, unit):",
+        "    if True:",
+        "a body in metres is a thousand times too small, though its unit was said",
+        ("test_import_command.py",),
+    ),
+    Mutant(
+        "simulation-idle-options-are-said-to-be-used",
+        "simulation/options.py",
+        'if not {*one.metadata.get("of", _ALL)} & {*given}]',
+        "if not given]",
+        "options that this session has nothing of are taken in silence",
+        (_OPTIONS,),
+    ),
+)
