@@ -44,7 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "search": GROUND
     | {"sensors", "body", "density", "matching", "objective", "optimise", "judgement"},
     "fit": GROUND | {"sensors", "body", "density", "matching", "objective", "optimise"},
-    "judgement": GROUND | {"sensors", "body", "density", "matching", "objective"},
+    "judgement": GROUND | {"sensors", "body", "density", "matching", "objective", "optimise"},
     "tracking": GROUND
     | {"sensors", "body", "density", "matching", "objective", "optimise", "search"}
     | {"fit", "judgement"},

@@ -211,10 +211,44 @@ def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body()
     # turned as by that camera alone, where the body's middle stays
     np.testing.assert_allclose(tilt.T_world_object, alone.T_world_object, atol=1e-9)
     assert rotation_angle_deg(tilt.T_world_object, T) > 40
-    assert tilts(both) == []  # two that meet it fix the tilt
+    assert tilts(both) == []  # two that meet it fix the tilt, where they stand well apart
+    for apart, count in ((0.45, 1), (0.55, 0)):  # rad between their lines of sight
+        turn = from_rotation_vector([0.0, apart, 0.0], [0.0, 0.0, 0.0])
+        place = turn @ from_parts(np.eye(3), -T[:3, 3])
+        place[:3, 3] += T[:3, 3]
+        near = PinholeCamera(K, resolution=(1280, 1024), T_sensor_world=place)
+        side_by_side = tilts(detect([camera, near], PLATE, T, noise=0.1))
+        assert len(side_by_side) == count
+        for one in side_by_side:  # about the middle of the two
+            assert rotation_angle_deg(one.T_world_object, T) > 25
     # a camera by itself is asked whatever it meets: a wrong tilt may be why it meets little
     few = view_of("camera", camera, camera.project(transform(T, PLATE.means[:2]))[0])
     assert len(tilts([few])) == 1
+
+
+def test_what_is_met_far_off_in_part_is_looked_for_elsewhere(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    """A ring that differs from one turned by a seventh in one point: there it meets all nearly."""
+    angles = np.arange(7) * 2 * np.pi / 7
+    ring = 40.0 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    ring[0] *= 0.93
+    body = Body("ring", tuple(map(PointFeature, ring)))
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for frame in range(6):
+        views = detect(pinhole_cameras, body, TRUTH, noise=0.1, seed=frame)
+        track, _ = tracker.advance(track, frame, None, views)
+    data = tracker.data(track, 6, None, detect(pinhole_cameras, body, TRUTH, noise=0.1, seed=9))
+    likelihood = likelihood_of(data)
+    doubtful = []
+    for turned in (0, 2):
+        turn = from_rotation_vector([0.0, 0.0, turned * 2 * np.pi / 7], np.zeros(3))
+        start = Start(TRUTH @ turn, data.close)
+        judged = likelihood.judge(likelihood.fit(start), start)
+        assert judged.coverage > 0.9
+        doubtful.append(is_doubtful(data, [judged]))
+    assert doubtful == [False, True]
 
 
 @pytest.mark.parametrize("hidden", [0, 1])

@@ -3,8 +3,9 @@
 python tools/reliability.py [--frames 50000] [--seed 0] [--workers 2] [--json FILE]
 
 Scenes are drawn at random: bodies of 3 to 60 features, 2 to 25 cm wide and of any thickness down to
-none, one to four cameras near or far, images or tables of detections, noise, clutter, hidden markers, lamps, other bodies, mirrors, motion blur,
-compression, a calibration or a body that is not as told, and an arm in front in half of the images.
+none, one to four cameras near or far, images or tables of detections, noise, clutter, hidden
+markers, lamps, other bodies, mirrors, motion blur, compression, a calibration or a body that is not
+as told, and an arm in front in half of the images.
 A pose is right where the truth is within its own 99.9 % ellipsoid.  For each range of confidence
 the share that is right stands beside what was said, with its 95 % interval (Wilson); below it how
 many poses that are `ok` are outside 99.99 %, and how many of these by a degree or a hundredth of

@@ -14,8 +14,10 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.special import chdtri
 
+from mixpose.judgement.information import inverted
 from mixpose.matching import Matches
 from mixpose.objective import BodyProjection
+from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of
 from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, twist_between
 
@@ -25,6 +27,7 @@ _HELD = float(chdtri(6, 1e-3))  # squared deviations of the ellipsoid of 99.9 %
 _RAYS = 12
 # as far as that ellipsoid, and up to eight times; between two, the likelihood is as good as normal
 _REACHES = 1.4 ** np.arange(7)
+_TWICE = NewtonOptions(iterations=3, unchecked=True)
 
 
 def with_likely_turns(
@@ -43,24 +46,26 @@ def with_likely_turns(
     """
     if not _LEAST_TURN**2 < np.trace(covariance[3:, 3:]) < math.inf:
         return covariance
-    profile = _Profile.about(covariance, T_world_object, seen, variances, projection, free)
-    if profile is None:
+    about = _Turns.about(covariance, T_world_object, seen, variances, projection, free)
+    if about is None:
         return covariance
     angles = np.arange(_RAYS) * (2 * np.pi / _RAYS)
     rays = math.sqrt(_HELD) * np.array([np.cos(angles), np.sin(angles)]).T
-    likely = profile.fallen(rays)[0] < _HELD
+    likely = about.fallen(rays)[0] < _HELD
     if not np.count_nonzero(likely):
         return covariance
     rays = rays[likely]
-    fallen, poses = profile.fallen((rays[:, None] * _REACHES[:, None]).reshape(-1, 2))
-    fallen, wider = fallen.reshape(len(rays), -1), covariance.copy()
-    for away, own in zip(fallen, poses.reshape(*fallen.shape, 4, 4), strict=True):
-        beyond = int(np.argmax(away >= _HELD)) if away.max() >= _HELD else len(away)
-        x = twist_between(T_world_object, own[max(beyond - 1, 0)])
-        inner = np.ix_(free, free)
-        m = float(x[free] @ np.linalg.solve(wider[inner], x[free]))
-        if m > _HELD:
-            wider[inner] += (1 / _HELD - 1 / m) * np.outer(x[free], x[free])
+    fallen, poses = about.fallen((rays[:, None] * _REACHES[:, None]).reshape(-1, 2))
+    away = np.append(fallen.reshape(len(rays), -1), np.full((len(rays), 1), np.inf), axis=1)
+    last = np.maximum(np.argmax(away >= _HELD, axis=1) - 1, 0)
+    ends = poses.reshape(len(rays), -1, 4, 4)[np.arange(len(rays)), last]
+    wider, inner = covariance.copy(), np.ix_(free, free)
+    inverse = inverted(wider[inner])
+    for x in twist_between(T_world_object, ends)[:, free]:
+        by = inverse @ x
+        if (m := float(x @ by)) > _HELD:
+            wider[inner] += (1 / _HELD - 1 / m) * np.outer(x, x)
+            inverse -= (1 / m - _HELD / m**2) * np.outer(by, by)  # Sherman and Morrison
     return wider
 
 
@@ -89,16 +94,15 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
 
 
 @dataclass(frozen=True)
-class _Profile:
-    """The likelihood by two turns, with all else as is likeliest then."""
+class _Turns:
+    """The likelihood about a pose: a term of steps along axes, the first two of which turn it."""
 
     T_world_object: Floats
     seen: Matches
-    weights: Floats  # (R,) of the offsets, R = 2 L N
+    roots: Floats  # (R,) of the weights of offsets, R = 2 L N
     projection: BodyProjection
-    plane: Floats  # (6, 2) twists by the two turns, each of one standard deviation
-    rest: Floats  # (6, k - 2) by all other directions
-    curvature: Floats  # (2, 2) of the likelihood at the pose, of noise that is known
+    axes: Floats  # (6, k) twists of a standard deviation each
+    curvature: Floats  # (2, 2) of −2 ln p by the two turns at the pose, of noise that is known
 
     @classmethod
     def about(
@@ -109,48 +113,43 @@ class _Profile:
         variances: Floats,
         projection: BodyProjection,
         free: Mask,
-    ) -> _Profile | None:
-        """Of the turns that are least known; None where none is unsure enough to matter."""
+    ) -> _Turns | None:
+        """By the turns that are least known; None where none is unsure enough to matter."""
         inner = np.ix_(free, free)
         scale = np.sqrt(np.maximum(covariance[inner].diagonal(), 1e-300))
         values, vectors = np.linalg.eigh(covariance[inner] / np.outer(scale, scale))
-        roots = np.zeros((6, len(scale)))
-        roots[free] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-12))
-        _, turns, axes = np.linalg.svd(roots[3:])
+        deviations = np.zeros((6, len(scale)))
+        deviations[free] = scale[:, None] * vectors * np.sqrt(np.maximum(values, 1e-12))
+        _, turns, across = np.linalg.svd(deviations[3:])
         if not turns[0] > _LEAST_TURN or len(scale) < 3:
             return None
-        weights = (seen.shares / (variances[:, None] + seen.extra)).ravel().repeat(2)
-        by_axis = roots @ axes.T
-        J = seen.J.reshape(-1, 6) @ by_axis
-        H = J.T @ (weights[:, None] * J)
+        axes = deviations @ across.T
+        roots = np.sqrt(seen.shares / (variances[:, None] + seen.extra)).ravel().repeat(2)
+        J = roots[:, None] * (seen.J.reshape(-1, 6) @ axes)
+        H = J.T @ J
         curvature = H[:2, :2] - H[:2, 2:] @ np.linalg.pinv(H[2:, 2:]) @ H[2:, :2]
-        given = T_world_object, seen, weights, projection
-        return cls(*given, by_axis[:, :2], by_axis[:, 2:], curvature)
+        return cls(T_world_object, seen, roots, projection, axes, curvature)
 
     def fallen(self, turns: Floats) -> tuple[Floats, Floats]:
         """By how much −2 ln p falls (K,) at turns (K, 2), in deviations, and the poses (K, 4, 4).
 
         Of noise as the covariance has it, which is not known as well as the curvature has it.
         """
-        poses = perturb(self.T_world_object, turns @ self.plane.T)
-        for _ in range(2):
-            r, J = self._at(poses)
-            by_rest = J @ self.rest
-            rows = (self.weights[:, None] * by_rest).swapaxes(1, 2)
-            # out of view nothing else holds the rest
-            information = rows @ by_rest + 1e-6 * np.eye(by_rest.shape[2])
-            moved = np.linalg.solve(information, rows @ r[..., None])[..., 0]
-            poses = perturb(poses, moved @ self.rest.T)
-        here = self._at(self.T_world_object[None])[0]
-        fallen = self._at(poses)[0] ** 2 @ self.weights - here**2 @ self.weights
+        rest = np.arange(self.axes.shape[1]) > 1
+        begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
+        ends = ascend(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _TWICE)
+        here = self.linearise(self.T_world_object[None]).value
         known = np.vecdot(turns @ self.curvature, turns)
-        wide = np.linalg.norm(turns @ self.plane[3:].T, axis=1) > _WIDEST_TURN
-        return np.where(wide, np.inf, fallen * (np.vecdot(turns, turns) / known)), poses
+        fallen = 2 * (here - ends.values) * (np.vecdot(turns, turns) / known)
+        wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
+        return np.where(wide, np.inf, fallen), ends.states
 
-    def _at(self, poses: Floats) -> tuple[Floats, Floats]:
-        """Offsets (K, R) from what is met, in σ_ε, and Jacobians (K, R, 6) of the places."""
-        at, seen = self.projection.project(poses), self.seen
-        sigmas = seen.sigmas[:, None, None, None]
-        r = (seen.places - at.y.swapaxes(0, 1)) / sigmas[:, 0] + seen.offsets
-        J = (at.J / sigmas[..., None]).swapaxes(0, 1)
-        return r.reshape(len(poses), -1), J.reshape(len(poses), -1, 6)
+    def linearise(self, states: Floats) -> Quadratic:
+        """Models of ln p at poses (K, 4, 4), by offsets from what the pose itself meets."""
+        at, seen = self.projection.project(states), self.seen
+        sigmas = seen.sigmas[:, None, None]
+        r = (seen.places - at.y.swapaxes(0, 1)) / sigmas + seen.offsets
+        J = (at.J.swapaxes(0, 1) / sigmas[..., None]).reshape(len(states), -1, 6)
+        return squares_of(
+            self.roots * r.reshape(len(states), -1), self.roots[:, None] * (J @ self.axes)
+        )

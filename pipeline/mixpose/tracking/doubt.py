@@ -174,7 +174,7 @@ def _told(data: Frame, best: ScoredPose) -> tuple[float, Shape | None]:
         alone = _evidence(data.alone(), Start(T, left_out=best.left_out))
     if alone > -rules.acceptance.log_doubt:
         return alone, None
-    before = track.shape if not track.misses and data.goes_on(T) else None
+    before = track.shape if not track.misses and data.is_expected(T) else None
     model = rules.judgement.noise
     shape = shape_shown(best.used, best.variances, data.body, T, alone, model, before)
     return shape.log_odds(data.body.radius, model), shape

@@ -173,16 +173,8 @@ class Frame(Setup):
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
 
-    def goes_on(self, T_world_object: Floats) -> bool:
-        """Whether a pose is where the best one before puts it, rather than anywhere."""
-        there = self._prior(T_world_object, self.predictions[:1], self.track.misses)
-        return there[0] > self.anywhere[0]
-
     def is_expected(self, T_world_object: Floats) -> bool:
-        """Whether a pose is as likely, before the frame, as one that is not in doubt.
-
-        By the likeliest; where nothing was seen before, any.
-        """
+        """Whether the frames before make a pose a thousandth as likely as the best, or more."""
         if not self.predictions:
             return True
         there = self.prior(self.predictions[0].T_world_object)[0] - self.prior(T_world_object)[0]

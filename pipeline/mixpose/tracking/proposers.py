@@ -5,6 +5,7 @@ A proposer yields starts for a frame, given the poses found so far, and says its
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -69,9 +70,11 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
-    # or misses some where the frames before let nobody expect it
+    # or meets some far off, or misses some where the frames before let nobody expect it
     is_far |= any(
-        one.coverage < 1 and not frame.is_expected(one.T_world_object) for one in ranked[:1]
+        _close(frame, one) < rules.acceptance.convincing
+        or (one.coverage < 1 and not frame.is_expected(one.T_world_object))
+        for one in ranked[:1]
     )
     # or is far less evident than the one before, by what it meets
     is_far |= any(one.gained < rules.proposals.fallen * track.gained for one in ranked[:1])
@@ -85,6 +88,13 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
+
+
+def _close(frame: Frame, pose: ScoredPose) -> float:
+    """Share of what is met that is met as closely as the noise of the frames before has it."""
+    errors, used = frame.rules.judgement.noise.errors, pose.used
+    off = errors.are_off(used, pose.variances[:, None] + used.extra)
+    return 1 - float(used.shares[off].sum()) / max(float(used.shares.sum()), 1e-12)
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -282,21 +292,25 @@ def _near_any(frame: Frame, poses: Floats) -> Floats:
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The pose tilted the other way, where one camera alone meets what is nearly flat."""
+    """The pose tilted the other way, where cameras from one side meet what is nearly flat."""
     body, views, T = frame.body, frame.views, best.T_world_object
     if len(views) > 1:
         least, seen = frame.rules.acceptance.agreeing, best.matches
         met = {name for name, share in zip(seen.names, seen.coverage) if share >= least}
         views = [view for view in views if view.name in met]
-    if len(views) != 1 or views[0].sensor.dimension != 2:
+    if not views or any(view.sensor.dimension != 2 for view in views):
         return
     some, flat = frozenset(range(len(body))), frame.rules.look_alikes.flat
     # a wrong tilt may be why little of a flat body is met
     if thickness(body) > flat and is_pointlike(body):
         some = met_features(best)
     if len(some) >= 3 and thickness(body, some) <= flat:
-        middle = body.means[sorted(some)].mean(axis=0)
-        away = views[0].sensor.towards(transform(T, middle[None]))[0]
+        middle = transform(T, body.means[sorted(some)].mean(axis=0, keepdims=True))
+        sights = np.array([view.sensor.towards(middle)[0] for view in views])
+        sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+        away = sights.mean(axis=0)
+        if np.linalg.norm(away) < math.cos(frame.rules.look_alikes.aside):
+            return
         wide = frame.close * frame.rules.proposals.narrowing
         tilted = other_tilt(body, some, T, away)
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))

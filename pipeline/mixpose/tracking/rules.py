@@ -49,6 +49,7 @@ class LookAlikeRules:
     )
     fewer: float = constant(1.5, "features fewer that a rival may meet: each is e⁴ in odds, or so")
     flat: float = constant(0.15, "thickness by smaller width below which what is met may be tilted")
+    aside: float = constant(0.25, "rad of lines of sight from their middle: wider ones tell a tilt")
     by_chance: float = constant(14.0, "coordinates beyond six met by chance: 5 points, 2 cameras")
 
 
