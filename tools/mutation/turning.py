@@ -84,7 +84,7 @@ MUTANTS = (
     Mutant(
         "tracking-unexpected-poses-convince",
         "tracking/proposers.py",
-        "one.coverage < 1 and not frame.is_expected(one.T_world_object)",
+        "close * one.coverage < 1 and not frame.is_expected(one.T_world_object)",
         "False",
         "a pose that jumps where nobody expects it is believed though it misses features",
         (_PROPOSERS,),
@@ -92,8 +92,8 @@ MUTANTS = (
     Mutant(
         "tracking-far-off-is-met",
         "tracking/proposers.py",
-        "_close(frame, one) < rules.acceptance.convincing",
-        "_close(frame, one) < 0",
+        "(close := _close(frame, one)) < rules.acceptance.convincing",
+        "(close := _close(frame, one)) < 0",
         "a ring is believed a seventh of a turn off, where it meets half of its points by chance",
         (_PROPOSERS,),
     ),

@@ -70,10 +70,10 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     is_new = track.believed < rules.proposals.believed
     # what one sensor of several is off by is left out already
     is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
-    # or meets some far off, or misses some where the frames before let nobody expect it
+    # or meets much of it far off; or anything, where the frames before let nobody expect it
     is_far |= any(
-        _close(frame, one) < rules.acceptance.convincing
-        or (one.coverage < 1 and not frame.is_expected(one.T_world_object))
+        (close := _close(frame, one)) < rules.acceptance.convincing
+        or (close * one.coverage < 1 and not frame.is_expected(one.T_world_object))
         for one in ranked[:1]
     )
     # or is far less evident than the one before, by what it meets
@@ -93,7 +93,9 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
 def _close(frame: Frame, pose: ScoredPose) -> float:
     """Share of what is met that is met as closely as the noise of the frames before has it."""
     errors, used = frame.rules.judgement.noise.errors, pose.used
-    off = errors.are_off(used, pose.variances[:, None] + used.extra)
+    before = dict(zip((view.name for view in frame.views), frame.variances, strict=True))
+    variances = np.minimum([before[name] for name in used.names], pose.variances)
+    off = errors.are_off(used, variances[:, None] + used.extra)
     return 1 - float(used.shares[off].sum()) / max(float(used.shares.sum()), 1e-12)
 
 
