@@ -94,7 +94,7 @@ def _close(frame: Frame, pose: ScoredPose) -> float:
     """Share of what is met that is met as closely as the noise of the frames before has it."""
     errors, used = frame.rules.judgement.noise.errors, pose.used
     before = dict(zip((view.name for view in frame.views), frame.variances, strict=True))
-    variances = np.minimum([before[name] for name in used.names], pose.variances)
+    variances = np.minimum([before.get(name, np.inf) for name in used.names], pose.variances)
     off = errors.are_off(used, variances[:, None] + used.extra)
     return 1 - float(used.shares[off].sum()) / max(float(used.shares.sum()), 1e-12)
 
