@@ -240,6 +240,9 @@ def test_what_is_met_far_off_in_part_is_looked_for_elsewhere(
         views = detect(pinhole_cameras, body, TRUTH, noise=0.1, seed=frame)
         track, _ = tracker.advance(track, frame, None, views)
     data = tracker.data(track, 6, None, detect(pinhole_cameras, body, TRUTH, noise=0.1, seed=9))
+    # after a jump, say, it may be turned in any way
+    anyhow = np.repeat([data.predictions[0].uncertainty[0], np.pi], 3)
+    data = replace(data, predictions=[replace(data.predictions[0], uncertainty=anyhow)])
     likelihood = likelihood_of(data)
     doubtful = []
     for turned in (0, 2):
@@ -247,6 +250,7 @@ def test_what_is_met_far_off_in_part_is_looked_for_elsewhere(
         start = Start(TRUTH @ turn, data.close)
         judged = likelihood.judge(likelihood.fit(start), start)
         assert judged.coverage > 0.9
+        assert data.is_expected(judged.T_world_object)
         doubtful.append(is_doubtful(data, [judged]))
     assert doubtful == [False, True]
 

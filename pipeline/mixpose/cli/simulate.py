@@ -49,8 +49,8 @@ def simulate_session(request: SimulateRequest) -> None:
             progress=lambda done: moved(completed=done),
         )
     if unused:
-        kinds = {one.name: one.metadata for one in fields(SimulateRequest)}
-        told = [next(iter(kinds[name]["names"]), f"--{name.replace('_', '-')}") for name in unused]
+        typed = {one.name: one.metadata.get("names", ()) for one in fields(SimulateRequest)}
+        told = [next(iter(typed[name]), f"--{name.replace('_', '-')}") for name in unused]
         warn(f"{', '.join(told)}: no sensor or body of this session has what that is about")
     count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(

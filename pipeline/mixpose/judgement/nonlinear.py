@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -44,7 +45,7 @@ def with_likely_turns(
     likeliest then.  Where a twist x at the edge of what is likely is m > h squared deviations away,
     h at the ellipsoid's edge, the covariance grows by (1/h − 1/m) x xᵀ, which puts it there.
     """
-    if not _LEAST_TURN**2 < np.trace(covariance[3:, 3:]) < math.inf:
+    if not _is_wide(covariance):
         return covariance
     about = _Turns.about(covariance, T_world_object, seen, variances, projection, free)
     if about is None:
@@ -77,10 +78,9 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
     6 σ³ l: 2.7 deviations of 4 σ⁴ l² and 5 σ⁶ l², which an ellipsoid of six dimensions (4.7) still
     holds.  Turns about two axes at once are as wide together: half as much of their product.
     """
-    turns = covariance[3:, 3:]
-    if not _LEAST_TURN**2 < np.trace(turns) < math.inf:
+    if not _is_wide(covariance):
         return covariance
-    variances, columns = np.linalg.eigh(turns)
+    variances, columns = np.linalg.eigh(covariance[3:, 3:])
     axes, lever = columns.T, -T_world_object[:3, :3] @ points.mean(axis=0)
     along = np.cross(axes, lever)
     twice = np.cross(axes[:, None], along)  # about an axis, then about another one
@@ -91,6 +91,11 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
     back = math.sqrt(5) * deviations[:, None] ** 3 * along
     wider[:3, :3] += back.T @ back
     return wider
+
+
+def _is_wide(covariance: Floats) -> bool:
+    """Whether turns are so unsure that they are not linear; not where nobody knows them."""
+    return bool(_LEAST_TURN**2 < np.trace(covariance[3:, 3:]) < math.inf)
 
 
 @dataclass(frozen=True)
@@ -138,11 +143,15 @@ class _Turns:
         rest = np.arange(self.axes.shape[1]) > 1
         begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
         ends = ascend(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _TWICE)
-        here = self.linearise(self.T_world_object[None]).value
         known = np.vecdot(turns @ self.curvature, turns)
-        fallen = 2 * (here - ends.values) * (np.vecdot(turns, turns) / known)
+        fallen = 2 * (self._here - ends.values) * (np.vecdot(turns, turns) / known)
         wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
         return np.where(wide, np.inf, fallen), ends.states
+
+    @cached_property
+    def _here(self) -> Floats:
+        """The value (1,) of ln p at the pose."""
+        return self.linearise(self.T_world_object[None]).value
 
     def linearise(self, states: Floats) -> Quadratic:
         """Models of ln p at poses (K, 4, 4), by offsets from what the pose itself meets."""

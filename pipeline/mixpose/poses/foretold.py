@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -40,8 +40,7 @@ def truth_of_then(truth: PoseFile, poses: PoseFile) -> PoseFile:
     moved: dict[int, PoseLine] = {}
     for _, each in groupby(by_body, key=_label):
         lines = sorted(each, key=lambda line: line.frame)
-        _check(truth, lines)
-        moved |= _moved(lines, ahead_s)
+        moved |= _moved(lines, _times(truth, lines), ahead_s)
     return replace(truth, poses=tuple(moved.get(id(line), line) for line in truth.poses))
 
 
@@ -49,24 +48,26 @@ def _label(line: PoseLine) -> str:
     return line.label
 
 
-def _check(truth: PoseFile, lines: Sequence[PoseLine]) -> None:
-    """Refuse a truth that does not say where a body is between its frames."""
+def _times(truth: PoseFile, lines: Sequence[PoseLine]) -> Floats:
+    """When lines of a body are of, one later than the other: else nobody knows what is between."""
     told = "; poses that were foretold (ahead_s) are held against the truth between its frames"
-    for before, line in zip([None, *lines[:-1]], lines, strict=True):
+    for line in lines:
         if line.time_s is None:
             raise RecordingError(f"{truth.path}:{line.line}: time_s is missing{told}")
-        if before is None or before.time_s is None:
-            continue
-        if before.frame == line.frame or before.time_s >= line.time_s:
+    times = np.array([line.time_s for line in lines], dtype=np.float64)
+    for (before, line), step in zip(pairwise(lines), np.diff(times), strict=True):
+        if before.frame == line.frame or step <= 0:
             raise RecordingError(
                 f"{truth.path}:{line.line}: frame {line.frame} of {line.label!r} is not later than "
                 f"line {before.line}{told}"
             )
+    return times
 
 
-def _moved(lines: Sequence[PoseLine], ahead_s: Mapping[int, float]) -> dict[int, PoseLine]:
+def _moved(
+    lines: Sequence[PoseLine], times: Floats, ahead_s: Mapping[int, float]
+) -> dict[int, PoseLine]:
     """Lines of a body at later moments, by the `id` of what they stand for."""
-    times = np.array([line.time_s for line in lines], dtype=np.float64)
     ahead = np.array([ahead_s.get(line.frame, 0.0) for line in lines])
     wanted = times + ahead
     poses = np.stack([line.T_world_object for line in lines if line.T_world_object is not None])

@@ -88,7 +88,7 @@ def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, ke
 
 
 def _names(table: ObjectTable, markers: Markers | None) -> tuple[str, ...]:
-    """What people call the points; nothing where a file gives some no name."""
+    """What people call the points; nothing where a file gives some no name, or two the same."""
     given = markers.names if markers is not None and table.names is None else table.names or ()
     names = tuple(" ".join(name.split()) for name in given)
     count = 0 if markers is None else len(markers.points)

@@ -20,7 +20,7 @@ Output: TypeAlias = Literal["images", "profiles", "pixels", "lengths"]
 
 Rule: TypeAlias = tuple[float, float, bool, str]
 
-# squares of larger numbers, and quotients of smaller ones, cannot be reckoned with
+# squares of larger numbers, and quotients of smaller ones, overflow
 _LARGEST, _SMALLEST = 1e12, 1e-12
 _MOST_COMPANIONS = 100
 
@@ -59,9 +59,8 @@ class SimulationOptions:
     fps: float | None = _option(None, _POSITIVE)  # None takes that of the session, or else 25
     # grey level without features; below 0 the camera clips most of its noise at black
     background: float = _option(10.0, _ANY, _IMAGES)
-    noise: float = _option(
-        2.0, _NOT_NEGATIVE, _IMAGES
-    )  # standard deviation of every pixel, grey levels
+    # standard deviation of every pixel, grey levels
+    noise: float = _option(2.0, _NOT_NEGATIVE, _IMAGES)
     shot_noise: float = _option(0.02, _NOT_NEGATIVE, _IMAGES)  # variance per grey level of signal
     # standard deviation of a feature's spot, px; None is `spot_sigma` of the sensor's [extract]
     # where that is given, else 1.6
@@ -113,12 +112,10 @@ class SimulationOptions:
     occluder: int = _option(0, _FEW, _CAMERAS)  # dark bars that swing before it
     # brightness of mirror images in a table below the body, as a share; 0 without one
     mirror: float = _option(0.0, _PROBABILITY, _CAMERAS)
-    jpeg: int | None = _option(
-        None, _QUALITY, _IMAGES
-    )  # of the compression that images went through
-    bayer: bool = _option(
-        False, None, _IMAGES
-    )  # images come from a colour sensor, its colours interpolated
+    # of the compression that images went through
+    jpeg: int | None = _option(None, _QUALITY, _IMAGES)
+    # images come from a colour sensor, its colours interpolated
+    bayer: bool = _option(False, None, _IMAGES)
     # by which the last camera was turned after its calibration
     turned_camera_deg: float = _option(0.0, _ANY, _CAMERAS)
     away_from: int | None = _option(None, _COUNT)  # frames after which the body is gone

@@ -68,16 +68,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     if ranked and (odds := ranked[0].elsewhere) is not None:
         return odds > rules.acceptance.log_doubt
     is_new = track.believed < rules.proposals.believed
-    # what one sensor of several is off by is left out already
-    is_far = is_new and any(one.residual_ratio > 1 and not one.left_out for one in ranked[:1])
-    # or meets much of it far off; or anything, where the frames before let nobody expect it
-    is_far |= any(
-        (close := _close(frame, one)) < rules.acceptance.convincing
-        or (close * one.coverage < 1 and not frame.is_expected(one.T_world_object))
-        for one in ranked[:1]
-    )
-    # or is far less evident than the one before, by what it meets
-    is_far |= any(one.gained < rules.proposals.fallen * track.gained for one in ranked[:1])
+    is_far = bool(ranked) and _is_far(frame, ranked[0], is_new=is_new)
     if frame.first_is(frame.trusted, ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
@@ -88,6 +79,25 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
+
+
+def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
+    """Whether a pose meets the body farther off, or less evidently, than one that convinces.
+
+    Of a track that `is_new`, by more than chance; what one sensor of several is off by is left out
+    already.
+    """
+    rules = frame.rules
+    if is_new and pose.residual_ratio > 1 and not pose.left_out:
+        return True
+    if pose.gained < rules.proposals.fallen * frame.track.gained:
+        return True
+    # much of it; or anything, where the frames before let nobody expect it
+    close = _close(frame, pose)
+    is_all = close * pose.coverage >= 1
+    return close < rules.acceptance.convincing or not (
+        is_all or frame.is_expected(pose.T_world_object)
+    )
 
 
 def _close(frame: Frame, pose: ScoredPose) -> float:
