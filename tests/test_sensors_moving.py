@@ -94,3 +94,8 @@ def test_rows_are_read_from_half_a_readout_before_the_delay_to_half_after() -> N
     ends = np.array([[0.0, 0.0], [0.0, 511.5], [0.0, 1023.0]])
     times = moments(CAMERAS["pinhole"], ends, LATE, READOUT)
     np.testing.assert_allclose(times, LATE + READOUT * np.array([-0.5, 0, 0.5]))
+
+
+def test_of_no_points_a_rolling_camera_sees_none() -> None:
+    y, seen = in_motion(CAMERAS["pinhole"], MOTION, LATE, READOUT).project(np.zeros((0, 3)))
+    assert (y.shape, seen.shape) == ((0, 2), (0,))

@@ -26,7 +26,7 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.proposers import PROPOSERS, is_doubtful, look_alikes
+from mixpose.tracking.proposers import PROPOSERS, is_doubtful, look_alikes, met_features
 from mixpose.tracking.refinements import REFINEMENTS
 
 Floats = NDArray[np.float64]
@@ -336,3 +336,18 @@ def test_four_corners_of_one_side_of_a_body_may_be_tilted_the_other_way() -> Non
     tilts = [rotation_angle_deg(each.T_world_object, T) for each in starts]
     # turned by 0.3 rad against the line of sight, and so by as much the other way
     assert np.isclose(tilts, np.degrees(0.6), atol=2.0).any()
+
+
+def test_a_marker_that_is_met_far_off_is_none_that_tells_a_body_from_another(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    """A body like this one but for a marker, 3 mm aside: a spot no farther off than C reaches."""
+    other = EIGHT.means.copy()
+    other[3] += [3.0, 0.0, 0.0]
+    seen = Body("other", tuple(map(PointFeature, other)))
+    views = detect(pinhole_cameras, seen, TRUTH, noise=0.1)
+    tracker = Tracker.create(EIGHT, EstimatorOptions())
+    data = tracker.data(tracker.begin(), 0, None, views)
+    best = tracker.explain(data)[0]
+    assert best.matches.met_by[3] > 0
+    assert met_features(data, best) == frozenset(range(8)) - {3}

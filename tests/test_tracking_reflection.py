@@ -14,6 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.doubt import of_reflection
 from mixpose.tracking.mirrors import MIRRORED as MIRROR_IMAGE
 
 Floats = NDArray[np.float64]
@@ -162,3 +163,16 @@ def test_what_frames_say_against_a_mirrored_body_holds_in_those_that_say_nothing
     for known, share in ((track, 0.0), (doubted, 1 / (1 + np.exp(-odds)))):
         _, estimate = tracker.advance(known, 5, None, views)
         assert estimate.confidence == pytest.approx(1 - share, abs=2e-5)
+
+
+def test_of_a_pose_that_meets_nothing_as_sensors_stand_no_odds_of_a_mirror_are_asked(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    """As where rows are read while a body moves fast: by itself, as if at rest, it meets none."""
+    views = detect(pinhole_cameras[:1], BODY, TRUTH, noise=0.2, hidden=1)
+    tracker = Tracker.create(BODY, EstimatorOptions())
+    data = tracker.data(tracker.begin(), 0, None, views)
+    best = tracker.explain(data)[0]
+    away = replace(best, T_world_object=perturb(TRUTH, np.array([40.0, 0, 0, 0, 0, 0])))
+    assert of_reflection(data, best).log_odds != -np.inf
+    assert not np.isnan(of_reflection(data, away).log_odds)

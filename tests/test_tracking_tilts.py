@@ -12,6 +12,7 @@ from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, twist_between
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.tracker import judged_again
 
 CAMERA = PinholeCamera(
     np.array([[900.0, 0, 400], [0, 900.0, 300], [0, 0, 1]]), resolution=(800, 600)
@@ -30,10 +31,15 @@ def swinging(seed: int) -> Floats:
     return np.stack([from_rotation_vector(w, x) for w, x in zip(turns, places, strict=True)])
 
 
+def plate(seed: int) -> Body:
+    """Six points in 11 mm."""
+    points = np.random.default_rng(100 + seed).uniform(-5.5, 5.5, (6, 3)) * [1.0, 1.0, 0.0]
+    return Body("plate", tuple(map(PointFeature, points)))
+
+
 def followed(seed: int) -> tuple[list[Estimate], Floats]:
     """Estimates of a body of six points in 11 mm, 50 px wide, and the true poses."""
-    points = np.random.default_rng(100 + seed).uniform(-5.5, 5.5, (6, 3)) * [1.0, 1.0, 0.0]
-    body = Body("plate", tuple(map(PointFeature, points)))
+    body = plate(seed)
     tracker, truth = Tracker.about_centre(body, EstimatorOptions()), swinging(seed)
     track, found = tracker.begin(), []
     for frame, T in enumerate(truth):
@@ -62,6 +68,23 @@ def test_the_right_tilt_is_told_where_another_one_is() -> None:
             off = [float(rotation_angle_deg(T, each)) for each in poses]
             told += min(off, default=180.0) < 20.0
     assert told >= 0.97 * frames
+
+
+def test_a_tilt_that_moved_with_another_is_as_likely_when_it_is_judged_again() -> None:
+    """Other bodies take detections of a frame, and spots are weighed by size: poses are again."""
+    tracker, truth = Tracker.about_centre(plate(0), EstimatorOptions()), swinging(0)
+    track, asked = tracker.begin(), 0
+    for frame, T in enumerate(truth):
+        views = detect([CAMERA], plate(0), T, noise=0.15, seed=frame)
+        data = tracker.data(track, frame, frame / 30, views)
+        ranked = tracker.explain(data)
+        again = judged_again(data, ranked)
+        for one, other in zip(ranked, again, strict=True):
+            if one.T_moved is not None:
+                asked += 1
+                assert other.log_density == pytest.approx(one.log_density, abs=0.1)
+        track, _ = tracker.advance(track, frame, frame / 30, views)
+    assert asked > 5
 
 
 def off(one: Estimate, T_true: Floats) -> float:

@@ -143,6 +143,22 @@ _SEARCH = (
         "after = SearchState(k, 0)",
         "a limited search tries the same guesses in every frame",
     ),
+    Mutant(
+        "search-points-that-rays-fix-are-as-vague-as-gates",
+        "search/from_points.py",
+        "np.clip(budget.by_gap * apart, budget.least_off, 1.0)",
+        "np.clip(budget.by_gap * apart, 1.0, 1.0)",
+        "of small bodies before cameras side by side no point is within the body",
+        ("test_search_triangulation.py",),
+    ),
+    Mutant(
+        "search-points-as-exact-as-rays-happen-to-meet",
+        "search/from_points.py",
+        "np.clip(budget.by_gap * apart, budget.least_off, 1.0)",
+        "np.clip(budget.by_gap * apart, 0.0, 1.0)",
+        "where two rays meet by luck their point is taken for exact, and its body is not found",
+        ("test_search_triangulation.py",),
+    ),
 )
 
 MUTANTS = (*_SEARCH_EVIDENCE, *_SEARCH)

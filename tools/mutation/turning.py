@@ -169,4 +169,20 @@ MUTANTS = (
         "options that this session has nothing of are taken in silence",
         (_OPTIONS,),
     ),
+    Mutant(
+        "tracking-tilts-judged-again-as-if-nobody-followed-them",
+        "tracking/tracker.py",
+        "start = Start(one.T_world_object, wide, left_out=one.left_out, T_moved=one.T_moved)",
+        "start = Start(one.T_world_object, wide, left_out=one.left_out)",
+        "of two tilts that nothing tells apart the followed one is ok, once another body is there",
+        (_TILTS,),
+    ),
+    Mutant(
+        "tracking-what-is-met-far-off-tells-bodies-apart",
+        "tracking/proposers.py",
+        "~errors.are_off(used, variances[:, None] + used.extra))",
+        "~errors.are_off(used, 100 + used.extra))",
+        "a body is taken for its neighbour, as some spot is where a marker of it would be",
+        (_PROPOSERS,),
+    ),
 )

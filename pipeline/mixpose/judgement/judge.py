@@ -76,6 +76,7 @@ class ScoredPose:
     by_count: float = 0.0  # by how much its evidence is larger as it pays by count, not by volume
     proposer: str = ""  # where the pose came from
     blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted
+    T_moved: Floats | None = None  # (4, 4) the pose by whose prior it was judged, if not its own
 
     @cached_property
     def used(self) -> Matches:

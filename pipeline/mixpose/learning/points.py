@@ -84,7 +84,7 @@ def _meetings(rays: dict[int, Rays], gates: Floats) -> tuple[Floats, Indices, Fl
     index = np.array(sorted(rays), dtype=np.intp)
     if len(lines) < 2:
         return np.zeros((0, 3)), np.zeros((0, len(gates)), dtype=np.intp), np.zeros(0)
-    met = triangulate(lines, gates[index].tolist(), RULES.min_sine)
+    met = triangulate(lines, gates[index].tolist())
     detections = np.full((len(met.points), len(gates)), -1, dtype=np.intp)
     rows = np.arange(len(met.points))
     for side in (0, 1):

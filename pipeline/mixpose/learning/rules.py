@@ -18,7 +18,6 @@ class LearningRules:
     )
     quietest: float = constant(0.02, "of σ_ε: less noise than that is not believed")
     probes: int = constant(60, "frames that the noise of detections is told by")
-    min_sine: float = constant(0.02, "of the angle between rays: less fixes no depth; as in search")
     still_share: float = constant(
         0.5, "of the frames in which something is at one place of the world: it does not move"
     )

@@ -84,7 +84,7 @@ class SeenTogether:
         if len(self._cameras) < 2:
             return None
         _, rays, reaches = zip(*self._cameras, strict=True)
-        return triangulate(rays, reaches, self.budget.min_sine)
+        return triangulate(rays, reaches, self.budget)
 
     @cached_property
     def images(self) -> list[LabelImage]:

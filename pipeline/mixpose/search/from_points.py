@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
-from mixpose.search.problem import SearchProblem
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem
 from mixpose.search.three_points import (
     FIRST,
     SECOND,
@@ -54,7 +54,7 @@ def generators_of(problem: SearchProblem) -> list[Guesses]:
     generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
     if len(rays) < 2:
         return generators
-    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
+    points = by_promise(problem, triangulate(rays, reaches, budget))
     crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
     # of the points tried in a crowd, and of the rays near them, few are right
     place = len(generators) if crowded else 0
@@ -63,22 +63,23 @@ def generators_of(problem: SearchProblem) -> list[Guesses]:
 
 
 def triangulate(
-    rays: Sequence[Rays], gates: Sequence[float], min_sine: float
+    rays: Sequence[Rays], gates: Sequence[float], budget: SearchBudget = THOROUGH
 ) -> TriangulatedPoints:
     """All pairs of rays of two sensors or more that meet within the error of the detections.
 
-    That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
+    That is a gate in px, one per sensor, which most are far from erring by: rays that meet more
+    closely put a point more exactly.
     """
     meetings = [
         met._replace(sensors=np.broadcast_to([first, second], met.rays.shape))
         for first, second in combinations(range(len(rays)), 2)
-        for met in _meetings(rays[first], rays[second], (gates[first], gates[second]), min_sine)
+        for met in _meetings(rays[first], rays[second], (gates[first], gates[second]), budget)
     ]
     return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
 
 
 def _meetings(
-    a: Rays, b: Rays, gates: tuple[float, float], min_sine: float
+    a: Rays, b: Rays, gates: tuple[float, float], budget: SearchBudget
 ) -> Iterator[TriangulatedPoints]:
     """Points where rays of sensors 0 and 1 meet, for some rays of the first after the other.
 
@@ -103,7 +104,7 @@ def _meetings(
         tolerance = np.hypot(
             gates[0] * (a.offset + a.slope * np.abs(s)), gates[1] * (b.offset + b.slope * np.abs(t))
         )
-        good = (gap <= tolerance) & (sine2 > min_sine**2)
+        good = (gap <= tolerance) & (sine2 > budget.min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
         if a.cloud is not None and a.cloud is b.cloud:  # which belong together is known
             good &= np.eye(len(u), len(b), k=start, dtype=np.bool_)
@@ -111,9 +112,10 @@ def _meetings(
         i, j = pairs.T
         on_a = a.origins[i] + s[good][:, None] * a.directions[i]
         on_b = b.origins[j] + t[good][:, None] * b.directions[j]
-        points, fixed = (on_a + on_b) / 2, allowed / np.sqrt(sine2[good])
+        apart = gap[good] / allowed
+        off = np.clip(budget.by_gap * apart, budget.least_off, 1.0) * allowed / np.sqrt(sine2[good])
         sensors = np.broadcast_to([0, 1], pairs.shape)
-        yield TriangulatedPoints(points, fixed, gap[good] / allowed, sensors, pairs)
+        yield TriangulatedPoints((on_a + on_b) / 2, off, apart, sensors, pairs)
 
 
 def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:

@@ -33,6 +33,13 @@ class SearchBudget:
     max_triples: int = constant(40_000, "of points, all of the most promising: they take 0.1 s")
     max_problems: int = constant(250_000, "triples of rays as triples of features, of one camera")
     min_sine: float = constant(0.02, "of angles between rays or sides: less fixes no depth or turn")
+    by_gap: float = constant(
+        4.0,
+        "gaps of two rays that a point may be off: of ratios of two like errors 6 in 7 are less",
+    )
+    least_off: float = constant(
+        0.3, "of what gates allow that it may be off at least: three times 0.3 σ_ε, as spots err by"
+    )
     crowded: float = constant(
         2.0, "detections for a feature above which those drawn far apart are right 2.7 times less"
     )

@@ -156,8 +156,9 @@ class RollingBatch:
         The moment t solves t = moment of the row that is seen at t.  One Newton step from the
         middle row leaves the square of the share of the readout in which the image moves a row.
         """
-        per_row, n = self._per_row, points_world.shape[-2]
-        x = points_world.reshape(-1, n, 3).transpose(2, 0, 1)
+        per_row = self._per_row
+        each = points_world if points_world.ndim > 2 else points_world[None]
+        x = each.transpose(2, 0, 1)
         arms = np.subtract(x, self._origin, order="C")
         early = (self._by_arm @ arms.swapaxes(0, 1) + self._of_origin).swapaxes(1, 2)
         y, J, visible = self._still.linearise(early[..., :3])

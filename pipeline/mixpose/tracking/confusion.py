@@ -101,7 +101,7 @@ def _in_place_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[tuple[
     """
     if not (is_pointlike(data.body) and is_pointlike(other.body)):
         return
-    met, sizes, centre = met_features(best), [1.0], np.zeros(3)
+    met, sizes, centre = met_features(data, best), [1.0], np.zeros(3)
     factor = data.body.radius / other.body.radius
     if abs(factor - 1) > 1e-9 and (of_one := _centre_of_one(data, best)) is not None:
         sizes, centre = [1.0, factor], of_one

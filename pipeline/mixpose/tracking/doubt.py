@@ -281,7 +281,10 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool, before: float) -> f
         return near if asked else -math.inf
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
     alone = data.alone()
-    own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
+    own = _evidence(alone, Start(T, left_out=judged.left_out))
+    if own == -math.inf:  # by itself, as where only its motion tells what rows saw, it meets none
+        return near if asked else -math.inf
+    mirror = _mirrored(alone, met >= 0)
     rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
     found = (_evidence(mirror, start) - own for start in starts_at(mirror, rivals))
     return next((odds for odds in found if odds > likely), near if asked else -math.inf)

@@ -20,7 +20,7 @@ from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolera
 from mixpose.density import DRAWING
 from mixpose.fit import blur_schedule, widest_blurs
 from mixpose.judgement import ScoredPose, is_sure
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.search import (
     Candidate,
@@ -102,11 +102,16 @@ def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
 
 def _close(frame: Frame, pose: ScoredPose) -> float:
     """Share of what is met that is met as closely as the noise of the frames before has it."""
+    shares = pose.used.shares
+    return float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
+
+
+def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
+    """Which features (L, N) are met as closely as the noise has it, before the frame and in it."""
     errors, used = frame.rules.judgement.noise.errors, pose.used
     before = dict(zip((view.name for view in frame.views), frame.variances, strict=True))
     variances = np.minimum([before.get(name, np.inf) for name in used.names], pose.variances)
-    off = errors.are_off(used, variances[:, None] + used.extra)
-    return 1 - float(used.shares[off].sum()) / max(float(used.shares.sum()), 1e-12)
+    return np.asarray((used.shares > 0) & ~errors.are_off(used, variances[:, None] + used.extra))
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -240,9 +245,13 @@ def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
     return ""
 
 
-def met_features(judged: ScoredPose) -> frozenset[int]:
-    """Numbers of the features that any sensor meets."""
-    return frozenset(judged.matches.met_by.nonzero()[0].tolist())
+def met_features(frame: Frame, judged: ScoredPose) -> frozenset[int]:
+    """Numbers of the features that any sensor meets, no farther off than errors put them.
+
+    Of those that are farther off, or that only sensors meet which are left out, nobody knows what
+    meets them.
+    """
+    return frozenset(np.flatnonzero(_met_closely(frame, judged).any(axis=0)).tolist())
 
 
 def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
@@ -256,7 +265,7 @@ def congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
     # single ranges do not say what is met
     if not is_pointlike(body) or 1 in best.matches.dimensions.tolist():
         return ()
-    met, rules = met_features(best), frame.rules.look_alikes
+    met, rules = met_features(frame, best), frame.rules.look_alikes
     return like_features(body, met, body, tolerance_of(body, body, rules.alike))
 
 
@@ -315,7 +324,7 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     some, flat = frozenset(range(len(body))), frame.rules.look_alikes.flat
     # a wrong tilt may be why little of a flat body is met
     if thickness(body) > flat and is_pointlike(body):
-        some = met_features(best)
+        some = met_features(frame, best)
     if len(some) >= 3 and thickness(body, some) <= flat:
         middle = transform(T, body.means[sorted(some)].mean(axis=0, keepdims=True))
         sights = np.array([view.sensor.towards(middle)[0] for view in views])

@@ -178,7 +178,12 @@ class Tracker(Setup):
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
             fits.append(fit)
-            judged = replace(likelihood.judge(fit, start), proposer=proposer, blurs=fit.blurs)
+            judged = replace(
+                likelihood.judge(fit, start),
+                proposer=proposer,
+                blurs=fit.blurs,
+                T_moved=start.T_moved,
+            )
             insert(ranked, judged, data.body, data.free, data.rules.acceptance)
             return judged
 
@@ -295,10 +300,13 @@ def judged_again(
     for one in poses if data.views else ():
         is_near = one.log_evidence > poses[0].log_evidence - behind
         wide = data.close if fitted and is_near else None
-        start = Start(one.T_world_object, wide, left_out=one.left_out)
+        start = Start(one.T_world_object, wide, left_out=one.left_out, T_moved=one.T_moved)
         fit = likelihood.fit(start)
         judged = replace(
-            likelihood.judge(fit, start), proposer=one.proposer, blurs=fit.blurs or one.blurs
+            likelihood.judge(fit, start),
+            proposer=one.proposer,
+            blurs=fit.blurs or one.blurs,
+            T_moved=one.T_moved,
         )
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
