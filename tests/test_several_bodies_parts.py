@@ -76,6 +76,25 @@ def test_two_bodies_of_which_only_what_they_share_is_seen_may_have_changed_place
             assert off(estimate, T)[0] < 2.0
 
 
+def test_where_a_body_may_be_the_other_one_that_comes_later_may_be_it_as_well() -> None:
+    """What is known of the first one's place is known of whichever of the two it is."""
+    one = body("one", np.vstack([TOOL[:4], [[70.0, 60.0, 50.0]]]))
+    other = body("other", np.vstack([TOOL[:4], [[-60.0, -40.0, 50.0]]]))
+    scene, places = scene_of(one, other), [at(-80, 10), at(90, -20, 30, 1.1)]
+    tracks, found = scene.begin(), []
+    for frame, seen in enumerate([[PART]] * 3 + [[PART] * 2] * 3 + [[one, other]] * 2):
+        views = views_of(seen, places[: len(seen)], frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        found.append(estimates)
+    for estimates in found[3:6]:
+        assert [estimate.status for estimate in estimates] == ["ambiguous"] * 2
+        assert max(estimate.confidence or 0.0 for estimate in estimates) < 0.9
+    for estimates in found[6:]:
+        assert [estimate.status for estimate in estimates] == ["ok"] * 2
+        for estimate, T in zip(estimates, places, strict=True):
+            assert off(estimate, T)[0] < 2.0
+
+
 def without_the_false_spot(view: View) -> View:
     points = view.observation.points
     assert points is not None

@@ -162,4 +162,12 @@ MUTANTS = (
         "a body that went on while nobody looked stays lost for a while",
         ("test_several_bodies_scene.py",),
     ),
+    Mutant(
+        "tracking-what-a-body-may-be-is-forgotten-by-the-one-that-it-may-be",
+        "tracking/confusion.py",
+        "known = max(before.get(self.what, -math.inf), self.before)",
+        "known = before.get(self.what, -math.inf)",
+        "of two bodies that may have changed places the one that came later is ok in the wrong one",
+        ("test_several_bodies_parts.py",),
+    ),
 )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -33,11 +34,12 @@ class Confusion(NamedTuple):
     what: str  # in words
     log_odds: float
     alone: float  # log odds by this frame alone
+    before: float = -math.inf  # log odds by the frames before, of the other body
 
     def since(self, before: Mapping[str, float]) -> Alternative:
         """By the frames before as well, of which the odds are known, by reasons."""
-        kept = min(before.get(self.what, -math.inf), self.alone)
-        return Alternative(self.what, max(self.log_odds, kept))
+        known = max(before.get(self.what, -math.inf), self.before)
+        return Alternative(self.what, max(self.log_odds, min(known, self.alone)))
 
 
 def taken_for(
@@ -51,11 +53,12 @@ def taken_for(
     bests = {k: one.best for k, one in told.items() if one.best and one.best.log_evidence > 0}
     sure = [k for k, one in told.items() if one.status == "ok"]
 
+    @cache
     def instead(k: int, j: int) -> list[Confusion]:
         against = look_alikes_of(frames[k], bests[k], frames[j])
         return sorted(against, key=lambda one: one.log_odds)
 
-    found = {k: instead(k, k) for k in bests}
+    found = {k: [*instead(k, k)] for k in bests}
     for k, j in permutations(frames, 2):
         if k in bests and j not in sure and frames[k].body is not frames[j].body:
             found[k] += _as_lost(instead(k, j), frames[k], frames[j])
@@ -66,9 +69,12 @@ def taken_for(
             continue
         if there[-1].log_odds > -frames[k].rules.look_alikes.behind and (here := instead(j, k)):
             both = there[-1].log_odds + here[-1].log_odds, there[-1].alone + here[-1].alone
-            for one, rival, what in ((k, j, there[-1].what), (j, k, here[-1].what)):
+            # if the one is the other, that is the one
+            asked = (k, there[-1].what), (j, here[-1].what)
+            before = max(frames[one].track.alike.get(what, -math.inf) for one, what in asked)
+            for (one, what), rival in zip(asked, (j, k), strict=True):
                 if rival in sure:
-                    found[one] += _as_lost([Confusion(what, *both)], frames[k], frames[j])
+                    found[one] += _as_lost([Confusion(what, *both, before)], frames[k], frames[j])
     return found
 
 
