@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 import mixpose
 from mixpose.records import Estimate
-from mixpose.rigid import from_parts, rotation_angle_deg, transform
+from mixpose.rigid import from_parts, transform, twist_between
 from mixpose.sensors import PinholeCamera
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -213,11 +213,15 @@ def parting(seed: int) -> tuple[Setup, Motion, np.random.Generator]:
 
 
 def is_right(estimate: Estimate, T_true: Floats, symmetries: Floats) -> bool:
-    """Whether a pose is near the true one."""
+    """Whether a pose is near the true one, or near one that looks the same."""
     T = estimate.T_world_object
-    if T is None or np.linalg.norm(T[:3, 3] - T_true[:3, 3]) > RIGHT_MM:
+    if T is None:
         return False
-    return bool(min(rotation_angle_deg(T, T_true @ S) for S in symmetries) < RIGHT_DEG)
+    away = [twist_between(alike, T) for alike in T_true @ symmetries]
+    return any(
+        np.linalg.norm(x[:3]) <= RIGHT_MM and np.degrees(np.linalg.norm(x[3:])) < RIGHT_DEG
+        for x in away
+    )
 
 
 def by_frame(session: mixpose.Session) -> Iterator[list[Estimate]]:
