@@ -51,6 +51,9 @@ class SearchBudget:
     beyond_doubt: float = constant(
         8.0, "nats from which guesses are enough: of 900 frames only mirror images had as much"
     )
+    close: float = constant(
+        0.3, "σ_ε, RMS up to which less than `convincing` is enough: as spots err by at most"
+    )
     outdone: float = constant(
         12.0, "nats behind the best from which poses are out: right ones were 4.2 behind at most"
     )

@@ -23,6 +23,7 @@ from mixpose.search.poses import (
     evidence,
     from_spread_orientations,
     label_image,
+    matches_of,
     unlike,
 )
 from mixpose.search.problem import (
@@ -233,6 +234,12 @@ class _Search:
             return False
         lead = ranks[0] - ranks[self._distinct(2)[-1]]
         if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:
+            return False
+        # where it meets less closely than spots err, its own markers may meet more elsewhere
+        met = matches_of(self._problem, self._poses[:1])
+        squares, most = float(met.squares.sum()), budget.close**2
+        is_close = squares <= most * float(met.measurements.sum())
+        if self._coverage() < budget.convincing and not is_close:
             return False
         explained = int(self._count(self._body, self._poses[:1])[0])
         return self._coverage() >= budget.sufficient or explained >= self._enough
