@@ -159,6 +159,14 @@ _SEARCH = (
         "where two rays meet by luck their point is taken for exact, and its body is not found",
         ("test_search_triangulation.py",),
     ),
+    Mutant(
+        "search-half-of-the-body-is-enough-however-far-off",
+        "search/search.py",
+        "if self._coverage() < budget.convincing and not self._is_close():",
+        "if False:",
+        "before cameras side by side a body is found turned over, after a few guesses",
+        ("test_search_evidence.py",),
+    ),
 )
 
 MUTANTS = (*_SEARCH_EVIDENCE, *_SEARCH)

@@ -236,13 +236,16 @@ class _Search:
         if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:
             return False
         # where it meets less closely than spots err, its own markers may meet more elsewhere
-        met = matches_of(self._problem, self._poses[:1])
-        squares, most = float(met.squares.sum()), budget.close**2
-        is_close = squares <= most * float(met.measurements.sum())
-        if self._coverage() < budget.convincing and not is_close:
+        if self._coverage() < budget.convincing and not self._is_close():
             return False
         explained = int(self._count(self._body, self._poses[:1])[0])
         return self._coverage() >= budget.sufficient or explained >= self._enough
+
+    def _is_close(self) -> bool:
+        """Whether detections are as near to the features of the best pose as spots err."""
+        met = matches_of(self._problem, self._poses[:1])
+        most = self._budget.close**2 * float(met.measurements.sum())
+        return float(met.squares.sum()) <= most
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""

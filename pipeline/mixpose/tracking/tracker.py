@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -24,7 +24,7 @@ from mixpose.tracking.arguments import pose_meant, require_meant
 from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
-from mixpose.tracking.likelihood import likelihood_of
+from mixpose.tracking.likelihood import Likelihood, likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent, predicted, searched
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
@@ -178,12 +178,7 @@ class Tracker(Setup):
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
             fits.append(fit)
-            judged = replace(
-                likelihood.judge(fit, start),
-                proposer=proposer,
-                blurs=fit.blurs,
-                T_moved=start.T_moved,
-            )
+            judged = _judged(likelihood, fit, start, proposer)
             insert(ranked, judged, data.body, data.free, data.rules.acceptance)
             return judged
 
@@ -288,6 +283,22 @@ def _moving_at(data: Frame, T_world_object: Floats) -> Frame:
     return data.in_motion(data.expected(T_world_object).at(T_world_object)) if is_moving else data
 
 
+def _judged(
+    likelihood: Likelihood,
+    fit: Fit,
+    start: Start,
+    proposer: str,
+    blurs: tuple[Mapping[str, float], ...] = (),  # of the fit before, where there is none now
+) -> ScoredPose:
+    """A pose that was fitted from a start, and what it comes from."""
+    return replace(
+        likelihood.judge(fit, start),
+        proposer=proposer,
+        blurs=fit.blurs or blurs,
+        T_moved=start.T_moved,
+    )
+
+
 def judged_again(
     data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> list[ScoredPose]:
@@ -301,13 +312,7 @@ def judged_again(
         is_near = one.log_evidence > poses[0].log_evidence - behind
         wide = data.close if fitted and is_near else None
         start = Start(one.T_world_object, wide, left_out=one.left_out, T_moved=one.T_moved)
-        fit = likelihood.fit(start)
-        judged = replace(
-            likelihood.judge(fit, start),
-            proposer=one.proposer,
-            blurs=fit.blurs or one.blurs,
-            T_moved=one.T_moved,
-        )
+        judged = _judged(likelihood, likelihood.fit(start), start, one.proposer, one.blurs)
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
 
