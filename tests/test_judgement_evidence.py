@@ -216,6 +216,18 @@ def test_features_that_may_be_off_tell_less_of_the_pose() -> None:
     assert found[0, 0] == pytest.approx(6 / (noise + 0.25))
 
 
+def test_information_of_features_that_nearly_touch_a_camera_is_as_exact_as_of_others() -> None:
+    # they move there by 1e7 px a mm, which beside their spread is as if that were all
+    J = np.zeros((6, 2, 6))
+    J[..., :3] = np.random.default_rng(5).normal(0, 1e7, (6, 2, 3))
+    near = Matches.stacked([matches_of(Seen(J, sigma=2.0))])
+    spreads = np.broadcast_to(np.eye(3), (1, 6, 3, 3))
+    found = information_of(near, np.full((1, 1), S2), spreads)[0]
+    # of each feature the two coordinates across its line of sight
+    across = sum(np.linalg.pinv(one) @ one for one in J[..., :3])
+    np.testing.assert_allclose(found[:3, :3], across, atol=1e-9)
+
+
 def test_information_is_that_of_least_squares() -> None:
     shares = np.array([1.0, 1.0, 0.5, 1.0, 0.0, 1.0])
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))

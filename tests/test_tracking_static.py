@@ -8,12 +8,14 @@ import numpy as np
 from detections import EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
+from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import transform
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import CloudSensor, PinholeCamera, from_planes
 from mixpose.tracking import Track, Tracker
+from mixpose.tracking.clouds import plane_views
 from mixpose.tracking.rules import ProposalRules
 from mixpose.tracking.static_clutter import StaticClutter
 
@@ -91,3 +93,23 @@ def test_a_place_counts_as_static_from_ten_frames_and_is_forgotten_as_slowly(
         assert isinstance(pattern, PointPattern)
         # eleven times there, and not there since
         assert len(pattern.points) == (0 if frame < 2 else 1)
+
+
+def test_a_point_of_a_cloud_stays_where_it_is_if_it_does_in_all_three_images() -> None:
+    lamps = np.random.default_rng(3).uniform(-500, 500, (6, 3))
+    # seen in the place of a lamp along one axis only: one image takes each for a lamp
+    moved = lamps[:3] + 100 * np.eye(3)[[2, 0, 1]]
+    before, after = (as_seen(points) for points in (lamps, np.concatenate([lamps[3:], moved])))
+    clutter = StaticClutter()
+    for _ in range(FRAMES):
+        clutter = clutter.learnt(before, FRAMES)
+    left = clutter.without(after, FRAMES)
+    places = from_planes(np.array([view.observation.points for view in left]))
+    np.testing.assert_allclose(places, moved, atol=1e-9)
+
+
+def as_seen(points: Floats) -> list[View]:
+    """A cloud of points in its three images."""
+    cloud = CloudSensor()
+    seen = PointPattern(points, np.ones(len(points)))
+    return plane_views(View("cloud", cloud, Observation(seen, 1.0)))

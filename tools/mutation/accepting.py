@@ -99,6 +99,22 @@ MUTANTS = (
         ("test_judgement_acceptance.py",),
     ),
     Mutant(
+        "judgement-bent-as-sure-as-rigid",
+        "judgement/judge.py",
+        "np.maximum(chdtri(count, rest) / chdtri(count, outside), chances)",
+        "0.0 * chances",
+        "of a body on skin, met closely by chance, a pose is told as sure as of a rigid one",
+        ("test_tracking_bent.py",),
+    ),
+    Mutant(
+        "judgement-bent-once-is-bent-never",
+        "judgement/noise.py",
+        "memory * bent + share",
+        "memory * bent",
+        "that a body was bent so far tells nothing of whether it is now",
+        ("test_tracking_bent.py",),
+    ),
+    Mutant(
         "judgement-symmetry-ignored",
         "judgement/acceptance.py",
         "if len(body.symmetries) == 1:",

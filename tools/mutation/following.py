@@ -289,8 +289,8 @@ _STATIC = (
     Mutant(
         "tracking-static-clutter-is-searched-first",
         "tracking/static_clutter.py",
-        "if not moves.all():",
-        "if False:",
+        "view if mask.all() else replace",
+        "view if True else replace",
         "a room full of lamps hides what comes into it",
         ("test_tracking_static.py",),
     ),

@@ -45,16 +45,16 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
     What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
     """
     *poses, sensors, n, m, _ = found.J.shape
-    by_feature, weights = (
-        (*poses, n, sensors * m, 6),
-        found.shares * found.each_part[:, None] / (variances[..., None] + found.extra),
-    )
-    rows = found.J, weights[..., None, None] * found.J
-    J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]
-    information = scaled.swapaxes(-2, -1) @ J
-    if spreads is not None:
-        taken = spreads @ np.linalg.inv(np.eye(3) + information[..., :3, :3] @ spreads)
-        information = information - information[..., :3] @ taken @ information[..., :3, :]
+    weights = found.shares * found.each_part[:, None] / (variances[..., None] + found.extra)
+    rows = np.sqrt(weights)[..., None, None] * found.J
+    if spreads is None:
+        rows = rows.reshape(*poses, sensors * n * m, 6)
+        return np.asarray(rows.swapaxes(-2, -1) @ rows)
+    # of each feature the coordinates of all sensors err together
+    rows = rows.swapaxes(-4, -3).reshape(*poses, n, sensors * m, 6)
+    by_place = rows[..., :3]
+    errors = np.eye(sensors * m) + by_place @ spreads @ by_place.swapaxes(-2, -1)
+    information = rows.swapaxes(-2, -1) @ np.linalg.solve(errors, rows)
     return np.asarray(information.sum(axis=-3))
 
 

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri, expit
 
 from mixpose.body import Body
 from mixpose.judgement.clutter import ClutterRates
@@ -186,15 +187,18 @@ def judge_together(
         measured, variances = variances, np.ones((*variances.shape[:-1], len(used)))
         variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
-    odds, bent = _evidence(cases, seen, variances, free, rules.detection)
+    odds, bent, chances = _evidence(cases, seen, variances, free, rules.detection)
     evidence, densities = odds + counted + [noise[-1] for noise in noises]
+    shares = _share_of_bent(np.array(chances), int(free.sum()), 1 - rules.noise.by_chance)
     return [
         ScoredPose(
             case.T_world_object,
             whole[k],
-            covariance,
+            (1 - shares[k]) * covariance + shares[k] * bent[k],
             float(evidence[k]),
-            noise=remembered,
+            noise=remembered.bent_once(chances[k], rules.noise.bias_memory)
+            if case.body.spread
+            else remembered,
             log_missed=rules.detection.log_missed,
             left_out=left_out,
             persistent=persistent,
@@ -211,12 +215,14 @@ def judge_together(
 
 def _evidence(
     cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
-) -> tuple[Floats, Floats]:
-    """Log odds (2, K) as in `log_evidence`, and covariances (K, 6, 6) of bodies that give way."""
+) -> tuple[Floats, Floats, list[float]]:
+    """Log odds (2, K) as in `log_evidence`; of bodies that give way covariances (K, 6, 6) where
+    they are bent, and how likely each (K,) is.
+    """
     bodies = [case.body for case in cases]
     priors = [case.prior or flat_prior(case.body, free, detection) for case in cases]
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
-    bent = np.zeros((len(cases), 6, 6))
+    bent, chances = np.zeros((len(cases), 6, 6)), [0.0] * len(cases)
     given = seen, variances, free, priors, sizes, detection
     surfaces = _surfaces_of(bodies, (*sizes.shape, seen.shares.shape[-1]))
     evidence = log_evidence(*given, information_of(seen, variances), None, surfaces)
@@ -226,16 +232,28 @@ def _evidence(
         for own, body, case in zip(by_pose, bodies, cases, strict=True):
             turned = body.node_spreads(case.T_world_object)
             own[: len(turned)] = turned
-        # rigid as a rule, and bent now and then: as often the one as the other
         information = information_of(seen, variances, spreads)
-        at_all = spreads.any(axis=(-3, -2, -1))
         bent_odds = log_evidence(*given, information, spreads, surfaces)
-        both = np.logaddexp(evidence, bent_odds) - math.log(2)
-        evidence = np.where(at_all, both, evidence)
-        for k in np.flatnonzero(at_all).tolist():
+        for k in np.flatnonzero(by_pose.any(axis=(1, 2, 3))).tolist():
+            # as often the one and the other as in frames before
+            rigid, bend = cases[k].before.log_bent
+            likely = np.array([rigid + evidence[:, k], bend + bent_odds[:, k]])
+            evidence[:, k] = np.logaddexp(*likely)
             inner = np.ix_(free, free)
             bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
-    return evidence, bent
+            rigid, bend = likely[:, 1].tolist()
+            chances[k] = float(expit(bend - rigid)) if rigid > -math.inf else 0.0
+    return evidence, bent, chances
+
+
+def _share_of_bent(chances: Floats, count: int, outside: float) -> Floats:
+    """Of covariances of bent bodies (K,), so that ellipsoids of that share hold all but some poses.
+
+    Of a body that is bent by a chance p, 1 - outside / p of its poses where it is bent are to be
+    inside; at least p of it, as of a mixture.
+    """
+    rest = np.minimum(outside / np.maximum(chances, 1e-300), 1.0)
+    return np.asarray(np.maximum(chdtri(count, rest) / chdtri(count, outside), chances))
 
 
 def _surfaces_of(bodies: Sequence[Body], shape: tuple[int, ...]) -> Indices | None:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -96,12 +96,26 @@ class RememberedNoise:
     # (q, q + 1) sums [A | v] of fields that last, by sets of sensors, the last seen first
     biases: Biases = field(default_factory=dict)
     fields: float = 1.0  # share of the variance that is fields of sensors; not known before
+    # frames so far, the older ones less, in which the body was rigid, and in which it was bent
+    bends: tuple[float, float] = (0.0, 0.0)
 
     def followed(self, names: Sequence[str], sums: Floats, *rest: Any) -> RememberedNoise:
         """With sums (2, L) of some sensors and those of others as they were, and all else anew."""
         others = [k for k, name in enumerate(self.names) if name not in names]
         sums = np.concatenate([sums, self.sums[:, others]], axis=1) if others else sums
-        return RememberedNoise((*names, *[self.names[k] for k in others]), sums, *rest)
+        names = *names, *[self.names[k] for k in others]
+        return RememberedNoise(names, sums, *rest, bends=self.bends)
+
+    @property
+    def log_bent(self) -> tuple[float, float]:
+        """Of a body that gives way ln p to be rigid, and to be bent, in a frame; even at first."""
+        rigid, bent = (count + 0.5 for count in self.bends)
+        return math.log(rigid / (rigid + bent)), math.log(bent / (rigid + bent))
+
+    def bent_once(self, share: float, memory: float) -> RememberedNoise:
+        """After a frame in which the body was bent by a chance."""
+        rigid, bent = self.bends
+        return replace(self, bends=(memory * rigid + 1 - share, memory * bent + share))
 
     def of(self, names: Sequence[str]) -> Floats:
         """Squares and degrees of freedom (2, L) of some sensors."""

@@ -143,9 +143,10 @@ class _Turns:
         rest = np.arange(self.axes.shape[1]) > 1
         begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
         ends = ascend(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _TWICE)
-        known = np.vecdot(turns @ self.curvature, turns)
-        fallen = 2 * (self._here - ends.values) * (np.vecdot(turns, turns) / known)
         wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
+        # turns so wide may be such that nothing tells: they have no curvature either
+        known = np.where(wide, np.inf, np.vecdot(turns @ self.curvature, turns))
+        fallen = 2 * (self._here - ends.values) * (np.vecdot(turns, turns) / known)
         return np.where(wide, np.inf, fallen), ends.states
 
     @cached_property

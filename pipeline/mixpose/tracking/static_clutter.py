@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
+from mixpose.sensors import clouds_among
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,26 @@ class StaticClutter:
 
     def without(self, views: Sequence[View], frames: int) -> list[View]:
         """The views without detections that were there in so many frames more than not."""
-        moving = list(views)
-        for k, view in enumerate(views):
-            if view.name in self.places:
-                places, counts = self.places[view.name]
-                static = places[counts >= frames]
-                moves = _nearest(static, view.observation) == len(static)
-                if not moves.all():
-                    moving[k] = replace(view, observation=view.observation.only(moves))
-        return moving
+        moving = [self._moving(view, frames) for view in views]
+        for planes in clouds_among(tuple([view.sensor for view in views])):
+            # a point stays where it is if it does in all three images
+            common = np.any([moving[k] for k in planes], axis=0)
+            for k in planes:
+                moving[k] = common
+        return [
+            view if mask.all() else replace(view, observation=view.observation.only(mask))
+            for view, mask in zip(views, moving, strict=True)
+        ]
+
+    def _moving(self, view: View, frames: int) -> Mask:
+        """Whether each detection (M,) of a view was not there in so many frames more than not."""
+        if (points := view.observation.points) is None:
+            return np.zeros(0, dtype=np.bool_)  # of no detections at all
+        if view.name not in self.places:
+            return np.ones(len(points), dtype=np.bool_)
+        places, counts = self.places[view.name]
+        static = places[counts >= frames]
+        return np.asarray(_nearest(static, view.observation) == len(static))
 
 
 def _nearest(places: Floats, seen: Observation) -> Indices:
