@@ -104,7 +104,7 @@ class RememberedNoise:
         others = [k for k, name in enumerate(self.names) if name not in names]
         sums = np.concatenate([sums, self.sums[:, others]], axis=1) if others else sums
         names = *names, *[self.names[k] for k in others]
-        return RememberedNoise(names, sums, *rest, bends=self.bends)
+        return replace(RememberedNoise(names, sums, *rest), bends=self.bends)
 
     @property
     def log_bent(self) -> tuple[float, float]:
