@@ -135,6 +135,17 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     assert own[3] == pytest.approx(8 * 7 * 6 / (56 * 55 * 54), rel=0.7)
 
 
+def test_features_of_which_no_three_face_alike_are_tried_with_those_near_them() -> None:
+    away = EIGHT.means - EIGHT.means.mean(axis=0)
+    body = Body("hedgehog", EIGHT.features, away / np.linalg.norm(away, axis=1, keepdims=True))
+    camera = PinholeCamera(np.diag([800.0, 800.0, 1.0]), resolution=(1280, 1024))
+    rays = camera.rays(np.random.default_rng(0).uniform(0, 1000, (12, 2)))
+    assert rays is not None
+    budget = SearchBudget(max_problems=4 * THOROUGH.batch)
+    chunks = list(ray_triples(SearchProblem([], body, ALL_FREE, np.eye(4), budget=budget), rays))
+    assert sum(triples.shape[1] for triples, _ in chunks) == 2 * THOROUGH.batch
+
+
 def test_sizes_of_a_search_follow_from_its_numbers() -> None:
     # as many of the most promising points as all triples of can be tried
     none = np.zeros((100, 3))

@@ -208,7 +208,8 @@ def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, I
             corners = [side[far_apart(features[side], budget.sample)] for side in sides]
         by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
         triples = [triple for some in corners for triple in permutations(some.tolist(), 3)]
-        by_feature = np.array(list(dict.fromkeys(triples)), dtype=np.intp).T
+        # of sides with less than three features there are none
+        by_feature = np.array(list(dict.fromkeys(triples)), dtype=np.intp).reshape(-1, 3).T
         order = rng.permutation(by_detection.shape[1] * by_feature.shape[1])[:most]
         for start in range(0, len(order), batch):
             a, b = np.divmod(order[start : start + batch], by_feature.shape[1])
