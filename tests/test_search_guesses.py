@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from math import comb
 
 import numpy as np
@@ -136,8 +137,8 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
 
 
 def test_features_of_which_no_three_face_alike_are_tried_with_those_near_them() -> None:
-    away = EIGHT.means - EIGHT.means.mean(axis=0)
-    body = Body("hedgehog", EIGHT.features, away / np.linalg.norm(away, axis=1, keepdims=True))
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))  # of a cube: 70° apart
+    body = Body("hedgehog", EIGHT.features, corners / np.sqrt(3))
     camera = PinholeCamera(np.diag([800.0, 800.0, 1.0]), resolution=(1280, 1024))
     rays = camera.rays(np.random.default_rng(0).uniform(0, 1000, (12, 2)))
     assert rays is not None
