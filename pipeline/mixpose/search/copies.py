@@ -8,7 +8,7 @@ set of poses of which no two have the same detections, the likelier having what 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -65,6 +65,13 @@ class SeenTogether:
     views: Sequence[View] = ()
     rules: JudgementRules = JudgementRules()
     budget: SearchBudget = THOROUGH
+    _copies: dict[Body, list[Copy]] = field(default_factory=dict)
+
+    def copies_of(self, body: Body, free: Mask) -> list[Copy]:
+        """Poses of a body as `search_copies` finds them, of which nothing is known."""
+        if body not in self._copies:
+            self._copies[body] = search_copies(self, [body], free)
+        return self._copies[body]
 
     @cached_property
     def detections(self) -> list[SensorDetections]:

@@ -25,7 +25,7 @@ from mixpose.judgement import (
 )
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
-from mixpose.search import Candidate, Copy, SeenTogether, search_copies
+from mixpose.search import Candidate, Copy, SeenTogether
 from mixpose.tracking.doubt import TWICE, contradicted, decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
@@ -292,7 +292,7 @@ def _poses(alone: Frame, rest: SeenTogether) -> Iterator[ScoredPose]:
     likelihood = likelihood_of(alone)
     found: Sequence[Copy | Candidate]
     if len(rest.views) > 1:  # quickly, by points that cameras see together
-        found = search_copies(rest, [alone.body], alone.free)
+        found = rest.copies_of(alone.body, alone.free)
     else:
         found = candidates_of(alone)
     for one in found[: alone.rules.proposals.seconds]:
