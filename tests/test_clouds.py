@@ -8,7 +8,7 @@ import os
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -297,6 +297,21 @@ def test_a_cloud_is_placed_against_a_camera(tmp_path: Path) -> None:
     # a camera knows depths of 8 frames to 0.1 px * 1200 mm / 100 px, and their turns alike
     assert np.linalg.norm(transform(found, np.zeros((1, 3))) - T_CLOUD[:3, 3]) < 3.0
     assert np.degrees(np.linalg.norm(twist_between(T_CLOUD, found)[3:])) < 0.3
+
+
+def test_a_cloud_that_never_shows_the_body_is_told_and_nothing_else_of_it(tmp_path: Path) -> None:
+    made = recording(tmp_path, markers=8, frames=8, clutter=2, hidden=0)
+    left = beside_a_camera(made, np.zeros(6))
+    (tmp_path / "camera.csv").rename(tmp_path / "left.csv")
+    left.write_text(left.read_text().replace('"camera', '"left'))
+    both = beside_a_camera(replace(made, session=left), np.zeros(6))
+    others = np.random.default_rng(1).uniform(-300, 300, (64, 3)).tolist()
+    rows = [f"{k // 8},{x!r},{y!r},{z!r}" for k, (x, y, z) in enumerate(others)]
+    (tmp_path / "cloud.csv").write_text("\n".join(["frame,x,y,z", *rows]) + "\n")
+    said = run("calibrate", both, "--check")
+    assert "mocap: shares no view" in said
+    assert "the calibration holds, of what shares views" in said
+    assert "nan" not in said
 
 
 def triangulated(folder: Path, frames: int) -> dict[int, list[Floats]]:

@@ -22,7 +22,7 @@ from mixpose.calibration.start import Start, start_from_cameras, starts_together
 from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
-from mixpose.sensors import CalibrationError
+from mixpose.sensors import CalibrationError, CloudSensor
 from mixpose.threads import one_blas_thread
 
 _STAGES = 8  # of a calibration, for progress
@@ -203,7 +203,10 @@ class _Run:
         """T_sensor_world of cameras that could not be linked by what they see alone."""
         linked = [s for s in self._task.cameras if s not in self._unlinked]
         known = linked, self._whole(part), noise, self._rules
-        found = {s: placed(self._task, part.state, s, *known) for s in self._unlinked}
+        # by lines of sight, which a cloud has none of
+        sensors = self._task.rig.sensors
+        cameras = [s for s in self._unlinked if not isinstance(sensors[s], CloudSensor)]
+        found = {s: placed(self._task, part.state, s, *known) for s in cameras}
         return {s: T for s, T in found.items() if T is not None}
 
     def _with_latecomers(self, part: Start, late: dict[int, Floats]) -> Start:

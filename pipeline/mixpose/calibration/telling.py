@@ -284,6 +284,8 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     are_told = 2 * len(bumped) < len(told)  # most of them agree
     lines = [_frames_line(found)]
     for index, one in enumerate(told):
+        if index in found.unlinked:
+            continue
         of, before = _unit_of(found, index, unit), one.residual_before
         text = f"residual {before:.3g} {of}" if np.isfinite(before) else "meets nothing"
         lines.append(
@@ -292,7 +294,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
         )
     lines += [f"{'not known':<20}{found.after.names[k]}: shares no view" for k in found.unlinked]
     if not bumped:
-        lines.append("the calibration holds")
+        lines.append("the calibration holds" + (", of what shares views" if found.unlinked else ""))
     elif are_told:
         lines.append(f"the calibration no longer holds: {', '.join(bumped)} moved")
     else:
