@@ -76,6 +76,30 @@ def test_two_bodies_of_which_only_what_they_share_is_seen_may_have_changed_place
             assert off(estimate, T)[0] < 2.0
 
 
+@pytest.mark.parametrize("are_seen", [(0, 1, 2), (0, 1)])
+def test_of_three_bodies_each_may_be_where_the_one_before_it_is(are_seen: Sequence[int]) -> None:
+    # each shares a fourth marker with the one and the other, of which one is hidden; where but two
+    # are seen, the third is either what is not there, or one of these
+    shared = [[70.0, 60.0, 50.0], [-60.0, -40.0, 50.0], [10.0, 80.0, -70.0]]
+    core, names = TOOL[:3], ("first", "second", "third")
+    whole = [
+        body(name, np.vstack([core, shared[k], shared[k - 1]])) for k, name in enumerate(names)
+    ]
+    parts = [body(name, np.vstack([core, shared[k]])) for k, name in enumerate(names)]
+    scene, places = scene_of(*whole), [at(-80, 10), at(90, -20, 30, 1.1), at(10, 110, -40, -0.8)]
+    tracks = scene.begin()
+    for frame in range(4):
+        seen = [parts[k] for k in are_seen], [places[k] for k in are_seen]
+        tracks, estimates = scene.advance(tracks, frame, None, views_of(*seen, frame))
+        assert "ok" not in {estimate.status for estimate in estimates}
+    for frame in range(4, 6):
+        views = views_of(whole, places, frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+    for estimate, T in zip(estimates, places, strict=True):
+        assert estimate.status == "ok"
+        assert off(estimate, T)[0] < 2.0
+
+
 def test_where_a_body_may_be_the_other_one_that_comes_later_may_be_it_as_well() -> None:
     """What is known of the first one's place is known of whichever of the two it is."""
     one = body("one", np.vstack([TOOL[:4], [[70.0, 60.0, 50.0]]]))

@@ -170,4 +170,20 @@ MUTANTS = (
         "of two bodies that may have changed places the one that came later is ok in the wrong one",
         ("test_several_bodies_parts.py",),
     ),
+    Mutant(
+        "tracking-three-bodies-never-go-round",
+        "tracking/confusion.py",
+        "yield from ([(k, j), (j, i), (i, k)] for i in thirds)",
+        "pass",
+        "three bodies of which each is where another one was found are ok",
+        ("test_several_bodies_parts.py",),
+    ),
+    Mutant(
+        "tracking-the-place-of-a-sure-body-is-not-another-s",
+        "tracking/confusion.py",
+        "yield from ([(k, j), (j, i)] for i in thirds)",
+        "pass",
+        "a body is ok in the place of one that is found where a lost one is",
+        ("test_several_bodies_parts.py",),
+    ),
 )

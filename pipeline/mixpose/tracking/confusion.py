@@ -9,10 +9,10 @@ all frames the one counts that tells most, and not their product.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
-from itertools import combinations, permutations
+from functools import cache, partial
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -62,20 +62,49 @@ def taken_for(
     for k, j in permutations(frames, 2):
         if k in bests and j not in sure and frames[k].body is not frames[j].body:
             found[k] += _as_lost(instead(k, j), frames[k], frames[j])
-    for pair in combinations(bests, 2):
-        # what meets more is seldom the other
-        k, j = sorted(pair, key=lambda one: -bests[one].features[0])
-        if frames[k].body is frames[j].body or not (there := instead(k, j)):
-            continue
-        if there[-1].log_odds > -frames[k].rules.look_alikes.behind and (here := instead(j, k)):
-            both = there[-1].log_odds + here[-1].log_odds, there[-1].alone + here[-1].alone
-            # if the one is the other, that is the one
-            asked = (k, there[-1].what), (j, here[-1].what)
-            before = max(frames[one].track.alike.get(what, -math.inf) for one, what in asked)
-            for (one, what), rival in zip(asked, (j, k), strict=True):
-                if rival in sure:
-                    found[one] += _as_lost([Confusion(what, *both, before)], frames[k], frames[j])
+    for steps in _exchanges(bests, frames, sure, instead):
+        against = [instead(*step)[-1] for step in steps]
+        log_odds, alone = (sum(odds) for odds in zip(*(one[1:3] for one in against), strict=True))
+        asked = [(k, one.what) for (k, _), one in zip(steps, against, strict=True)]
+        before = max(frames[k].track.alike.get(what, -math.inf) for k, what in asked)
+        for (k, j), (_, what) in zip(steps, asked, strict=True):
+            if j in sure:
+                changed = Confusion(what, log_odds, alone, before)
+                found[k] += _as_lost([changed], frames[k], frames[j])
     return found
+
+
+def _exchanges(
+    bests: Mapping[int, ScoredPose],
+    frames: Mapping[int, Frame],
+    sure: Sequence[int],
+    instead: Callable[[int, int], list[Confusion]],
+) -> Iterator[list[tuple[int, int]]]:
+    """Steps from bodies to those that may be what was found of them.
+
+    Two or three go round; or the last is one that is not surely elsewhere.
+    """
+    # what meets more is seldom the other
+    ranked = sorted(bests, key=lambda one: -bests[one].features[0])
+
+    def may_be(k: int, j: int) -> bool:
+        return frames[k].body is not frames[j].body and bool(instead(k, j))
+
+    def is_likely(k: int, j: int) -> bool:
+        least = -frames[k].rules.look_alikes.behind
+        return may_be(k, j) and max(instead(k, j)[-1][1:3]) > least
+
+    for place, k in enumerate(ranked):
+        for j in filter(partial(is_likely, k), later := ranked[place + 1 :]):
+            if may_be(j, k):
+                yield [(k, j), (j, k)]
+            thirds = [i for i in later if i != j and may_be(j, i) and may_be(i, k)]
+            yield from ([(k, j), (j, i), (i, k)] for i in thirds)
+    unsure = [k for k in frames if k not in sure]
+    for k, j in permutations(set(sure).intersection(bests), 2):
+        thirds = [i for i in unsure if may_be(j, i)]
+        if thirds and is_likely(k, j):
+            yield from ([(k, j), (j, i)] for i in thirds)
 
 
 def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
