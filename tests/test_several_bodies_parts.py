@@ -76,6 +76,25 @@ def test_two_bodies_of_which_only_what_they_share_is_seen_may_have_changed_place
             assert off(estimate, T)[0] < 2.0
 
 
+def test_spots_where_only_one_of_two_bodies_has_a_marker_do_not_tell_what_is_seen() -> None:
+    """A body may meet one by chance, where the other has all of its markers as well."""
+    fifth = [np.array([[70.0, 60.0, 50.0]]), np.array([[-60.0, -40.0, 50.0]])]
+    one, other = (body(f"body {k}", np.vstack([TOOL[:4], fifth[k]])) for k in range(2))
+    scene, places = scene_of(one, other), [at(-80, 10), at(90, -20, 30, 1.1)]
+    tracks = scene.begin()
+    for frame in range(2):
+        views = views_of([PART] * 2, places, frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+    # they are the one where the other is, and what they have alone is seen in either place
+    told = [estimate.T_world_object for estimate in estimates]
+    assert all(T is not None for T in told)
+    spots = [body("spot", place) for place in fifth]
+    seen = [other, one, *spots], [T for T in (*told, *told) if T is not None]
+    for frame in range(2, 4):
+        tracks, estimates = scene.advance(tracks, frame, None, views_of(*seen, frame))
+        assert [estimate.status for estimate in estimates] == ["ambiguous"] * 2
+
+
 @pytest.mark.parametrize("are_seen", [(0, 1, 2), (0, 1)])
 def test_of_three_bodies_each_may_be_where_the_one_before_it_is(are_seen: Sequence[int]) -> None:
     # each shares a fourth marker with the one and the other, of which one is hidden; where but two

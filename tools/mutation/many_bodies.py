@@ -186,4 +186,20 @@ MUTANTS = (
         "a body is ok in the place of one that is found where a lost one is",
         ("test_several_bodies_parts.py",),
     ),
+    Mutant(
+        "tracking-what-a-body-has-alone-is-never-met-by-chance",
+        "tracking/confusion.py",
+        "if len(part.features) == len(met) or _is_open(data, part, other):",
+        "if len(part.features) == len(met):",
+        "a spot in the right place ends the doubt which of two bodies is seen",
+        ("test_several_bodies_parts.py",),
+    ),
+    Mutant(
+        "tracking-one-that-was-expected-there-is-it-whatever-is-met",
+        "tracking/confusion.py",
+        "there - own if is_all else min(there - own, alone)",
+        "there - own",
+        "a body that is seen whole may be the part of it that was followed",
+        ("test_several_bodies_parts.py",),
+    ),
 )

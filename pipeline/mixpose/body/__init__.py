@@ -8,6 +8,7 @@ from mixpose.body.features import (
 )
 from mixpose.body.look_alikes import (
     ASIDE as ASIDE,
+    FEWEST as FEWEST,
     TURNED as TURNED,
     LookAlike as LookAlike,
     congruent_parts as congruent_parts,

@@ -91,18 +91,18 @@ def tolerance_of(body: Body, other: Body, share: float) -> float:
 
 @lru_cache(maxsize=4096)
 def like_features(
-    body: Body, features: frozenset[int], other: Body, tolerance: float
+    body: Body, features: frozenset[int], other: Body, tolerance: float, fewest: int = FEWEST + 1
 ) -> tuple[LookAlike, ...]:
     """All motions under which features of a body lie like features of another, or of itself.
 
     All but one or a seventh of the features, such as those met in a frame, need a partner within
-    the tolerance, where these are more than fix a motion.  The body's own symmetries are left out,
-    and what turns a face away that was seen.
+    the tolerance, but no fewer than the fewest: as a rule more than fix a motion.  The body's own
+    symmetries are left out, and what turns a face away that was seen.
     """
     chosen = np.array(sorted(features), dtype=np.intp)
     points, targets = body.means[chosen], other.means
     found: dict[Pairs, LookAlike] = {}
-    least = min(len(points), max(len(points) - max(1, int(LOST * len(points))), FEWEST + 1))
+    least = min(len(points), max(len(points) - max(1, int(LOST * len(points))), fewest))
     for base in _bases(points, tolerance):
         triples = congruent_triples(points[base], targets, 2 * tolerance)
         T = motions(points[base], targets[triples])

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.body import LookAlike, like_features, of_size, tolerance_of
+from mixpose.body import FEWEST, LookAlike, like_features, of_size, tolerance_of
 from mixpose.fit import Fit
 from mixpose.judgement import Alternative, ScoredPose, Verdict
 from mixpose.objective import project_body
@@ -109,7 +109,8 @@ def _exchanges(
 
 def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
     """Parts of another body, or of its own, that all that a pose meets might be as well."""
-    parts = list(_in_place_of(data, best, other))
+    met = met_features(data, best)
+    parts = list(_in_place_of(data, best, met, other))
     if not parts:
         return
     T = best.T_world_object
@@ -126,28 +127,45 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Conf
             start = other.rival(best, T_other, other.close, left_out=best.left_out)
             there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
         known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
-        yield Confusion(part.reason, there - own, there - own - known)
+        alone = there - own - known
+        # of more than what may be either, where the other one was expected tells nothing
+        is_all = len(part.features) == len(met)
+        yield Confusion(part.reason, there - own if is_all else min(there - own, alone), alone)
 
 
-def _in_place_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[tuple[LookAlike, Floats]]:
-    """Parts of a body that lie like all that a pose meets, with its pose (4, 4) there.
+def _in_place_of(
+    data: Frame, best: ScoredPose, met: frozenset[int], other: Frame
+) -> Iterator[tuple[LookAlike, Floats]]:
+    """Parts of a body that lie like what a pose meets, with its pose (4, 4) there.
 
+    Of another body like all but one of these, which is then held against it.
     One camera sees a body that is larger by some factor, and as much farther away, as the same.
     """
     if not (is_pointlike(data.body) and is_pointlike(other.body)):
         return
-    met, sizes, centre = met_features(data, best), [1.0], np.zeros(3)
+    sizes, centre = [1.0], np.zeros(3)
     factor = data.body.radius / other.body.radius
     if abs(factor - 1) > 1e-9 and (of_one := _centre_of_one(data, best)) is not None:
         sizes, centre = [1.0, factor], of_one
     for size in sizes:
         body = other.body if size == 1 else of_size(other.body, size)
         tolerance = tolerance_of(data.body, body, other.rules.look_alikes.alike)
-        for part in like_features(data.body, met, body, tolerance):
-            if len(part.features) == len(met):
+        for part in like_features(data.body, met, body, tolerance, FEWEST):
+            if len(part.features) == len(met) or _is_open(data, part, other):
                 T_other = best.T_world_object @ part.T_body_other
                 T_other[:3, 3] += (1 / size - 1) * (T_other[:3, 3] - centre)
                 yield part, T_other
+
+
+def _is_open(data: Frame, part: LookAlike, other: Frame) -> bool:
+    """Whether a marker that another body lacks may be met by chance, as it may be that one.
+
+    Of a body that is new, or in doubt so far.
+    """
+    is_new = data.track.believed < data.rules.proposals.believed
+    known = data.track.alike.get(part.reason, -math.inf)
+    is_doubted = known > data.rules.acceptance.log_doubt
+    return other.body is not data.body and (is_new or is_doubted)
 
 
 def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
@@ -164,4 +182,4 @@ def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
 def _as_lost(against: Sequence[Confusion], one: Frame, other: Frame) -> list[Confusion]:
     """Odds of two bodies of which the one may be the other, even where both were lost."""
     least = math.log(0.5) if one.was_lost and other.was_lost else -math.inf
-    return [each._replace(log_odds=max(each.log_odds, least)) for each in against]
+    return [each._replace(log_odds=max(each.log_odds, min(least, each.alone))) for each in against]
