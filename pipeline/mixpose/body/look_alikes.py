@@ -103,7 +103,7 @@ def like_features(
     points, targets = body.means[chosen], other.means
     found: dict[Pairs, LookAlike] = {}
     least = min(len(points), max(len(points) - max(1, int(LOST * len(points))), fewest))
-    for base in _bases(points, tolerance):
+    for base in _bases(points, tolerance, fewest):
         triples = congruent_triples(points[base], targets, 2 * tolerance)
         T = motions(points[base], targets[triples])
         for part in _kept(body, chosen, other, T, tolerance, least):
@@ -216,7 +216,7 @@ def _tree(body: Body) -> cKDTree:
     return cKDTree(body.means)
 
 
-def _bases(points: Floats, tolerance: float) -> list[list[int]]:
+def _bases(points: Floats, tolerance: float, fewest: int) -> list[list[int]]:
     """Wide triples of points (n, 3), such that each point is missing in one where there are more.
 
     None where they are on a line.
@@ -227,7 +227,7 @@ def _bases(points: Floats, tolerance: float) -> list[list[int]]:
     if _is_narrow(points[first], tolerance):
         return []
     bases = [first]
-    if len(points) > FEWEST + 1:
+    if len(points) > fewest:
         for left_out in first:
             rest = np.delete(np.arange(len(points)), left_out)
             base = rest[list(widest_triple(points[rest]))].tolist()

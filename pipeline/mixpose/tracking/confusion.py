@@ -160,12 +160,12 @@ def _in_place_of(
 def _is_open(data: Frame, part: LookAlike, other: Frame) -> bool:
     """Whether a marker that another body lacks may be met by chance, as it may be that one.
 
-    Of a body that is new, or in doubt so far.
+    Of a body that is new, was away, or in doubt so far.
     """
-    is_new = data.track.believed < data.rules.proposals.believed
-    known = data.track.alike.get(part.reason, -math.inf)
-    is_doubted = known > data.rules.acceptance.log_doubt
-    return other.body is not data.body and (is_new or is_doubted)
+    track, rules = data.track, data.rules
+    is_new = track.believed < rules.proposals.believed or track.misses or track.doubted
+    is_doubted = track.alike.get(part.reason, -math.inf) > rules.acceptance.log_doubt
+    return other.body is not data.body and bool(is_new or is_doubted)
 
 
 def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
