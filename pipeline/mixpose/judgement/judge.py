@@ -189,7 +189,9 @@ def judge_together(
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent, chances = _evidence(cases, seen, variances, free, rules.detection)
     evidence, densities = odds + counted + [noise[-1] for noise in noises]
-    shares = _share_of_bent(np.array(chances), int(free.sum()), 1 - rules.noise.by_chance)
+    shares = np.array(chances)
+    if any(chances):
+        shares = _share_of_bent(shares, int(free.sum()), 1 - rules.noise.by_chance)
     return [
         ScoredPose(
             case.T_world_object,
