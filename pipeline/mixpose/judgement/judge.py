@@ -189,9 +189,9 @@ def judge_together(
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent, chances = _evidence(cases, seen, variances, free, rules.detection)
     evidence, densities = odds + counted + [noise[-1] for noise in noises]
-    shares = np.array(chances)
-    if any(chances):
-        shares = _share_of_bent(shares, int(free.sum()), 1 - rules.noise.by_chance)
+    shares = chances
+    if chances.any():
+        shares = _share_of_bent(chances, int(free.sum()), 1 - rules.noise.by_chance)
     return [
         ScoredPose(
             case.T_world_object,
@@ -217,18 +217,19 @@ def judge_together(
 
 def _evidence(
     cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
-) -> tuple[Floats, Floats, list[float]]:
-    """Log odds (2, K) as in `log_evidence`; of bodies that give way covariances (K, 6, 6) where
-    they are bent, and how likely each (K,) is.
+) -> tuple[Floats, Floats, Floats]:
+    """Log odds (2, K) as in `log_evidence`; of bodies that give way also covariances (K, 6, 6).
+
+    These are of where they are bent, with the chances (K,) that they are.
     """
     bodies = [case.body for case in cases]
     priors = [case.prior or flat_prior(case.body, free, detection) for case in cases]
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
-    bent, chances = np.zeros((len(cases), 6, 6)), [0.0] * len(cases)
+    bent, chances = np.zeros((len(cases), 6, 6)), np.zeros(len(cases))
     given = seen, variances, free, priors, sizes, detection
     surfaces = _surfaces_of(bodies, (*sizes.shape, seen.shares.shape[-1]))
     evidence = log_evidence(*given, information_of(seen, variances), None, surfaces)
-    if any(body.spread for body in bodies):
+    if soft := [k for k, body in enumerate(bodies) if body.spread]:
         spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
         by_pose = spreads.reshape(len(cases), *spreads.shape[-3:])
         for own, body, case in zip(by_pose, bodies, cases, strict=True):
@@ -236,15 +237,15 @@ def _evidence(
             own[: len(turned)] = turned
         information = information_of(seen, variances, spreads)
         bent_odds = log_evidence(*given, information, spreads, surfaces)
-        for k in np.flatnonzero(by_pose.any(axis=(1, 2, 3))).tolist():
+        inner = np.ix_(free, free)
+        for k in soft:
+            bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
             # as often the one and the other as in frames before
             rigid, bend = cases[k].before.log_bent
             likely = np.array([rigid + evidence[:, k], bend + bent_odds[:, k]])
             evidence[:, k] = np.logaddexp(*likely)
-            inner = np.ix_(free, free)
-            bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
-            rigid, bend = likely[:, 1].tolist()
-            chances[k] = float(expit(bend - rigid)) if rigid > -math.inf else 0.0
+            if np.isfinite(likely).all():
+                chances[k] = expit(likely[1, 1] - likely[0, 1])
     return evidence, bent, chances
 
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -99,12 +99,14 @@ class RememberedNoise:
     # frames so far, the older ones less, in which the body was rigid, and in which it was bent
     bends: tuple[float, float] = (0.0, 0.0)
 
-    def followed(self, names: Sequence[str], sums: Floats, *rest: Any) -> RememberedNoise:
-        """With sums (2, L) of some sensors and those of others as they were, and all else anew."""
+    def followed(
+        self, names: Sequence[str], sums: Floats, moments: Floats, biases: Biases, fields: float
+    ) -> RememberedNoise:
+        """With sums (2, L) of some sensors, and those of others and bends as they were."""
         others = [k for k, name in enumerate(self.names) if name not in names]
         sums = np.concatenate([sums, self.sums[:, others]], axis=1) if others else sums
         names = *names, *[self.names[k] for k in others]
-        return replace(RememberedNoise(names, sums, *rest), bends=self.bends)
+        return RememberedNoise(names, sums, moments, biases, fields, self.bends)
 
     @property
     def log_bent(self) -> tuple[float, float]:

@@ -68,7 +68,10 @@ class SeenTogether:
     _copies: dict[Body, list[Copy]] = field(default_factory=dict)
 
     def copies_of(self, body: Body, free: Mask) -> list[Copy]:
-        """Poses of a body as `search_copies` finds them, of which nothing is known."""
+        """Poses of a body as `search_copies` finds them, of which nothing is known.
+
+        All bodies of a scene have the same free directions.
+        """
         if body not in self._copies:
             self._copies[body] = search_copies(self, [body], free)
         return self._copies[body]

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import permutations
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -64,10 +64,10 @@ def taken_for(
             found[k] += _as_lost(instead(k, j), frames[k], frames[j])
     for steps in _exchanges(bests, frames, sure, instead):
         against = [instead(*step)[-1] for step in steps]
-        log_odds, alone = (sum(odds) for odds in zip(*(one[1:3] for one in against), strict=True))
-        asked = [(k, one.what) for (k, _), one in zip(steps, against, strict=True)]
-        before = max(frames[k].track.alike.get(what, -math.inf) for k, what in asked)
-        for (k, j), (_, what) in zip(steps, asked, strict=True):
+        log_odds, alone = sum(one.log_odds for one in against), sum(one.alone for one in against)
+        asked = [(k, j, one.what) for (k, j), one in zip(steps, against, strict=True)]
+        before = max(frames[k].track.alike.get(what, -math.inf) for k, _, what in asked)
+        for k, j, what in asked:
             if j in sure:
                 changed = Confusion(what, log_odds, alone, before)
                 found[k] += _as_lost([changed], frames[k], frames[j])
@@ -91,8 +91,11 @@ def _exchanges(
         return frames[k].body is not frames[j].body and bool(instead(k, j))
 
     def is_likely(k: int, j: int) -> bool:
+        if not may_be(k, j):
+            return False
+        likeliest = instead(k, j)[-1]
         least = -frames[k].rules.look_alikes.behind
-        return may_be(k, j) and max(instead(k, j)[-1][1:3]) > least
+        return max(likeliest.log_odds, likeliest.alone) > least
 
     for place, k in enumerate(ranked):
         for j in filter(partial(is_likely, k), later := ranked[place + 1 :]):
@@ -100,15 +103,15 @@ def _exchanges(
                 yield [(k, j), (j, k)]
             thirds = [i for i in later if i != j and may_be(j, i) and may_be(i, k)]
             yield from ([(k, j), (j, i), (i, k)] for i in thirds)
-    unsure = [k for k in frames if k not in sure]
-    for k, j in permutations(set(sure).intersection(bests), 2):
-        thirds = [i for i in unsure if may_be(j, i)]
-        if thirds and is_likely(k, j):
-            yield from ([(k, j), (j, i)] for i in thirds)
+    for j in filter(bests.__contains__, sure):
+        thirds = [i for i in frames if i not in sure and may_be(j, i)]
+        others = [k for k in sure if k in bests and k != j and is_likely(k, j)] if thirds else []
+        for k, i in product(others, thirds):
+            yield [(k, j), (j, i)]
 
 
 def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
-    """Parts of another body, or of its own, that all that a pose meets might be as well."""
+    """Parts of another body, or of its own, that what a pose meets might be as well."""
     met = met_features(data, best)
     parts = list(_in_place_of(data, best, met, other))
     if not parts:

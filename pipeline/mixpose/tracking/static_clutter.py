@@ -29,7 +29,7 @@ class StaticClutter:
         for view in views:
             if (points := view.observation.points) is None:
                 continue
-            old, count = places.get(view.name, (points[:0], np.zeros(0, dtype=np.intp)))
+            old, count = self._known(view, points)
             nearest = _nearest(old, view.observation)
             is_met = np.isin(np.arange(len(old)), nearest)
             count = np.minimum(count + np.where(is_met, 1, -1), 2 * frames)
@@ -57,11 +57,13 @@ class StaticClutter:
         """Whether each detection (M,) of a view was not there in so many frames more than not."""
         if (points := view.observation.points) is None:
             return np.zeros(0, dtype=np.bool_)  # of no detections at all
-        if view.name not in self.places:
-            return np.ones(len(points), dtype=np.bool_)
-        places, counts = self.places[view.name]
+        places, counts = self._known(view, points)
         static = places[counts >= frames]
         return np.asarray(_nearest(static, view.observation) == len(static))
+
+    def _known(self, view: View, points: Floats) -> tuple[Floats, Indices]:
+        """Places of a view that has points (M, m), and their counts; none before it was seen."""
+        return self.places.get(view.name, (points[:0], np.zeros(0, dtype=np.intp)))
 
 
 def _nearest(places: Floats, seen: Observation) -> Indices:
