@@ -21,7 +21,8 @@ from mixpose.search.from_points import (
 )
 from mixpose.search.poses import count_inliers, label_image
 from mixpose.search.problem import SearchProblem, sensor_detections
-from mixpose.search.three_points import align_triples, ray_triples
+from mixpose.search.three_points import align_triples
+from mixpose.search.triples import ray_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]

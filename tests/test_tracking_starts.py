@@ -261,8 +261,11 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     track = replace(tracker.begin(), met_before={"0": 5}, believed=3, frame=0)
 
-    def doubted(track: Track, met: int, log_evidence: float = 20.0, ratio: float = 0.5) -> bool:
-        seen = replace(sensor("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
+    def doubted(
+        track: Track, met: int, log_evidence: float = 20.0, ratio: float = 0.5, count: int = 8
+    ) -> bool:
+        shares = np.where(np.arange(8) < met, 1.0, 0.0)
+        seen = replace(sensor("0", met), shares=shares, count=float(count))
         judged = replace(scored(TRUTH, seen), log_evidence=log_evidence, residual_ratio=ratio)
         return is_doubtful(data_of(tracker, [], track), [judged])
 
@@ -274,6 +277,8 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     assert not doubted(track, 4)
     # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
     assert doubted(replace(track, met_before={"0": 8}), 5)
+    # but not where all that there is is met: nowhere else is more
+    assert not doubted(replace(track, met_before={"0": 8}), 5, count=5)
     for other in (
         replace(track, believed=2),
         replace(track, misses=1),

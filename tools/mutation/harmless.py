@@ -204,9 +204,9 @@ HARMLESS: tuple[Harmless, ...] = (
         "a share that is exactly the one that suffices",
     ),
     Harmless(
-        "search/three_points.py",
-        "detections = far_apart(rays.pixels, 3 * budget.sample // 2)",
-        "detections = far_apart(rays.pixels, 4 * budget.sample // 2)",
+        "search/triples.py",
+        "outer = far_apart(rays.pixels, 3 * budget.sample // 2)",
+        "outer = far_apart(rays.pixels, 4 * budget.sample // 2)",
         "only speed: more of the outermost detections are tried",
     ),
     Harmless(

@@ -33,6 +33,8 @@ from mixpose.search.three_points import (
     SIDES as SIDES,
     align_triples as align_triples,
     depths as depths,
+)
+from mixpose.search.triples import (
     far_apart as far_apart,
     sparse as sparse,
 )

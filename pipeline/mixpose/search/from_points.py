@@ -25,10 +25,10 @@ from mixpose.search.three_points import (
     SECOND,
     Guesses,
     align_triples,
-    far_apart,
     from_three_rays,
     gathered,
 )
+from mixpose.search.triples import far_apart
 from mixpose.sensors import Rays
 
 _AT_ONCE = 40_000  # pairs of rays: their numbers stay in the cache of a processor

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import islice
+from math import comb
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,7 +34,8 @@ from mixpose.search.problem import (
     can_fix,
     sensor_detections,
 )
-from mixpose.search.three_points import Guesses, sparse
+from mixpose.search.three_points import Guesses
+from mixpose.search.triples import sparse
 
 _MISSED = 4.0  # nats that a detection costs that is missed
 
@@ -181,7 +183,7 @@ class _Search:
         seen = max(min(most_seen, len(body)), 1)
         few, length = sparse(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
         poses, ranks, gains = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
-        best, checked, done = 0.0, 0.0, skipped
+        best, checked, done, made = 0.0, 0.0, skipped, 0
         for make in islice(generator, skipped, None):
             done += 1
             more = self._problem.allowed(make())
@@ -191,7 +193,7 @@ class _Search:
                 more = more[np.argsort(-rank, kind="stable")[: budget.shortlist]]
             self._cost["tested"] += len(more)
             rank = self._count(body, more)
-            likely = rank > ranks.max(initial=0.0) - budget.outdone / _MISSED
+            likely, before = rank > ranks.max(initial=0.0) - budget.outdone / _MISSED, poses[:1]
             poses = np.concatenate([poses, more[likely]])
             ranks = np.append(ranks, rank[likely])
             gains = np.append(gains, self._known(more[likely]))
@@ -199,6 +201,10 @@ class _Search:
             order = order[unlike(body, poses[order], budget.alike)][:length]
             poses, ranks, gains = poses[order], ranks[order], gains[order]
             best = float(ranks.max(initial=0.0))
+            if not self._confirm:
+                made = self._made_at(poses[:1], more[rank > best - 1], before, made)
+                if made * _share_of_rivals(best - budget.outdone / _MISSED, best) >= budget.again:
+                    break
             if best > 1.1 * checked + 1:
                 checked = best
                 if self._are_enough(poses[:3], best):
@@ -209,6 +215,19 @@ class _Search:
                 break
         self._refine(poses[ranks > best - budget.outdone / _MISSED], self._stages)
         return done
+
+    def _made_at(self, best: Floats, more: Floats, before: Floats, made: int) -> int:
+        """How many guesses put the body where the best (1, 4, 4) does, with `more` of this batch.
+
+        They were so many up to the one before it, if it was the best there.
+        """
+        means, near = self._body.means, self._budget.same * self._body.radius
+        there = transform(best, means)
+        at = [
+            np.linalg.norm(transform(some, means) - there, axis=2).mean(axis=1) < near
+            for some in (before, more)
+        ]
+        return made * int(np.count_nonzero(at[0])) + int(np.count_nonzero(at[1]))
 
     def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
@@ -279,3 +298,8 @@ class _Search:
             return evidence(self._problem, poses)
         shares = self._descent.objective().shares(poses)
         return shares.sum(axis=0), np.sqrt(shares).mean(axis=0)
+
+
+def _share_of_rivals(explained: float, best: float) -> float:
+    """Of the triples of detections of a pose, those of one that explains fewer."""
+    return comb(max(int(explained), 0), 3) / max(comb(int(best), 3), 1)

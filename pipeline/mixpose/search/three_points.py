@@ -13,9 +13,8 @@ runs over long rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import lru_cache, partial
-from itertools import combinations, permutations, product
-from math import comb, perm
+from functools import partial
+from itertools import product
 from typing import TypeAlias
 
 import numpy as np
@@ -24,13 +23,13 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.records import Floats, Indices
 from mixpose.rigid import cross, from_parts
-from mixpose.search.problem import SearchProblem, is_pointlike
+from mixpose.search.problem import SearchProblem
+from mixpose.search.triples import ray_triples
 from mixpose.sensors import Rays
 
 # batches of poses (K, 4, 4), worked out when they are called: what is skipped costs nothing
 Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 
-_FACING, _SIDE = 0.5, 0.9  # cosines of normals that are seen together, and of one side
 _TINY = np.finfo(np.float64).tiny
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
@@ -166,90 +165,6 @@ def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Guesses
         yield partial(solve, problem.body, reach, rays, *triples)
 
 
-def far_apart(points: Floats, count: int) -> Indices:
-    """Indices of points that are far from one another, starting at the outermost."""
-    distance, chosen = np.linalg.norm(points - points.mean(axis=0), axis=1), list[int]()
-    for k in range(min(count, len(points))):
-        chosen.append(int(distance.argmax()))
-        from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        distance = np.minimum(distance, from_last) if k else from_last
-    return np.array(chosen)
-
-
-@lru_cache(maxsize=32)
-def sparse(body: Body, count: int) -> Body:
-    """A body with `count` of its features, far from one another; itself where it has no more."""
-    if len(body) <= count or not is_pointlike(body):
-        return body
-    few = far_apart(body.means, count)
-    normals = None if body.normals is None else body.normals[few]
-    return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
-
-
-def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
-    """Batches of problems: three detections (3, K) as three features (3, K).
-
-    All, where they can be tried; else of detections and of the features of a side those far apart
-    first, which fix a pose best, unless most detections are false: the outermost are the body's no
-    more.  Then near detections as features that are near each other, at random.
-    """
-    budget, features, cameras = problem.budget, problem.body.means, len(problem.cameras)
-    rng = np.random.default_rng(problem.seed)
-    n, M, batch, most = len(features), len(rays), budget.batch, budget.max_problems
-    if cameras > 1:  # a hit of one is enough: of half as many, one of two misses 1 body in 24
-        most //= 4 * cameras
-    all_tried = comb(M, 3) * perm(n, 3) <= most
-    if all_tried or budget.crowded * n >= M:
-        detections, corners = np.arange(M), [np.arange(n)]
-        if not all_tried:
-            most //= 2
-            detections = far_apart(rays.pixels, 3 * budget.sample // 2)
-            sides = _sides(problem.body)
-            corners = [side[far_apart(features[side], budget.sample)] for side in sides]
-        by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
-        triples = [triple for some in corners for triple in permutations(some.tolist(), 3)]
-        # of sides with less than three features there are none
-        by_feature = np.array(list(dict.fromkeys(triples)), dtype=np.intp).reshape(-1, 3).T
-        order = rng.permutation(by_detection.shape[1] * by_feature.shape[1])[:most]
-        for start in range(0, len(order), batch):
-            a, b = np.divmod(order[start : start + batch], by_feature.shape[1])
-            yield by_detection[:, a], by_feature[:, b]
-    if all_tried:
-        return
-    # indices of points, from each of them to its farthest
-    near_rays, near_features = (
-        np.argsort(np.linalg.norm(p[:, None] - p, axis=2), axis=1) for p in (rays.pixels, features)
-    )
-    # a body is seen in one place, larger or smaller
-    crowds = [budget.sample, 2 * budget.sample, 4 * budget.sample, M]
-    for k in range(most // batch):
-        crowd = crowds[k % len(crowds)]
-        some, few = min(crowd, M), min(max(crowd // 2, 3), n)
-        yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
-
-
-@lru_cache(maxsize=32)
-def _sides(body: Body) -> list[Indices]:
-    """Features that face about the same way as one of them, until each is among those of a side."""
-    if body.normals is None:
-        return [np.arange(len(body))]
-    cosines, sides = body.normals @ body.normals.T, list[Indices]()
-    left = np.ones(len(body), dtype=np.bool_)
-    while left.any():
-        own = cosines[left.argmax()]
-        sides.append(np.flatnonzero(own > _FACING))
-        left &= own < _SIDE
-    return sides
-
-
-def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
-    """Random triples (3, count): a point, and two of the `crowd - 1` nearest to it."""
-    first = rng.integers(0, len(nearest), count)
-    # the two that are drawn lowest: among thousands, to sort them all is most of a search
-    chosen = np.argpartition(rng.random((count, crowd - 1)), 1, axis=1)[:, :2].T + 1
-    return np.stack([first, *nearest[first, chosen]])
-
-
 def _perspective(
     body: Body, reach: float, rays: Rays, detections: Indices, corners: Indices
 ) -> Floats:
@@ -266,8 +181,10 @@ def _perspective(
     poses = align_triples(gathered(features, corners), rays.origins[0][:, None] + away)
     if body.normals is None:
         return poses
-    outward = np.einsum("kij,cjk->cik", poses[:, :3, :3], gathered(body.normals, corners))
-    return np.asarray(poses[((outward * away).sum(axis=1) < 0).all(axis=0)])
+    columns = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
+    normals = zip(gathered(body.normals, corners), away, strict=True)
+    facing = [_dot(np.asarray(sum(map(np.multiply, own, columns))), to) < 0 for own, to in normals]
+    return np.asarray(poses[np.all(facing, axis=0)])
 
 
 def _orthographic(

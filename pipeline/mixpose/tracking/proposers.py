@@ -74,8 +74,10 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
     is_new |= len(track.branches) != 1
-    before = sum(track.met_before.values())
-    misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
+    before, used = sum(track.met_before.values()), ranked[0].used
+    # if detections are left that it may be met by elsewhere
+    misses_more = np.count_nonzero(used.shares) <= rules.acceptance.convincing * before
+    misses_more &= bool((ranked[0].matches.count > ranked[0].matches.met + 0.5).any())
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
