@@ -117,6 +117,18 @@ def test_of_three_cameras_two_of_which_were_bumped_none_is_named() -> None:
     assert not any("MOVED" in line for line in lines)
 
 
+def test_cameras_without_a_common_view_do_not_say_which_of_two_others_moved() -> None:
+    sensors = cameras(5)
+    frames = recording(sensors, 14, 0.05)
+    frames = tuple(replace(f, points={k: y for k, y in f.points.items() if k < 2}) for f in frames)
+    task = bumped(task_of(sensors, frames), 1, 0.8, 9.0)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    assert found.unlinked == (2, 3, 4)
+    *lines, last = check_lines(found, "mm")
+    assert last.endswith("of two sensors no one can tell which moved")
+    assert not any("MOVED" in line for line in lines)
+
+
 def test_a_camera_that_meets_nothing_as_it_stood_has_moved() -> None:
     sensors = cameras(3)
     frames = recording(sensors, 14, 0.05)

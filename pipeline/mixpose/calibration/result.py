@@ -177,11 +177,13 @@ class Displacement:
 
 
 def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displacement, ...]:
-    """Compare a calibration with the one it began from."""
-    G = _consensus(found.before, found.after)
+    """Compare a calibration with the one it began from: all sensors that share views."""
+    linked = [k for k in range(len(found.after.names)) if k not in found.unlinked]
+    G = _consensus(found.before, found.after, linked)
     deviations = _deviations(found)
     told = []
-    for index, name in enumerate(found.after.names):
+    for index in linked:
+        name = found.after.names[index]
         turn, shift = _apart(found.before, found.after, index, G)
         sd_turn, sd_shift = deviations[index]
         each = found.residuals[index]
@@ -200,17 +202,16 @@ def before_and_after(before: Rig, after: Rig, index: int) -> tuple[Floats, Float
     return None if old is None or new is None else (old, new)
 
 
-def _consensus(before: Rig, after: Rig) -> Floats:
-    """The motion of the world (4, 4) after which most sensors stand where they stood."""
+def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
+    """The motion of the world (4, 4) after which most of some sensors stand where they stood."""
     # that of the sensor from which the others differ least: the bumped ones are outvoted
-    count = len(before.names)
-    poses = [before_and_after(before, after, k) for k in range(count)]
+    poses = [before_and_after(before, after, k) for k in linked]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
         return told[0] if told else _from_places(before, after)
     worth = []
     for G in told:
-        apart = [_apart(before, after, k, G) for k in range(count)]
+        apart = [_apart(before, after, k, G) for k in linked]
         worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
     return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
 

@@ -283,9 +283,8 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     bumped = [one.name for one in told if one.moved]
     are_told = 2 * len(bumped) < len(told)  # most of them agree
     lines = [_frames_line(found)]
-    for index, one in enumerate(told):
-        if index in found.unlinked:
-            continue
+    for one in told:
+        index = found.after.names.index(one.name)
         of, before = _unit_of(found, index, unit), one.residual_before
         text = f"residual {before:.3g} {of}" if np.isfinite(before) else "meets nothing"
         lines.append(
