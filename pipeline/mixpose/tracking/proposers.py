@@ -56,7 +56,7 @@ def _are_ranges(frame: Frame) -> bool:
     return are_associated(frame.views, frame.body, frame.rules.ranges)
 
 
-def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
+def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
     Once it was followed for some frames, a pose convinces that misses no more all at once and that
@@ -81,6 +81,11 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
+
+
+def is_there(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
+    """Whether the body is where it was expected, or found with others, and looked for no more."""
+    return frame.first_is(frame.trusted, ranked) or not is_doubtful(frame, ranked)
 
 
 def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:

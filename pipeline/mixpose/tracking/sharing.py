@@ -25,7 +25,7 @@ from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import MatchedLikelihood, case_of
-from mixpose.tracking.proposers import predicted
+from mixpose.tracking.proposers import is_there, predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
 from mixpose.tracking.tracker import Tracker, judged_again, weighed_at
@@ -68,6 +68,8 @@ class Sharing:
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
     looked: bool = False  # whether they were looked for among points that cameras see together
+    # where these may show bodies that have claimed nothing
+    shown: dict[int, Starts] = field(default_factory=dict)
     # what explanations meet, and whose detections are by what `claimed` bodies meet
     met: dict[int, tuple[Explanation, Met]] = field(default_factory=dict)
     taken: tuple[Mapping[int, Met], Claims | None] = field(default=({}, None))
@@ -76,7 +78,9 @@ class Sharing:
         """The poses of all bodies."""
         self._all_from(self._expected())
         if len(self.claimed) < len(self.bodies):
-            self._all_from(self._found_at_once())
+            self._all_from(shown := self._found_at_once())
+            waiting = [k for k in shown if k not in self.claimed]
+            self.shown = {k: shown[k] for k in waiting if self._is_possible(k)}
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
@@ -138,7 +142,7 @@ class Sharing:
             self.claimed = before + [
                 k
                 for k, one in self.found.items()
-                if k not in before and one.frame.first_is(one.frame.trusted, one.ranked)
+                if k not in before and is_there(one.frame, one.ranked)
             ]
             claims = self._claims()
             changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
@@ -238,8 +242,8 @@ class Sharing:
         # points in space were looked at: about where it must be, if it was there just now
         around = predicted(data, [])
         near = tuple(one for one in around if not track.misses or self._is_near(data, one))
-        data = replace(data, starts=near)
-        ranked = self.bodies[k].explain(data, quickly=True) if near else []
+        data = replace(data, starts=(*near, *self.shown.get(k, ())))
+        ranked = self.bodies[k].explain(data, quickly=True) if data.starts else []
         return Explanation(data, left, ranked)
 
     def _judge_again(self) -> None:

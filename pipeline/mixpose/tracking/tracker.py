@@ -26,7 +26,14 @@ from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, likelihood_of
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, Proposer, congruent, predicted, searched
+from mixpose.tracking.proposers import (
+    PROPOSERS,
+    Proposer,
+    congruent,
+    is_there,
+    predicted,
+    searched,
+)
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
@@ -170,7 +177,7 @@ class Tracker(Setup):
     def explain(self, data: Frame, *, quickly: bool = False) -> list[ScoredPose]:
         """Propose, fit and judge poses: distinct ones, the most evident first.
 
-        `quickly` stops where the body is not convincing where it is expected.
+        `quickly` stops where the body is not where it is expected.
         """
         likelihood, ranked, fits = likelihood_of(data), list[ScoredPose](), list[Fit]()
 
@@ -189,7 +196,7 @@ class Tracker(Setup):
                     for refine in self.refinements:
                         for better in refine(data, likelihood, judged):
                             consider(better, likelihood.fit(better), refine.__name__)
-            if quickly and not data.first_is(data.trusted, ranked):
+            if quickly and not is_there(data, ranked):
                 break
             quickly = False
         weighed = weighed_at(data, ranked[0]) if ranked else data
