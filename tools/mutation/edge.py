@@ -119,7 +119,7 @@ _SIMULATION = (
     ),
 )
 
-_DIAGNOSIS = ("test_check_diagnosis.py",)
+_DIAGNOSIS = ("test_check_diagnosis.py", "test_check_values.py")
 
 _CHECKING = (
     Mutant(
