@@ -81,6 +81,26 @@ def _listed(path: Path) -> list[Path]:
     return [each if (each := Path(name)).exists() else path.parent / name for name in names]
 
 
+def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
+    """Raise SessionError for options that serve a single recording."""
+    alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
+    alone["--pause"] = "" if request.pause else None
+    others = [session.name for session in sessions if not session.exists()]
+    for option, value in alone.items():
+        if not value and value != "":  # the usual port, or an option without a value
+            continue
+        if option == "--view" and others:
+            raise SessionError(
+                f"--view: found {others[0]}, neither a port nor a session file; allowed: nothing, "
+                "PORT or HOST:PORT"
+            )
+        shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
+        found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
+        raise SessionError(
+            f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
+        )
+
+
 def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) -> int:
     """Estimate many recordings, say in the end how each of them went, and return the worst exit
     status.
@@ -89,15 +109,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     output is made if it is not there; `workers` count on a cluster only where it is a local one.
     Raises SessionError if there is no folder for the poses, or an option serves a single recording.
     """
-    alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
-    alone["--pause"] = "" if request.pause else None
-    for option, value in alone.items():
-        if value or value == "":  # the usual port, or an option without a value
-            shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
-            found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
-            raise SessionError(
-                f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
-            )
+    _refuse_alone(sessions, request)
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)
     _refuse_others(folder, jobs)
