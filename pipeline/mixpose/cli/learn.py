@@ -37,8 +37,8 @@ def learn_session(request: LearnRequest) -> None:
     refuse_to_overwrite_but(request.output, inputs, MARK)
     refuse_suffix(request.output, "-o", (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
-    if others := [one.name for one in session.sensors if one.sensor.dimension != 2]:
-        warn(f"{', '.join(others)}: bodies are learnt from what cameras see, and not from this")
+    if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
+        warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
     with watched() as progress:
         lesson = learn(session, named_sources(request.source or ()), progress)
     bodies = _in_frames(lesson, request, older)

@@ -17,7 +17,7 @@ from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import State, blocks_of
 from mixpose.learning.growing import Found, Places, only_once, usual_reach
 from mixpose.learning.placing import FEWEST, body_of
-from mixpose.learning.points import Cloud
+from mixpose.learning.points import Cloud, are_points
 from mixpose.learning.rules import RULES
 from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
@@ -44,7 +44,7 @@ class Learnt:
     points: Floats  # (N, 3)
     # (N, 3, 3): of each marker, the body's frame being where its markers are on average
     covariances: Floats
-    frames: Indices  # (N,): frames in which two sensors or more saw it
+    frames: Indices  # (N,): frames in which two cameras or more saw it, or a cloud
     poses: Floats  # (K, 4, 4): T_world_object in the frames that were adjusted
     numbers: Indices  # (K,): of these frames; of congruent bodies each has its own pose
     count: int  # congruent bodies that were seen at a time
@@ -90,7 +90,7 @@ def adjusted(bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes) -> li
         points = body.shape.points
         while len(points) >= FEWEST:
             found = _adjusted(points, frames, poses, eyes)
-            seen = _seen(found, len(points), len(frames))
+            seen = _seen(found, len(points), len(frames), eyes)
             kept = seen >= max(RULES.least_frames, RULES.least_share * len(frames))
             near = RULES.alike * RULES.gate * usual_reach(body.places, clouds)
             kept &= only_once(found.state.rig.points, seen, np.full(len(points), near))
@@ -206,11 +206,12 @@ def _met(found: Adjusted) -> Floats:
     return np.array([len(pairs) for pairs in _pairs_met(found)], dtype=np.float64)
 
 
-def _seen(found: Adjusted, markers: int, frames: int) -> Indices:
-    """Frames (N,) in which two sensors or more met a marker."""
+def _seen(found: Adjusted, markers: int, frames: int, eyes: Eyes) -> Indices:
+    """Frames (N,) in which two cameras or more met a marker, or a cloud."""
     met = np.zeros((frames, markers), dtype=np.intp)
-    for pairs in _pairs_met(found):
-        np.add.at(met, tuple(pairs.T), 1)
+    counts = 1 + are_points(eyes.rig.sensors)
+    for pairs, count in zip(_pairs_met(found), counts, strict=True):
+        np.add.at(met, tuple(pairs.T), count)
     return np.asarray((met >= 2).sum(axis=0))
 
 

@@ -8,6 +8,7 @@ along with them is there with the one or with the other, and never with both at 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import pdtr
@@ -33,7 +34,7 @@ def with_copies(body: Found, clouds: Sequence[Cloud]) -> Found:
     places = placed(shape, clouds, RULES.most_bodies, least)
     # seldom two at a time: the one body, also where it shows fewer points
     if np.sum(_per_frame(places, clouds) > 1) < seen_often(len({k for k, _ in places})):
-        return Found(averaged(shape, places, clouds), tuple(places))
+        return _averaged(shape, places, clouds)
     count = _count(shape, places, clouds)
     strange = _is_strange(shape, places, count)
     others = _never_with(shape, places, strange)
@@ -45,7 +46,14 @@ def with_copies(body: Found, clouds: Sequence[Cloud]) -> Found:
         count -= 1
     if count == 1:
         places = placed(shape, clouds)
-    return Found(averaged(shape, places, clouds), tuple(places), count)
+    return _averaged(shape, places, clouds, count)
+
+
+def _averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], count: int = 1) -> Found:
+    """So many bodies of the shape that places show on average, met at the points that are left."""
+    mean, kept = averaged(shape, places, clouds)
+    left = [(k, replace(one, met=one.met[kept])) for k, one in places]
+    return Found(mean, tuple([(k, one) for k, one in left if one.count >= FEWEST]), count)
 
 
 def is_chance(body: Found, clouds: Sequence[Cloud]) -> bool:

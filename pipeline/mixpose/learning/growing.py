@@ -71,7 +71,7 @@ def grown(shape: Shape, clouds: Sequence[Cloud]) -> Found | None:
         places = placed(shape, clouds)
         if len(places) < RULES.least_frames:
             return None
-        shape = averaged(shape, places, clouds)
+        shape, _ = averaged(shape, places, clouds)
         if len(shape) < FEWEST:
             return None
         if turn + 1 == RULES.rounds:
@@ -111,8 +111,11 @@ def _poses_apart(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple
     return number, count
 
 
-def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> Shape:
-    """The shape as its frames show it on average, without points that few of them show."""
+def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple[Shape, Mask]:
+    """The shape as its frames show it on average, without points that few of them show.
+
+    And which of its points (N,) are left.
+    """
     weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
     counts, reach = np.zeros(len(shape)), np.zeros(len(shape))
     number, different = _poses_apart(shape, places, clouds)
@@ -129,7 +132,7 @@ def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> Shape:
     near = RULES.alike * RULES.gate * reach / np.maximum(counts, 1)
     kept &= only_once(shape.points, counts, near)
     middle = total[kept] / weight[kept, None]
-    return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept]))
+    return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept])), kept
 
 
 def only_once(points: Floats, counts: Floats | Indices, near: Floats) -> Mask:

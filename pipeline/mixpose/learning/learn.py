@@ -28,18 +28,20 @@ class Lesson:
     bodies: tuple[Learnt, ...]  # in their principal axes, those of which most was seen first
     still: int  # other things that were seen and stood still all the time
     frames: int  # that were read
-    noise: float  # deviation of detections as a share of σ_ε, by how closely lines of sight meet
+    # deviation of detections of cameras as a share of σ_ε, by how closely lines of sight meet
+    noise: float
 
 
 def eyes_of(session: Session) -> Eyes:
-    """The sensors of a session; a SessionError if fewer than two have lines of sight."""
+    """The sensors of a session; a SessionError without two that have lines of sight, or a cloud."""
     setups = session.sensors
     seeing = [one.name for one in setups if one.sensor.dimension == 2]
-    if len(seeing) < 2:
+    if len(seeing) < 2 and not any(one.sensor.dimension == 3 for one in setups):
         raise SessionError(
             f"{session.path}: learn: found {len(seeing)} camera{'s' * (len(seeing) != 1)}; "
-            "allowed: two or more that see the body at the same time. With one, put a rough guess "
-            "of the markers into [object] and let mixpose calibrate --free body adjust it"
+            "allowed: two or more that see the body at the same time, or a cloud of points. With "
+            "one camera, put a rough guess of the markers into [object] and let mixpose calibrate "
+            "--free body adjust it"
         )
     errors = {k: one.calibration_error for k, one in enumerate(setups) if one.calibration_error}
     return Eyes(rig_of(session), np.array([one.extract.sigma for one in setups]), errors)
@@ -51,8 +53,8 @@ def learn(
     """Learn the bodies that move in a session's recording.
 
     The session's own bodies are not looked at; `sources` stand in place of its recordings.  Raises
-    SessionError if there are fewer than two cameras, RecordingError if the recording cannot be
-    read, or shows no body that moves.
+    SessionError if there are fewer than two cameras and no cloud, RecordingError if the recording
+    cannot be read, or shows no body that moves.
     """
     eyes = eyes_of(session)
     read = replace(

@@ -1,4 +1,4 @@
-"""Points in space of each frame, where lines of sight of two sensors or more meet.
+"""Points in space of each frame, where lines of sight of two cameras or more meet, or of clouds.
 
 And what of them does not move: points that are at one place of the world in most frames.
 """
@@ -14,9 +14,11 @@ from scipy.special import erf
 
 from mixpose.calibration import SeenFrame
 from mixpose.learning.rules import RULES
+from mixpose.matching import ErrorRules
 from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import inverse, transform
 from mixpose.search import triangulate
-from mixpose.sensors import Rays, Sensor
+from mixpose.sensors import CloudSensor, Rays, Sensor
 
 _STEPS = 3  # of Gauss-Newton, from the middle between two rays
 _SHARES = np.logspace(-2.5, 0.3, 60)  # deviations that are tried, by the gate
@@ -57,25 +59,35 @@ class Cloud:
 def clouds_of(
     frames: Sequence[SeenFrame], sensors: Sequence[Sensor], sigmas: Floats
 ) -> tuple[list[Cloud], float]:
-    """Triangulate every frame; and the deviation of detections, as a share of their σ_ε (L,)."""
+    """Triangulate every frame; and the deviation of detections, as a share of their σ_ε.
+
+    That of cameras, by how closely lines of sight meet; points of clouds do not tell theirs.
+    """
     told = [_seen(frame, sensors) for frame in frames]
     wide = RULES.widest * sigmas
     some = np.linspace(0, len(told) - 1, min(len(told), RULES.probes)).astype(int)
     gaps = [_meetings(told[k][1], wide)[2] for k in np.unique(some)]
     noise = max(RULES.widest * _deviation(np.concatenate([np.zeros(0), *gaps])), RULES.quietest)
-    gates = min(RULES.gate * noise, RULES.widest) * sigmas
-    return [_cloud(*each, sensors, noise * sigmas, gates) for each in told], noise
+    shares = np.where(are_points(sensors), ErrorRules().typical, noise)
+    gates = np.minimum(RULES.gate * shares, RULES.widest) * sigmas
+    return [_cloud(*each, sensors, shares * sigmas, gates) for each in told], noise
+
+
+def are_points(sensors: Sequence[Sensor]) -> Mask:
+    """Which sensors (L,) measure points in space: one of them shows what cameras show by two."""
+    return np.array([isinstance(sensor, CloudSensor) for sensor in sensors])
 
 
 def _seen(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[int, Rays]]:
-    """The frame with those detections that have a line of sight, and these."""
-    rays: dict[int, Rays] = {}
+    """The frame with those detections that are points or have a line of sight, and these lines."""
+    rays, seen = dict[int, Rays](), dict[int, Floats]()
     for sensor, points in sorted(frame.points.items()):
         found = sensors[sensor].rays(points) if len(points) else None
         if found is not None and len(found):
-            rays[sensor] = found
-    pixels = {sensor: found.pixels for sensor, found in rays.items()}
-    return SeenFrame(frame.number, frame.time_s, pixels, frame.times), rays
+            rays[sensor], seen[sensor] = found, found.pixels
+        elif len(points) and isinstance(sensors[sensor], CloudSensor):
+            seen[sensor] = points
+    return SeenFrame(frame.number, frame.time_s, seen, frame.times), rays
 
 
 def _meetings(rays: dict[int, Rays], gates: Floats) -> tuple[Floats, Indices, Floats]:
@@ -118,7 +130,10 @@ def _cloud(
     frame: SeenFrame, rays: dict[int, Rays], sensors: Sequence[Sensor], noise: Floats, gates: Floats
 ) -> Cloud:
     points, detections, gaps = _meetings(rays, gates)
-    if len(rays) > 2 and len(points):
+    measured, own = _measured(frame, sensors)
+    points, detections = np.concatenate([points, measured]), np.concatenate([detections, own])
+    gaps = np.append(gaps, np.zeros(len(own)))
+    if len(frame.points) > min(len(rays), 2) and len(points):
         detections = _supported(points, detections, gaps, frame, sensors, gates)
         kept = (detections >= 0).any(axis=1)
         points, detections = points[kept], detections[kept]
@@ -126,6 +141,17 @@ def _cloud(
     fine = np.isfinite(np.column_stack([points, reach])).all(axis=1)
     rows = np.arange(np.count_nonzero(fine))
     return Cloud(points[fine], reach[fine], detections[fine], rows, frame)
+
+
+def _measured(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[Floats, Indices]:
+    """The points (P, 3) of clouds, in the world, and their detections (P, L)."""
+    points, detections = [np.zeros((0, 3))], [np.zeros((0, len(sensors)), dtype=np.intp)]
+    for k, seen in frame.points.items():
+        if isinstance(sensor := sensors[k], CloudSensor):
+            points.append(transform(inverse(sensor.T_sensor_world), seen))
+            detections.append(np.full((len(seen), len(sensors)), -1))
+            detections[-1][:, k] = np.arange(len(seen))
+    return np.concatenate(points), np.concatenate(detections)
 
 
 def _supported(
@@ -138,26 +164,27 @@ def _supported(
 ) -> Indices:
     """Detections (P, L) of all sensors that see the points; -1 throughout for those left out.
 
-    Of points that share detections the one that most sensors confirm stays; what only two sensors
-    see is a ghost where one of its detections belongs to a point of three or more.
+    Of points that share detections the one that most sensors confirm stays; what only two cameras
+    see is a ghost where one of its detections belongs to a point of three or more, as which a point
+    of a cloud counts.
     """
-    off = gaps.copy()
+    off, each = gaps.copy(), np.where(are_points(sensors), 3, 1)
     for sensor, pixels in frame.points.items():
         y, visible = sensors[sensor].project(points)
         away, nearest = cKDTree(pixels).query(y)
         found = visible & (away < gates[sensor]) & (detections[:, sensor] < 0)
         detections[found, sensor] = nearest[found]
         off[found] += away[found] / gates[sensor]
-    views = (detections >= 0).sum(axis=1)
+    views: Indices = np.asarray((detections >= 0) @ each, dtype=np.intp)
     taken = [set[int]() for _ in sensors]
     kept = np.zeros(len(points), dtype=np.bool_)
     for k in np.lexsort((off / views, -views)):
         own = [(s, d) for s, d in enumerate(detections[k].tolist()) if d >= 0]
-        shared = sum(d in taken[s] for s, d in own)
-        if shared > max(len(own) - 3, 0):
+        shared = sum(int(each[s]) for s, d in own if d in taken[s])
+        if shared > max(views[k] - 3, 0):
             continue
         kept[k] = True
-        if len(own) > 2:
+        if views[k] > 2:
             for s, d in own:
                 taken[s].add(d)
     return np.where(kept[:, None], detections, -1)

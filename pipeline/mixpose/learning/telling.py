@@ -76,7 +76,7 @@ def doubts_of(learnt: Learnt, name: str, unit: str) -> list[str]:
             f"{name}: its markers map onto themselves in {turns - 1} other "
             f"way{'s' * (turns > 2)}: such poses cannot be told apart; move or add a marker"
         )
-    for sensor, met in learnt.met.items():
+    for sensor, met in learnt.met.items() if len(learnt.met) > 1 else ():
         others = float(np.median([each for one, each in learnt.met.items() if one != sensor]))
         if met < _HARDLY * others:
             told.append(
