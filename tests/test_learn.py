@@ -287,12 +287,16 @@ def test_the_command_writes_a_table_that_the_same_session_reads(tmp_path: Path) 
 def test_what_no_camera_saw_is_said_to_be_left_out(tmp_path: Path) -> None:
     frames = detections([moving(4, 5)], CAMERAS, SHORT, 1)
     path = write_recording(tmp_path, frames, CAMERAS)
-    (tmp_path / "points.csv").write_text("frame,x,y,z\n0,1,2,3\n", encoding="utf-8")
+    (tmp_path / "anchor.csv").write_text("frame,range\n0,900\n", encoding="utf-8")
     with path.open("a", encoding="utf-8") as session:
-        session.write('\n[[sensor]]\nname = "points"\nmodel = "cloud"\nsource = "points.csv"\n')
+        session.write(
+            '\n[[sensor]]\nname = "anchor"\nmodel = "lateration"\nsource = "anchor.csv"\n'
+        )
+        session.write("position = [0, 0, 900]\n")
     done = command("learn", path, "-o", "body.csv", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "points: bodies are learnt from what cameras see, and not from this" in done.stderr
+    said = "anchor: bodies are learnt from cameras and clouds, and not from this"
+    assert said in done.stderr
 
 
 def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from mixpose.search import THOROUGH, SearchBudget, search_frame
 from mixpose.search.problem import SearchProblem
 from mixpose.search.search import _share_of_rivals
 from mixpose.search.three_points import _perspective
-from mixpose.search.triples import ray_triples
+from mixpose.search.triples import _seen_together, ray_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -48,18 +48,28 @@ def seen(body: Body, noise: float = 0.05) -> View:
     return view
 
 
-@pytest.mark.parametrize("again", [inf, THOROUGH.again])
-def test_a_search_ends_where_a_rival_of_its_pose_would_have_been_seen(again: float) -> None:
+@pytest.mark.parametrize("repeats", [inf, THOROUGH.repeats])
+def test_a_search_ends_where_a_rival_of_its_pose_would_have_been_seen(repeats: float) -> None:
     body = box()
     view = seen(body)
     assert view.observation.cells == 18
-    budget = SearchBudget(again=again)
+    budget = SearchBudget(repeats=repeats)
     found = search_frame([view], body, free=ALL_FREE, T_reference=None, budget=budget)
     best = found.candidates[0].T_world_object
     assert rotation_angle_deg(best, POSE) < 0.2
     # 455 of 816 triples of 18 detections are of any 15 of them, so that 13 guesses at the pose are
     # enough, which the first batches of sixty have
-    assert (found.report.made < 20_000) == (again < inf)
+    assert (found.report.made < 20_000) == (repeats < inf)
+
+
+def test_walls_that_face_each_other_are_seen_together() -> None:
+    """Of a channel a camera sees both walls inside; of a board one of its two sides."""
+    y, z = (one.ravel() for one in np.meshgrid((-40.0, 0.0, 40.0), (-30.0, 30.0)))
+    walls = [np.column_stack([np.full(6, x), y, z]) for x in (-50.0, 50.0)]
+    inward = np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], 6, axis=0)
+    features = tuple(PointFeature(point) for point in np.concatenate(walls))
+    assert _seen_together(Body("channel", features, inward)).shape == (3, 12 * 11 * 10)
+    assert _seen_together(Body("board", features, -inward)).shape == (3, 2 * 6 * 5 * 4)
 
 
 def test_a_rival_that_explains_less_is_led_to_by_fewer_triples() -> None:

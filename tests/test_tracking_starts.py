@@ -14,6 +14,7 @@ from matches import Seen, matches_of, scored
 from numpy.typing import NDArray
 
 from mixpose.body import ASIDE, Body, PointFeature
+from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import (
     AcceptanceRules,
@@ -22,6 +23,7 @@ from mixpose.judgement import (
     ScoredPose,
 )
 from mixpose.objective import View
+from mixpose.records import GridPattern
 from mixpose.rigid import (
     from_rotation_vector,
     perturb,
@@ -277,8 +279,18 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     assert not doubted(track, 4)
     # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
     assert doubted(replace(track, met_before={"0": 8}), 5)
-    # but not where all that there is is met: nowhere else is more
+    # but not where all that there is is met: nowhere else is more; of grey values nobody counts it
     assert not doubted(replace(track, met_before={"0": 8}), 5, count=5)
+    grey = GridPattern(np.ones((4, 4), np.float32), np.zeros(2), 1.0)
+    seen = replace(sensor("0", 5.0), shares=np.where(np.arange(8) < 5, 1.0, 0.0), count=5.0)
+    judged = replace(scored(TRUTH, seen), log_evidence=20.0, residual_ratio=0.5)
+    camera = PinholeCamera(np.diag([800.0, 800.0, 1.0]))
+    data = data_of(
+        tracker,
+        [View("0", camera, Observation(grey, 1.5))],
+        replace(track, met_before={"0": 8}),
+    )
+    assert is_doubtful(data, [judged])
     for other in (
         replace(track, believed=2),
         replace(track, misses=1),

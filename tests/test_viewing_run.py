@@ -177,6 +177,6 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
     many = command("run", TWO, RANGES, "-o", tmp_path / "many", "--view")
     assert_one_line(many, 2, f"--view: found 2 sessions ({TWO}, {RANGES}), allowed with one only")
     taken = command("run", TWO, "--view", "abc")
-    assert_one_line(taken, 2, "--view: found abc, neither a port nor a session file; allowed: ")
+    assert_one_line(taken, 2, f"{os.sep}abc: no such session file; after --view allowed are a port")
     with pytest.raises(SessionError, match="--pause: a live source does not wait"):
         Viewer(load_session(TWO), "0", print, on_files=False, paused=True)

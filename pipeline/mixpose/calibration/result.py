@@ -208,7 +208,7 @@ def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
     poses = [before_and_after(before, after, k) for k in linked]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
-        return told[0] if told else _from_places(before, after)
+        return told[0] if told else _from_places(before, after, linked)
     worth = []
     for G in told:
         apart = [_apart(before, after, k, G) for k in linked]
@@ -216,10 +216,10 @@ def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
     return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
 
 
-def _from_places(before: Rig, after: Rig) -> Floats:
+def _from_places(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
     """The best motion between range sensors."""
-    a = np.array([centre_of(s) for s in after.sensors])
-    b = np.array([centre_of(s) for s in before.sensors])
+    a = np.array([centre_of(after.sensors[k]) for k in linked])
+    b = np.array([centre_of(before.sensors[k]) for k in linked])
     if len(a) < 3:
         return from_parts(np.eye(3), (b - a).mean(axis=0))
     return motions(a, b[None])[0]  # type: ignore[no-any-return]

@@ -85,14 +85,13 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
     """Raise SessionError for options that serve a single recording."""
     alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
     alone["--pause"] = "" if request.pause else None
-    others = [session.name for session in sessions if not session.exists()]
     for option, value in alone.items():
-        if not value and value != "":  # the usual port, or an option without a value
-            continue
-        if option == "--view" and others:
+        if not value and value != "":
+            continue  # not asked for; empty are the usual port, and an option without a value
+        if option == "--view" and not value and not sessions[-1].exists():
             raise SessionError(
-                f"--view: found {others[0]}, neither a port nor a session file; allowed: nothing, "
-                "PORT or HOST:PORT"
+                f"{sessions[-1]}: no such session file; after --view allowed are a port, HOST:PORT "
+                "or nothing"
             )
         shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
         found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")

@@ -57,10 +57,10 @@ class SearchBudget:
     outdone: float = constant(
         12.0, "nats behind the best from which poses are out: right ones were 4.2 behind at most"
     )
-    again: float = constant(
-        7.0, "guesses at the best pose, of triples that a rival has too: e⁻⁷ are left unseen"
+    repeats: float = constant(
+        7.0, "guesses at the best pose, of triples that a rival has too: about e⁻⁷ are left unseen"
     )
-    same: float = constant(0.25, "radii between guesses at one pose: as far as a grid slips")
+    same_pose: float = constant(0.25, "radii between guesses at one pose: as far as a grid slips")
     useful: float = constant(-np.inf, "evidence that a pose must have to be of any use")
     descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2), (0.4, 2)),

@@ -130,6 +130,7 @@ class _Search:
             one.rays is not None for one in problem.detections
         )
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
+        self._is_alone = self._by_evidence and len(cameras) == 1
         self._descent = Descent(
             views, sparse(self._body, 4 * self._budget.sample), problem.free, self._budget
         )
@@ -181,9 +182,10 @@ class _Search:
         # of the sides of a body that are turned away nothing is seen
         most_seen = max(len(rays) for _, rays in self._problem.cameras)
         seen = max(min(most_seen, len(body)), 1)
+        behind = budget.outdone / _MISSED  # detections
         few, length = sparse(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
         poses, ranks, gains = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
-        best, checked, done, made = 0.0, 0.0, skipped, 0
+        best, checked, done, alike = 0.0, 0.0, skipped, 0
         for make in islice(generator, skipped, None):
             done += 1
             more = self._problem.allowed(make())
@@ -193,7 +195,7 @@ class _Search:
                 more = more[np.argsort(-rank, kind="stable")[: budget.shortlist]]
             self._cost["tested"] += len(more)
             rank = self._count(body, more)
-            likely, before = rank > ranks.max(initial=0.0) - budget.outdone / _MISSED, poses[:1]
+            likely, before = rank > ranks.max(initial=0.0) - behind, poses[:1]
             poses = np.concatenate([poses, more[likely]])
             ranks = np.append(ranks, rank[likely])
             gains = np.append(gains, self._known(more[likely]))
@@ -201,9 +203,9 @@ class _Search:
             order = order[unlike(body, poses[order], budget.alike)][:length]
             poses, ranks, gains = poses[order], ranks[order], gains[order]
             best = float(ranks.max(initial=0.0))
-            if not self._confirm:
-                made = self._made_at(poses[:1], more[rank > best - 1], before, made)
-                if made * _share_of_rivals(best - budget.outdone / _MISSED, best) >= budget.again:
+            if self._is_alone:
+                alike = self._as_the_best(poses[:1], more[rank > best - 1], before, alike)
+                if alike * _share_of_rivals(best - behind, best) >= budget.repeats:
                     break
             if best > 1.1 * checked + 1:
                 checked = best
@@ -213,21 +215,22 @@ class _Search:
                     break
             if self._cost["made"] >= most:
                 break
-        self._refine(poses[ranks > best - budget.outdone / _MISSED], self._stages)
+        self._refine(poses[ranks > best - behind], self._stages)
         return done
 
-    def _made_at(self, best: Floats, more: Floats, before: Floats, made: int) -> int:
-        """How many guesses put the body where the best (1, 4, 4) does, with `more` of this batch.
+    def _as_the_best(self, best: Floats, more: Floats, before: Floats, alike: int) -> int:
+        """How many guesses put the body where the best of them (1, 4, 4) does.
 
-        They were so many up to the one before it, if it was the best there.
+        `alike` did so where the best one `before` (1, 4, 4) put it; to these come those of the last
+        batch, `more` (K, 4, 4) that explain about as much.
         """
-        means, near = self._body.means, self._budget.same * self._body.radius
+        means, near = self._body.means, self._budget.same_pose * self._body.radius
         there = transform(best, means)
         at = [
             np.linalg.norm(transform(some, means) - there, axis=2).mean(axis=1) < near
             for some in (before, more)
         ]
-        return made * int(np.count_nonzero(at[0])) + int(np.count_nonzero(at[1]))
+        return alike * int(np.count_nonzero(at[0])) + int(np.count_nonzero(at[1]))
 
     def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""

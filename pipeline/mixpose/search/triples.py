@@ -18,7 +18,7 @@ from mixpose.search.problem import SearchProblem, is_pointlike
 from mixpose.sensors import Rays
 
 _FACING, _SIDE = 0.5, 0.9  # cosines of normals that are seen together, and of one side
-_OPPOSITE = -0.99  # cosine of normals of which no camera sees both, but 4° from along a face
+_TURNED_AWAY = -0.99  # cosine of normals: a camera sees both within 4° from along their faces
 _ORDERS = list(permutations(range(3)))
 
 
@@ -89,7 +89,7 @@ def _neighbours(points: Floats) -> Indices:
 @lru_cache(maxsize=32)
 def _neighbouring(body: Body) -> Indices:
     """Triples (3, P), in all orders, of features of a side, each with two of the three nearest."""
-    sides = [side for side in _sides(body) if len(side) > 3]
+    sides = [side for side in _sides(body) if len(side) > 2]
     own = [side[_neighbours(body.means[side])] for side in sides]
     return _in_all_orders(np.concatenate([np.zeros((3, 0), dtype=np.intp), *own], axis=1))
 
@@ -104,12 +104,18 @@ def _of_sides(body: Body, count: int) -> Indices:
 
 @lru_cache(maxsize=32)
 def _seen_together(body: Body) -> Indices:
-    """Triples (3, P), in all orders, of all features of which no two face away from each other."""
+    """Triples (3, P), in all orders, of all features but those that no camera sees together.
+
+    These face away from each other, and neither is in front of the other's face.
+    """
     triples = _combined(np.arange(len(body)))
     if body.normals is not None:
-        together = body.normals @ body.normals.T > _OPPOSITE
+        turned_away = body.normals @ body.normals.T < _TURNED_AWAY
+        away = body.means - body.means[:, None]
+        behind = np.vecdot(away, body.normals[:, None]) <= 0
+        apart = turned_away & behind & behind.T
         pairs = combinations(triples, 2)
-        triples = triples[:, np.all([together[a, b] for a, b in pairs], axis=0)]
+        triples = triples[:, ~np.any([apart[a, b] for a, b in pairs], axis=0)]
     return _in_all_orders(triples)
 
 

@@ -75,16 +75,22 @@ def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
         return True
     is_new |= len(track.branches) != 1
     before, used = sum(track.met_before.values()), ranked[0].used
-    # if detections are left that it may be met by elsewhere
-    misses_more = np.count_nonzero(used.shares) <= rules.acceptance.convincing * before
-    misses_more &= bool((ranked[0].matches.count > ranked[0].matches.met + 0.5).any())
+    is_less = np.count_nonzero(used.shares) <= rules.acceptance.convincing * before
+    misses_more = is_less and _leaves_any(frame, ranked[0])
     # what two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
 
 
+def _leaves_any(frame: Frame, pose: ScoredPose) -> bool:
+    """Whether detections are left that may show the body elsewhere; of grey values nobody knows."""
+    if any(view.observation.points is None for view in frame.views):
+        return True
+    return bool((pose.matches.count > pose.matches.met + 0.5).any())
+
+
 def is_there(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
-    """Whether the body is where it was expected, or found with others, and looked for no more."""
+    """Whether what is found convinces, or lies where it was expected and casts no doubt."""
     return frame.first_is(frame.trusted, ranked) or not is_doubtful(frame, ranked)
 
 

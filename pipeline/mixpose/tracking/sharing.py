@@ -1,6 +1,6 @@
 """One moment of several bodies: each is explained by what the others leave, to a fixpoint.
 
-Bodies that convince where they are expected come first, all at once; what they meet is theirs.
+Bodies that are where they are expected come first, all at once; what they meet is theirs.
 The others look at what is left, the most evident is believed, whichever stands first in the file,
 and takes its detections from the rest, which look again.
 """
@@ -68,7 +68,7 @@ class Sharing:
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
     looked: bool = False  # whether they were looked for among points that cameras see together
-    # where these may show bodies that have claimed nothing
+    # where points in space may show bodies that have claimed nothing
     shown: dict[int, Starts] = field(default_factory=dict)
     # what explanations meet, and whose detections are by what `claimed` bodies meet
     met: dict[int, tuple[Explanation, Met]] = field(default_factory=dict)
@@ -78,9 +78,9 @@ class Sharing:
         """The poses of all bodies."""
         self._all_from(self._expected())
         if len(self.claimed) < len(self.bodies):
-            self._all_from(shown := self._found_at_once())
-            waiting = [k for k in shown if k not in self.claimed]
-            self.shown = {k: shown[k] for k in waiting if self._is_possible(k)}
+            self._all_from(starts := self._found_at_once())
+            waiting = [k for k in starts if k not in self.claimed]
+            self.shown = {k: starts[k] for k in waiting if self._is_possible(k)}
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
@@ -242,9 +242,22 @@ class Sharing:
         # points in space were looked at: about where it must be, if it was there just now
         around = predicted(data, [])
         near = tuple(one for one in around if not track.misses or self._is_near(data, one))
-        data = replace(data, starts=(*near, *self.shown.get(k, ())))
-        ranked = self.bodies[k].explain(data, quickly=True) if data.starts else []
-        return Explanation(data, left, ranked)
+        found = Explanation(replace(data, starts=near), left, [])
+        for starts in (near, self._shown_of(k)):
+            data = replace(data, starts=starts)
+            ranked = self.bodies[k].explain(data, quickly=True) if starts else []
+            if ranked and (not found.ranked or ranked[0].log_density > found.ranked[0].log_density):
+                found = Explanation(data, left, ranked)
+            if is_there(found.frame, found.ranked):
+                break
+        return found
+
+    def _shown_of(self, k: int) -> Starts:
+        """Where points in space may show a body, or one of identical bodies that look as one."""
+        if self.bodies[k].instance is None or not self._is_forgotten(k):
+            return self.shown.get(k, ())
+        alike = [j for j in self.shown if self.bodies[j].body is self.bodies[k].body]
+        return tuple([one for j in alike if self._is_forgotten(j) for one in self.shown[j]])
 
     def _judge_again(self) -> None:
         """Judge poses for which other detections are left by now; without merged ones, fit them."""
