@@ -14,7 +14,6 @@ from scipy.special import erf
 
 from mixpose.calibration import SeenFrame
 from mixpose.learning.rules import RULES
-from mixpose.matching import ErrorRules
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import inverse, transform
 from mixpose.search import triangulate
@@ -68,7 +67,7 @@ def clouds_of(
     some = np.linspace(0, len(told) - 1, min(len(told), RULES.probes)).astype(int)
     gaps = [_meetings(told[k][1], wide)[2] for k in np.unique(some)]
     noise = max(RULES.widest * _deviation(np.concatenate([np.zeros(0), *gaps])), RULES.quietest)
-    shares = np.where(are_points(sensors), ErrorRules().typical, noise)
+    shares = np.where(are_points(sensors), RULES.of_clouds, noise)
     gates = np.minimum(RULES.gate * shares, RULES.widest) * sigmas
     return [_cloud(*each, sensors, shares * sigmas, gates) for each in told], noise
 

@@ -17,6 +17,9 @@ class LearningRules:
         2.0, "times the noise of all, from which what moves is looked for by its own as well"
     )
     quietest: float = constant(0.02, "of σ_ε: less noise than that is not believed")
+    of_clouds: float = constant(
+        0.2, "of σ_ε that points of clouds err by, which do not tell it: as detections as a rule"
+    )
     probes: int = constant(60, "frames that the noise of detections is told by")
     still_share: float = constant(
         0.5, "of the frames in which something is at one place of the world: it does not move"
