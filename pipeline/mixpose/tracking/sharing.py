@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from mixpose.fit import Fit, fit_together
-from mixpose.judgement import Case, ScoredPose, Verdict, is_possible, judge_together
+from mixpose.judgement import Case, ScoredPose, Verdict, insert, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Mask
 from mixpose.search import SeenTogether, search_copies
@@ -246,8 +246,12 @@ class Sharing:
         for starts in (near, self._shown_of(k)):
             data = replace(data, starts=starts)
             ranked = self.bodies[k].explain(data, quickly=True) if starts else []
-            if ranked and (not found.ranked or ranked[0].log_density > found.ranked[0].log_density):
-                found = Explanation(data, left, ranked)
+            both = list(found.ranked)  # rivals of one another
+            for one in ranked:
+                insert(both, one, data.body, data.free, data.rules.acceptance)
+            if found.ranked and (not ranked or ranked[0].log_density < found.ranked[0].log_density):
+                data = found.frame
+            found = Explanation(data, left, both)
             if is_there(found.frame, found.ranked):
                 break
         return found
