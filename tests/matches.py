@@ -46,6 +46,12 @@ class Seen:
     finest: float = 0.05
 
 
+def of_eight(name: str, met: float, off: float = 0.1, unmatched: float = 0.0) -> Seen:
+    """A sensor that meets some of 8 features, each off by some of σ_ε along either axis."""
+    shares = np.full(8, met / 8)
+    return Seen(np.zeros((8, 2, 6)), name, 1.5 * off, shares, sigma=1.5, unmatched_nearby=unmatched)
+
+
 def matches_of(*sensors: Seen) -> Matches:
     """One pose against L sensors; those that see fewer features or coordinates are filled up."""
     most = max(len(one.J) for one in sensors)

@@ -37,7 +37,6 @@ from mixpose.session import Session, load_session
 from mixpose.session.setup import Start
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
-MOVED = np.array([1.5, -2.0, 1.0, 0.004, -0.01, 0.006])
 
 
 @pytest.fixture

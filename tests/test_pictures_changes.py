@@ -13,7 +13,9 @@ from inspected import (
     command,
     copied,
     estimated_pose,
+    left_image,
     with_options,
+    write_left,
 )
 from numpy.typing import NDArray
 
@@ -169,12 +171,10 @@ def test_no_sigma_is_advised_where_a_told_delay_puts_features_off(
 def test_small_clutter_is_told_by_its_area(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:
-    path = recording / "left0006.png"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
+    image = left_image(recording)
     for u in range(30, 600, 60):
         image[30:33, u : u + 3] = 150
-    cv2.imwrite(str(path), image)
+    write_left(recording, image)
     text = advice_for(recording / "session.toml", 6, pose_of_frame_6)
     # specks of 9 px and markers of about 40: their geometric mean lies between
     assert "10 found belong to no feature, all smaller" in text
@@ -186,28 +186,24 @@ def test_where_markers_are_not_told_for_sure_no_size_is_advised(
     status: Status, hidden: int, recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:
     # a pose that may be wrong, or one that misses two of seven markers
-    path = recording / "left0006.png"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
+    image = left_image(recording)
     session = mixpose.load_session(recording / "session.toml")
     y, _ = session.sensors[0].sensor.project(transform(pose_of_frame_6, session.body.means))
     for u, v in y[:hidden].round().astype(int).tolist():
         image[v - 8 : v + 9, u - 8 : u + 9] = 0
     for u in range(30, 600, 60):
         image[30:33, u : u + 3] = 150
-    cv2.imwrite(str(path), image)
+    write_left(recording, image)
     text = advice_for(recording / "session.toml", 6, pose_of_frame_6, status)
     assert "10 found belong to no feature; which are markers cannot be told here" in text
     assert "min_area" not in text
 
 
 def test_without_a_pose_too_many_features_are_not_told_apart(recording: Path) -> None:
-    path = recording / "left0006.png"
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
+    image = left_image(recording)
     for u in range(30, 600, 25):
         image[30:33, u : u + 3] = 150
-    cv2.imwrite(str(path), image)
+    write_left(recording, image)
     text = advice_for(recording / "session.toml", 6, None)
     assert "too many: look which are markers" in text
     assert "raise min_area" not in text

@@ -18,9 +18,7 @@ from inspected import (
     TWO_CAMERAS,
     command,
     copied,
-    estimated_pose,
 )
-from numpy.typing import NDArray
 
 import mixpose
 from mixpose.cli.inspect import summary
@@ -39,11 +37,6 @@ from mixpose.runner import begin, observe, open_sources
 def recording(tmp_path: Path) -> Path:
     """One frame of two cameras, free to be spoilt."""
     return copied(tmp_path / "recording")
-
-
-@pytest.fixture(scope="module")
-def pose_of_frame_6() -> NDArray[np.float64]:
-    return estimated_pose()
 
 
 def test_cameras_get_a_picture_per_stage_and_a_sheet(

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from detections import EIGHT, TRUTH, detect, view_of
-from matches import Seen, matches_of, scored
+from matches import matches_of, of_eight
 from numpy.typing import NDArray
 
 from mixpose.body import ASIDE, Body, PointFeature
-from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import (
     AcceptanceRules,
@@ -23,7 +22,6 @@ from mixpose.judgement import (
     ScoredPose,
 )
 from mixpose.objective import View
-from mixpose.records import GridPattern
 from mixpose.rigid import (
     from_rotation_vector,
     perturb,
@@ -37,7 +35,6 @@ from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
-    is_doubtful,
     look_alikes,
     multistart,
     predicted,
@@ -51,12 +48,6 @@ Floats = NDArray[np.float64]
 
 RULES, MODEL = AcceptanceRules(), NoiseModel()
 ELSEWHERE = perturb(TRUTH, np.repeat([50.0, 0.5], 3))
-
-
-def sensor(name: str, met: float, off: float = 0.1, unmatched: float = 0.0) -> Seen:
-    """A sensor that meets some of 8 features, each off by some of σ_ε along either axis."""
-    shares = np.full(8, met / 8)
-    return Seen(np.zeros((8, 2, 6)), name, 1.5 * off, shares, sigma=1.5, unmatched_nearby=unmatched)
 
 
 def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> Frame:
@@ -252,86 +243,21 @@ def test_several_starts_that_lead_to_nothing_are_not_fitted(
     assert list(multistart(data_of(elsewhere, views), [])) == []
 
 
-def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
-    data = data_of(Tracker.create(EIGHT, EstimatorOptions(), TRUTH), [])
-    assert is_doubtful(data, [])
-    assert is_doubtful(data, [scored(TRUTH, sensor("0", 5.0))])
-    assert not is_doubtful(data, [scored(TRUTH, sensor("0", 8.0))])
-
-
-def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() -> None:
-    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = replace(tracker.begin(), met_before={"0": 5}, believed=3, frame=0)
-
-    def doubted(
-        track: Track, met: int, log_evidence: float = 20.0, ratio: float = 0.5, count: int = 8
-    ) -> bool:
-        shares = np.where(np.arange(8) < met, 1.0, 0.0)
-        seen = replace(sensor("0", met), shares=shares, count=float(count))
-        judged = replace(scored(TRUTH, seen), log_evidence=log_evidence, residual_ratio=ratio)
-        return is_doubtful(data_of(tracker, [], track), [judged])
-
-    assert not doubted(track, 5)
-    # as much of it, farther off than chance makes it: it may have turned away all at once
-    assert doubted(track, 5, ratio=1.1)
-    # as much of it, and yet not sure: a thing that shines alike came near
-    assert doubted(track, 5, log_evidence=5.0)
-    assert not doubted(track, 4)
-    # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
-    assert doubted(replace(track, met_before={"0": 8}), 5)
-    # but not where all that there is is met: nowhere else is more; of grey values nobody counts it
-    assert not doubted(replace(track, met_before={"0": 8}), 5, count=5)
-    grey = GridPattern(np.ones((4, 4), np.float32), np.zeros(2), 1.0)
-    seen = replace(sensor("0", 5.0), shares=np.where(np.arange(8) < 5, 1.0, 0.0), count=5.0)
-    judged = replace(scored(TRUTH, seen), log_evidence=20.0, residual_ratio=0.5)
-    camera = PinholeCamera(np.diag([800.0, 800.0, 1.0]))
-    data = data_of(
-        tracker,
-        [View("0", camera, Observation(grey, 1.5))],
-        replace(track, met_before={"0": 8}),
-    )
-    assert is_doubtful(data, [judged])
-    for other in (
-        replace(track, believed=2),
-        replace(track, misses=1),
-        replace(track, doubted=True),
-        replace(track, branches=2 * track.branches),
-    ):
-        assert doubted(other, 5)
-
-
-def test_in_the_first_frames_what_is_met_farther_off_than_chance_makes_it_is_looked_for() -> None:
-    """It may be its double image in a pane, which meets all of it about as well."""
-    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    convincing = scored(TRUTH, sensor("0", 8.0))
-
-    def doubted(believed: int, ratio: float, **other: Any) -> bool:
-        track = replace(tracker.begin(), believed=believed)
-        judged = replace(convincing, residual_ratio=ratio, **other)
-        return is_doubtful(data_of(tracker, [], track), [judged])
-
-    assert doubted(1, 1.1)
-    assert not doubted(1, 0.9)
-    # recordings that err by fits and starts, and what is explained by a sensor that is left out
-    assert not doubted(3, 6.0)
-    assert not doubted(1, 6.0, left_out={"1": "out of step"})
-
-
 def test_of_three_sensors_the_one_whose_residuals_are_far_larger_disagrees() -> None:
-    found = [sensor("0", 8.0), sensor("1", 8.0, off=0.6), sensor("2", 8.0)]
+    found = [of_eight("0", 8.0), of_eight("1", 8.0, off=0.6), of_eight("2", 8.0)]
     # six times the others' deviation, 36 times their variance
     assert disagreeing(matches_of(*found), RULES, MODEL) == ["1"]
-    found[1] = sensor("1", 8.0, off=0.4)
+    found[1] = of_eight("1", 8.0, off=0.4)
     assert disagreeing(matches_of(*found), RULES, MODEL) == []
-    two = [sensor("0", 8.0), sensor("1", 8.0, off=0.9)]
+    two = [of_eight("0", 8.0), of_eight("1", 8.0, off=0.9)]
     assert disagreeing(matches_of(*two), RULES, MODEL) == []
 
 
 def test_a_sensor_that_sees_the_body_elsewhere_disagrees_and_a_covered_one_does_not() -> None:
-    agreeing = sensor("0", 8.0), sensor("1", 7.0)
-    elsewhere = matches_of(*agreeing, sensor("2", 1.0, unmatched=7.0))
+    agreeing = of_eight("0", 8.0), of_eight("1", 7.0)
+    elsewhere = matches_of(*agreeing, of_eight("2", 1.0, unmatched=7.0))
     assert disagreeing(elsewhere, RULES, MODEL) == ["2"]
-    covered = matches_of(*agreeing, sensor("2", 1.0, unmatched=1.0))
+    covered = matches_of(*agreeing, of_eight("2", 1.0, unmatched=1.0))
     assert disagreeing(covered, RULES, MODEL) == []
 
 

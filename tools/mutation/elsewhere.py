@@ -38,7 +38,7 @@ MUTANTS = (
         "pose.residual_ratio > 1 and not pose.left_out",
         "False",
         "the body is followed to its double image in a pane",
-        (_STARTS,),
+        ("test_tracking_doubtful.py",),
     ),
     Mutant(
         "tracking-what-is-left-out-is-looked-for",
@@ -46,7 +46,7 @@ MUTANTS = (
         "pose.residual_ratio > 1 and not pose.left_out",
         "pose.residual_ratio > 1",
         "frames that leave a sensor out are doubted, as those that do not",
-        (_STARTS,),
+        ("test_tracking_doubtful.py",),
     ),
     Mutant(
         "tracking-weighed-where-it-was-expected",

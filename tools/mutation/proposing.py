@@ -264,7 +264,7 @@ _PROPOSALS = (
         "if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):",
         "if not ranked:",
         "where a prediction fails nothing else is tried",
-        (_STARTS,),
+        ("test_tracking_doubtful.py",),
     ),
 )
 

@@ -158,7 +158,7 @@ _SEARCH = (
         "misses_more = is_less and _leaves_any(frame, ranked[0])",
         "misses_more = is_less",
         "a body that turns away is searched for all over, though all that is seen is met",
-        ("test_tracking_starts.py",),
+        ("test_tracking_doubtful.py",),
     ),
     Mutant(
         "search-points-of-a-crowd-first",

@@ -166,6 +166,7 @@ def residuals_by(found: Calibration, kind: Literal["frame", "feature"]) -> tuple
 class Displacement:
     """How far one sensor is from where the old calibration has it."""
 
+    sensor: int  # its number in the rig
     name: str
     turn_deg: float  # against the consensus of the sensors, like the shift
     shift: float
@@ -183,7 +184,6 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
     deviations = _deviations(found)
     told = []
     for index in linked:
-        name = found.after.names[index]
         turn, shift = _apart(found.before, found.after, index, G)
         sd_turn, sd_shift = deviations[index]
         each = found.residuals[index]
@@ -192,7 +192,8 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
         worse = bool(np.isfinite(after) and not before <= rules.worse * max(after, 1e-12))
         far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
         moved = worse and far
-        told.append(Displacement(name, turn, shift, sd_turn, sd_shift, before, after, moved))
+        of = index, found.after.names[index]
+        told.append(Displacement(*of, turn, shift, sd_turn, sd_shift, before, after, moved))
     return tuple(told)
 
 

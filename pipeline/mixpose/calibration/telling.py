@@ -284,8 +284,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     are_told = 2 * len(bumped) < len(told)  # most of them agree
     lines = [_frames_line(found)]
     for one in told:
-        index = found.after.names.index(one.name)
-        of, before = _unit_of(found, index, unit), one.residual_before
+        of, before = _unit_of(found, one.sensor, unit), one.residual_before
         text = f"residual {before:.3g} {of}" if np.isfinite(before) else "meets nothing"
         lines.append(
             f"{one.name:<20}{_displaced(one, unit)}; {text}, calibrated anew "

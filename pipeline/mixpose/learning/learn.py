@@ -14,7 +14,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.learning.adjusting import Eyes, Learnt, adjusted
 from mixpose.learning.axes import in_principal_axes
 from mixpose.learning.bodies import find_bodies
-from mixpose.learning.points import Cloud, clouds_of, without_places, without_still
+from mixpose.learning.points import Cloud, are_points, clouds_of, without_places, without_still
 from mixpose.learning.rules import RULES
 from mixpose.records import Floats
 from mixpose.session import Session
@@ -36,7 +36,7 @@ def eyes_of(session: Session) -> Eyes:
     """The sensors of a session; a SessionError without two that have lines of sight, or a cloud."""
     setups = session.sensors
     seeing = [one.name for one in setups if one.sensor.dimension == 2]
-    if len(seeing) < 2 and not any(one.sensor.dimension == 3 for one in setups):
+    if len(seeing) < 2 and not are_points([one.sensor for one in setups]).any():
         raise SessionError(
             f"{session.path}: learn: found {len(seeing)} camera{'s' * (len(seeing) != 1)}; "
             "allowed: two or more that see the body at the same time, or a cloud of points. With "

@@ -132,7 +132,7 @@ def _cloud(
     measured, own = _measured(frame, sensors)
     points, detections = np.concatenate([points, measured]), np.concatenate([detections, own])
     gaps = np.append(gaps, np.zeros(len(own)))
-    if len(frame.points) > min(len(rays), 2) and len(points):
+    if len(frame.points) > (1 if len(own) else 2) and len(points):  # others may confirm them
         detections = _supported(points, detections, gaps, frame, sensors, gates)
         kept = (detections >= 0).any(axis=1)
         points, detections = points[kept], detections[kept]

@@ -242,19 +242,16 @@ class Sharing:
         # points in space were looked at: about where it must be, if it was there just now
         around = predicted(data, [])
         near = tuple(one for one in around if not track.misses or self._is_near(data, one))
-        found = Explanation(replace(data, starts=near), left, [])
-        for starts in (near, self._shown_of(k)):
-            data = replace(data, starts=starts)
-            ranked = self.bodies[k].explain(data, quickly=True) if starts else []
-            both = list(found.ranked)  # rivals of one another
-            for one in ranked:
-                insert(both, one, data.body, data.free, data.rules.acceptance)
-            if found.ranked and (not ranked or ranked[0].log_density < found.ranked[0].log_density):
-                data = found.frame
-            found = Explanation(data, left, both)
-            if is_there(found.frame, found.ranked):
-                break
-        return found
+        found = self._from(k, data, near, left)
+        if is_there(found.frame, found.ranked):
+            return found
+        return _as_rivals(found, self._from(k, data, self._shown_of(k), left))
+
+    def _from(self, k: int, data: Frame, starts: Starts, left: Mask) -> Explanation:
+        """A body from some starts, quickly; nothing without any."""
+        data = replace(data, starts=starts)
+        ranked = self.bodies[k].explain(data, quickly=True) if starts else []
+        return Explanation(data, left, ranked)
 
     def _shown_of(self, k: int) -> Starts:
         """Where points in space may show a body, or one of identical bodies that look as one."""
@@ -349,6 +346,17 @@ class Sharing:
         """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
         reach = self.bodies[k].rules.judgement.noise.errors.reach
         return bool((cdist(self._nobody.places[chosen], places) < reach).any())
+
+
+def _as_rivals(one: Explanation, other: Explanation) -> Explanation:
+    """The poses of two explanations of a frame, in the frame of the likelier one."""
+    if not (one.ranked and other.ranked):
+        return one if one.ranked else other
+    is_other = other.ranked[0].log_density >= one.ranked[0].log_density
+    data, ranked = (other if is_other else one).frame, list(one.ranked)
+    for pose in other.ranked:
+        insert(ranked, pose, data.body, data.free, data.rules.acceptance)
+    return Explanation(data, one.left, ranked)
 
 
 def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
