@@ -60,7 +60,8 @@ def squares(T_true: Floats, T: Floats, covariance: Floats) -> float:
 
 
 @pytest.mark.parametrize(
-    ("tilt_deg", "distance", "changes"), [(4.0, 500.0, True), (40.0, 250.0, False)]
+    ("tilt_deg", "distance", "changes"),
+    [(4.0, 500.0, True), (1.0, 800.0, True), (40.0, 250.0, False)],
 )
 def test_the_ellipsoid_of_a_board_before_one_camera_holds_it_as_often_as_it_says(
     tilt_deg: float, distance: float, changes: bool

@@ -19,6 +19,7 @@ from mixpose.optimise import (
     Term,
     ascend,
     least_squares,
+    stepped,
 )
 from mixpose.rigid import perturb, twist_between
 
@@ -94,13 +95,16 @@ def test_states_with_data_of_their_own_are_evaluated_until_all_have_arrived() ->
     np.testing.assert_array_equal(found.states, climbed(hill, *STARTS).states)
 
 
-def test_unchecked_steps_are_as_many_as_were_asked_for() -> None:
+def test_steps_that_nobody_checks_are_as_many_as_were_asked_for() -> None:
     # value 10 - 50 x² by a curvature of 200: every step goes half of the way, but for the damping
     term = Function(bowl(200.0))
-    options = NewtonOptions(3, damping=0.01, unchecked=True)
-    found = climbed(term, np.array([0.4]), np.array([0.0]), free=ONE, options=options)
+    found = stepped(term, np.array([[0.4], [0.0]]), lambda x, step: x + step, ONE, 3, damping=0.01)
     assert term.asked == [2, 2, 2]
-    assert found.states[:, 0] == pytest.approx([0.4 * (1 - 100 / 202) ** 3, 0.0])
+    left = 0.4 * (1 - 100 / 202) ** np.array([2, 3])
+    assert found.states[:, 0] == pytest.approx([left[1], 0.0])
+    # of the last step what its model of curvature 200 expects
+    expected = 10 - 50 * left[0] ** 2 + 100 * left[0] * (away := left[0] - left[1])
+    assert found.values == pytest.approx([expected - 100 * away**2, 10.0])
 
 
 @dataclass(frozen=True)
@@ -216,9 +220,11 @@ def test_a_definite_hessian_is_used_in_place_of_a_curvature_that_is_too_large() 
     def with_hessian(x: Floats) -> tuple[float, Floats, Floats, Floats]:
         return *bowl(300.0)(x), np.array([[100.0]])
 
-    start, options = np.array([0.3]), NewtonOptions(iterations=1, unchecked=True)
-    slow = climbed(bowl(300.0), start, free=ONE, options=options)
-    fast = climbed(Function(with_hessian), start, free=ONE, options=options)
+    start = np.array([[0.3]])
+    slow, fast = (
+        stepped(Function(model), start, lambda x, step: x + step, ONE, 1)
+        for model in (bowl(300.0), with_hessian)
+    )
     # a step of a third of the way leaves 0.2, Newton's the damping's 1e-4 of 0.3
     assert slow.states[0, 0] == pytest.approx(0.2, abs=1e-4)
     assert fast.states[0, 0] == pytest.approx(0.0, abs=1e-4)

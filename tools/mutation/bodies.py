@@ -173,7 +173,7 @@ _OPTIMISE = (
     Mutant(
         "optimise-every-last-step-taken",
         "optimise/ascent.py",
-        "self._is_taken = [options.unchecked] * count",
+        "self._is_taken = [False] * count",
         "self._is_taken = [True] * count",
         "an ascent that ran out of iterations takes a step that nobody looked at",
     ),

@@ -12,9 +12,17 @@ MUTANTS = (
     Mutant(
         "judgement-likely-turns-are-left-out",
         "judgement/nonlinear.py",
-        "likely = about.fallen(rays)[0] < _HELD",
-        "likely = about.fallen(rays)[0] < 0",
+        "likely = away[:, 0] < _HELD",
+        "likely = away[:, 0] < 0",
         "a flat body that faces its one camera is said to be turned as exactly as it is not",
+        (_NONLINEAR,),
+    ),
+    Mutant(
+        "judgement-likely-turns-no-farther-than-the-edge",
+        "judgement/nonlinear.py",
+        "_REACHES = np.array([1.0, 1.4, 2.0])",
+        "_REACHES = np.array([1.0])",
+        "turns that are as likely farther out than where the curvature has its edge are not held",
         (_NONLINEAR,),
     ),
     Mutant(

@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
 from mixpose.objective import BodyProjection, project_body
-from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of
+from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of, stepped
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, rotation_angle_deg
 from mixpose.search import far_apart, sparse, spread_turns
@@ -32,7 +32,7 @@ _KEPT = 24  # orientations that are followed to the end
 _MOST_FEATURES = 12  # features that orientations are tried with; all are compared in the end
 _NEAR_DEG = 1.0  # poses closer than this are one
 _FAR = 1e6  # squared deviations that a feature out of view is off
-_HALF_WAY = NewtonOptions(iterations=6, unchecked=True)
+_HALF_WAY = 6  # steps
 _TO_THE_END = NewtonOptions(iterations=9, tolerance=1e-3)
 
 
@@ -71,7 +71,7 @@ def look_alikes(
     chosen = np.arange(len(points)) if few is body else far_apart(points, _MOST_FEATURES)
     nearest = _Nearest(measured, project_body(sensors, few), chosen)
     for _ in range(2):  # the second half of the way is for the best only
-        poses = ascend(nearest, poses, perturb, free, _HALF_WAY).states
+        poses = stepped(nearest, poses, perturb, free, _HALF_WAY).states
         misfit = nearest.misfit(poses)
         order = np.argsort(misfit, kind="stable")[:_KEPT]
         poses = poses[order[misfit[order] < _PROMISING**2]]

@@ -18,7 +18,7 @@ from scipy.special import chdtri
 from mixpose.judgement.information import inverted
 from mixpose.matching import Matches
 from mixpose.objective import BodyProjection
-from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of
+from mixpose.optimise import Quadratic, squares_of, stepped
 from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, twist_between
 
@@ -26,9 +26,10 @@ _LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
 _WIDEST_TURN = 1.0  # rad: what is turned by more is another pose
 _HELD = float(chdtri(6, 1e-3))  # squared deviations of the ellipsoid of 99.9 %
 _RAYS = 12
-# as far as that ellipsoid, and up to eight times; between two, the likelihood is as good as normal
-_REACHES = 1.4 ** np.arange(7)
-_TWICE = NewtonOptions(iterations=3, unchecked=True)
+# as far as that ellipsoid, and up to twice, between which the likelihood is as good as normal: up
+# to eight times finds no more of boards, triangles and bars at 4 to 40 times their size
+_REACHES = np.array([1.0, 1.4, 2.0])
+_STEPS = 3
 
 
 def with_likely_turns(
@@ -52,14 +53,11 @@ def with_likely_turns(
         return covariance
     angles = np.arange(_RAYS) * (2 * np.pi / _RAYS)
     rays = math.sqrt(_HELD) * np.array([np.cos(angles), np.sin(angles)]).T
-    likely = about.fallen(rays)[0] < _HELD
-    if not np.count_nonzero(likely):
-        return covariance
-    rays = rays[likely]
     fallen, poses = about.fallen((rays[:, None] * _REACHES[:, None]).reshape(-1, 2))
-    away = np.append(fallen.reshape(len(rays), -1), np.full((len(rays), 1), np.inf), axis=1)
+    away = np.append(fallen.reshape(_RAYS, -1), np.full((_RAYS, 1), np.inf), axis=1)
+    likely = away[:, 0] < _HELD
     last = np.maximum(np.argmax(away >= _HELD, axis=1) - 1, 0)
-    ends = poses.reshape(len(rays), -1, 4, 4)[np.arange(len(rays)), last]
+    ends = poses.reshape(_RAYS, -1, 4, 4)[np.arange(_RAYS), last][likely]
     wider, inner = covariance.copy(), np.ix_(free, free)
     inverse = inverted(wider[inner])
     for x in twist_between(T_world_object, ends)[:, free]:
@@ -142,7 +140,7 @@ class _Turns:
         """
         rest = np.arange(self.axes.shape[1]) > 1
         begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
-        ends = ascend(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _TWICE)
+        ends = stepped(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _STEPS)
         wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
         # turns so wide may be such that nothing tells: they have no curvature either
         known = np.where(wide, np.inf, np.vecdot(turns @ self.curvature, turns))
@@ -150,9 +148,9 @@ class _Turns:
         return np.where(wide, np.inf, fallen), ends.states
 
     @cached_property
-    def _here(self) -> Floats:
-        """The value (1,) of ln p at the pose."""
-        return self.linearise(self.T_world_object[None]).value
+    def _here(self) -> float:
+        """The value of ln p at the pose."""
+        return -0.5 * float(np.sum((self.roots * self.seen.offsets.ravel()) ** 2))
 
     def linearise(self, states: Floats) -> Quadratic:
         """Models of ln p at poses (K, 4, 4), by offsets from what the pose itself meets."""

@@ -7,6 +7,7 @@ from mixpose.optimise.ascent import (
     Sum as Sum,
     Term as Term,
     ascend as ascend,
+    stepped as stepped,
 )
 from mixpose.optimise.squares import (
     LinearResiduals as LinearResiduals,

@@ -71,9 +71,6 @@ class NewtonOptions:
     # about the same factor from step to step
     remaining: float = 0.0
     negligible: float = 0.0  # end: the step gains less than this, in the unit of the value
-    # as many steps as iterations, with the first damping and whatever they gain: in a search, where
-    # the best of many is sought
-    unchecked: bool = False
     together: bool = False  # states that ended are evaluated along: the term has data for each
     least_curvature: float = constant(
         0.3, "of the curvature: where a Hessian is flatter, its step would lead too far"
@@ -122,6 +119,23 @@ def ascend(
     return climb.ended(move)
 
 
+def stepped(
+    term: Term,
+    states: Any,  # H states
+    move: Callable[[Any, Floats], Any],  # as for `ascend`
+    free: Mask,  # (q,)
+    count: int,  # steps
+    damping: float = NewtonOptions.damping,
+) -> Ascent:
+    """Go so many steps from each of H states, whatever they gain: where the best of many counts."""
+    can_change, options = free.astype(np.float64), NewtonOptions(damping=damping)
+    for _ in range(count):
+        here = term.linearise(states)
+        steps, gains = _steps(here, can_change, [damping] * len(here.value), options)
+        states = move(states, steps)
+    return Ascent(states, here.value + gains, here)
+
+
 class _Climb:
     """States on their way, with the models there and the steps to be tried next."""
 
@@ -133,13 +147,11 @@ class _Climb:
         self.steps, self.gains = _steps(here, self._free, self._damping, options)
         self._before = [0.0] * count  # gains of the steps before these
         self._shown: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
-        self._is_taken = [options.unchecked] * count  # whether the step is taken unseen
+        self._is_taken = [False] * count  # whether the step is taken unseen
 
     def unfinished(self, going: list[int]) -> list[int]:
         """Those of some states that have not arrived."""
         options = self._options
-        if options.unchecked:
-            return going
         left, values = [], self._here.value.tolist()
         for k in going:
             size, gain = abs(values[k]), self.gains[k]
@@ -154,10 +166,10 @@ class _Climb:
     def take(self, tried: Any, there: Quadratic, asked: list[int], going: list[int]) -> list[int]:
         """Go to states that are better, and damp the other steps: those that are not stuck."""
         options, values, better = self._options, self._here.value.tolist(), there.value.tolist()
-        if not options.unchecked and there.hessian is None:
+        if there.hessian is None:
             there = self._as_shown(there, asked)
-        count, ease = len(values), 1 if options.unchecked else 10
-        damping = [max(self._damping[k] / ease, _NO_DAMPING) for k in asked]
+        count = len(values)
+        damping = [max(self._damping[k] / 10, _NO_DAMPING) for k in asked]
         steps, gains = _steps(there, self._free, damping, options)
         chosen, left = list(range(count)), []
         for row, k in enumerate(asked):
@@ -166,7 +178,7 @@ class _Climb:
             gain = self.gains[k]
             is_close = gain <= options.value_error * abs(values[k])
             is_better = better[row] > values[k] or (is_close and gains[row] < gain)
-            if is_better or options.unchecked:
+            if is_better:
                 self._before[k], self._damping[k], chosen[k] = gain, damping[row], count + row
             else:
                 self._damping[k] = max(10 * self._damping[k], 100 * options.damping)

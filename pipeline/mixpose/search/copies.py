@@ -142,7 +142,7 @@ def search_copies(
         for problem, own in zip(problems, triangles, strict=True)
     ]
     found = {
-        k: _candidates(problem, some, seen.images, partial(known, k))
+        k: _candidates(problem, some, seen, partial(known, k))
         for k, problem, some in zip(kinds, problems, poses, strict=True)
     }
     return _shared_out(found, bodies, budget)
@@ -151,7 +151,7 @@ def search_copies(
 def _candidates(
     problem: SearchProblem,
     poses: Floats,
-    images: Sequence[LabelImage],
+    seen: SeenTogether,
     known: Callable[[Floats], Floats],
 ) -> _Candidates:
     """Of poses (K, 4, 4) of one body those that may be, and what they meet."""
@@ -159,9 +159,10 @@ def _candidates(
     poses = poses[unlike(body, poses, budget.alike)]
     if not len(poses):
         return _Candidates(poses, np.zeros(0), np.zeros(0), np.zeros((0, 1), dtype=np.intp))
-    counts, near = count_inliers(images, body, poses)
-    ranks = counts.sum(axis=0) + 0.1 * near
-    poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]
+    if len(poses) > budget.shortlist:
+        counts, near = count_inliers(seen.images, body, poses)
+        ranks = counts.sum(axis=0) + 0.1 * near
+        poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]
     matches = matches_of(problem, poses)
     begins = np.cumsum([0, *(len(sensor.points) for sensor, _ in problem.cameras)])
     met = matches.detections >= 0

@@ -22,7 +22,7 @@ from mixpose.body import Body
 from mixpose.judgement import odds_of, paid_by_count
 from mixpose.matching import Matches, crowding, owners_of
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
-from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend, squares_of
+from mixpose.optimise import Quadratic, Sum, squares_of, stepped
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
@@ -240,8 +240,8 @@ class Descent:
         for factors, steps, survivors in stages if len(poses) else ():
             objective = self.objective(factors)
             if steps:
-                options = NewtonOptions(steps, damping=1e-3, unchecked=True)
-                poses = ascend(objective, poses, self._moved, self.free, options).states
+                ends = stepped(objective, poses, self._moved, self.free, steps, damping=1e-3)
+                poses = ends.states
             if len(poses) > survivors:
                 # of shares k/n, not of their squares: what counts is how many features are met
                 values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
@@ -311,8 +311,8 @@ def _centres(problem: SearchProblem) -> Floats:
         length = np.linalg.norm(steps, axis=1, keepdims=True)
         return np.asarray(places + steps * np.minimum(1.0, 5 * radius / np.maximum(length, 1e-30)))
 
-    options = NewtonOptions(12, damping=1e-6, unchecked=True)
-    places = ascend(middles, _starts(problem), moved, problem.free[:3], options).states
+    begun, free = _starts(problem), problem.free[:3]
+    places = stepped(middles, begun, moved, free, 12, damping=1e-6).states
     off = np.sqrt(-2 * middles.linearise(places).value)
     count = np.count_nonzero(off < off.min(initial=np.inf) + radius)
     near = places[np.argsort(off, kind="stable")[:count]]
