@@ -28,6 +28,8 @@ class MatchedLikelihood:
         # whether each feature's detection is known, so that one may be left out
         self.knows_detections = frame.options.objective == "matched"
         self._climbed: dict[frozenset[str], list[Fit]] = {}  # by sensors left out
+        if frame.together:
+            self._climbed[frozenset()] = [frame.together[1]]
 
     def fits(self, starts: Iterable[Start]) -> Iterator[tuple[Start, Fit]]:
         """Fits from starts, one after the other, as later ones may hang on those before."""
@@ -72,12 +74,13 @@ class MatchedLikelihood:
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
-        if self.frame.together and fit is self.frame.together[1]:
-            return self.frame.together[2]
         frame, motion = _as_moving(self.frame, fit)
-        (judged,) = judge_together(
-            [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
-        )
+        if frame.together and fit is frame.together[1] and start is frame.together[0]:
+            judged = frame.together[2]
+        else:
+            (judged,) = judge_together(
+                [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
+            )
         if frame.track.doubted:  # by errors that last: it tells nothing against other poses now
             judged = replace(judged, by_count=0.0)
         return judged if motion is None else with_motion_unknown(judged, frame, motion)

@@ -19,12 +19,13 @@ from scipy.spatial.distance import cdist
 from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, insert, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
+from mixpose.optimise import Ascent
 from mixpose.records import Floats, Mask
 from mixpose.search import SeenTogether, search_copies
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
-from mixpose.tracking.likelihood import MatchedLikelihood, case_of
+from mixpose.tracking.likelihood import MatchedLikelihood, case_of, likelihood_of
 from mixpose.tracking.proposers import is_there, predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
@@ -164,20 +165,18 @@ class Sharing:
         """
         left = {k: claims.left(k) for k in starts}
         frames = {k: self._frame(k, left[k], starts=starts[k]) for k in starts}
+        alike, ends = list[int](), dict[int, Ascent]()
         if len(starts) > 1 and self._shared:
             whole = len(self._shared.totals)
-            alike = {
-                k: one
-                for k, one in frames.items()
-                if len(one.views) == whole
-                and not one.is_timed
-                and not self._are_near(k, ~left[k], places[k])
-            }
-            frames |= climbed_together(alike, self._shared)
+            alike = [k for k, one in frames.items() if len(one.views) == whole and not one.is_timed]
+            apart = [k for k in alike if not self._are_near(k, ~left[k], places[k])]
+            climbed, ends = climbed_together({k: frames[k] for k in apart}, self._shared)
+            frames |= climbed
+        near = [k for k, one in frames.items() if k in ends or self._is_near(one, starts[k][0])]
+        frames |= begun_together({k: frames[k] for k in alike if k in near}, ends)
         found = dict[int, Explanation]()
         for k, one in frames.items():
-            is_near = one.together is not None or self._is_near(one, one.starts[0])
-            ranked = self.bodies[k].explain(one, quickly=True) if is_near else []
+            ranked = self.bodies[k].explain(one, quickly=True) if k in near else []
             found[k] = Explanation(one, left[k], ranked)
         return found
 
@@ -359,8 +358,10 @@ def _as_rivals(one: Explanation, other: Explanation) -> Explanation:
     return Explanation(data, one.left, ranked)
 
 
-def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
-    """The frames of several bodies with what is climbed from their first starts, and judged.
+def climbed_together(
+    frames: Mapping[int, Frame], shared: SharedDensities
+) -> tuple[dict[int, Frame], dict[int, Ascent]]:
+    """The frames of several bodies, and what climbs from their first starts, where that is near.
 
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
@@ -368,22 +369,36 @@ def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> di
         k: replace(one, drawn=matched_objective(one.views, one.body, one.sigmas, shared=shared))
         for k, one in frames.items()
     }
-    starts = {
-        k: one.starts[0]
+    some = {
+        k: one
         for k, one in begun.items()
         if one.options.objective == "matched" and can_be_together(one.body)
     }
-    if len(starts) < 2:
-        return begun
-    poses, first = [one.T_world_object for one in starts.values()], begun[min(starts)]
-    ends = fit_together([begun[k].finest for k in starts], poses, first.free, first.rules.fit)
-    fits, cases = dict[int, Fit](), list[Case]()
-    for (k, start), end in zip(starts.items(), ends, strict=True):
-        if end is not None:
-            begun[k] = replace(begun[k], drawn=end[0])
-            fits[k] = MatchedLikelihood(begun[k]).fit(start, end[1])
-            cases.append(case_of(begun[k], fits[k], start))
-    judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
-    for (k, fit), pose in zip(fits.items(), judged, strict=True):
-        begun[k] = replace(begun[k], together=(starts[k], fit, pose))
-    return begun
+    if len(some) < 2:
+        return begun, {}
+    first, poses = begun[min(some)], [one.starts[0].T_world_object for one in some.values()]
+    climbs = fit_together([one.finest for one in some.values()], poses, first.free, first.rules.fit)
+    found = {k: end for k, end in zip(some, climbs, strict=True) if end is not None}
+    begun |= {k: replace(begun[k], drawn=objective) for k, (objective, _) in found.items()}
+    return begun, {k: ascent for k, (_, ascent) in found.items()}
+
+
+def begun_together(frames: Mapping[int, Frame], ends: Mapping[int, Ascent]) -> dict[int, Frame]:
+    """The frames of bodies that the same sensors see, fitted from their first starts and judged.
+
+    From where these climbs ended, if they are at hand.
+    """
+    starts, fits, cases = dict[int, Start](), dict[int, Fit](), list[Case]()
+    for k, one in frames.items():
+        likelihood, starts[k] = likelihood_of(one), one.starts[0]
+        if isinstance(likelihood, MatchedLikelihood):
+            fits[k] = likelihood.fit(starts[k], ends.get(k))
+            cases.append(case_of(one, fits[k], starts[k]))
+    if not fits:
+        return {}
+    first = frames[min(fits)]
+    poses = judge_together(cases, first.free, first.rules.judgement)
+    return {
+        k: replace(frames[k], together=(starts[k], fit, pose))
+        for (k, fit), pose in zip(fits.items(), poses, strict=True)
+    }
