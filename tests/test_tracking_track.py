@@ -224,7 +224,7 @@ def test_a_start_may_be_as_far_off_as_is_said() -> None:
 
 def test_a_course_goes_on_by_its_derivatives_and_spreads_by_what_jerk_may_do() -> None:
     """Place, velocity, acceleration and jerk by Taylor; a random walk of the jerk, integrated."""
-    course, seconds = Course.begun(np.ones(6), EIGHT, RULES), 0.3
+    course, seconds = Course.begun(np.ones(6), EIGHT.radius, RULES), 0.3
     state = np.array([1.0, 2.0, 3.0, 4.0])
     course = replace(
         course, means=course.means + state, covariances=np.zeros_like(course.covariances)
@@ -252,7 +252,7 @@ def test_the_velocity_of_steady_motion_is_known_better_than_by_two_poses() -> No
     squared = []
     for seed in range(10):
         off = deviation * np.random.default_rng(seed).standard_normal((80, 6))
-        course = Course.begun(deviation, EIGHT, RULES)
+        course = Course.begun(deviation, EIGHT.radius, RULES)
         for step in velocity * seconds + np.diff(off, axis=0):
             course = course.followed(step, deviation, seconds)
         told = course.expected(None, 0.0)

@@ -327,6 +327,7 @@ class Estimate:
     # (3,) of the body in its own coordinates; None where it has no tip
     tip_object: Floats | None = field(default=None, compare=False)
     filled: bool = False  # whether nothing was measured: the pose is what frames around it say
+    ahead_s: float = 0.0  # how much later than its frame the pose is, of one that was foretold
 
     @cached_property
     def offsets(self) -> Mapping[str, Offsets]:

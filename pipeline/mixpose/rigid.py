@@ -149,8 +149,8 @@ def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
 
 def quaternion_xyzw(T_a_b: Floats) -> Floats:
     """Unit quaternion (4,), (x, y, z, w) with w >= 0, of one motion."""
-    vector = cv2.Rodrigues(T_a_b[:3, :3])[0]
-    return np.asarray(Rotation.from_rotvec(vector[:, 0]).as_quat(canonical=True), dtype=np.float64)
+    # OpenCV takes turns of less than 1e-5 rad for none
+    return np.asarray(Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True))
 
 
 def is_rigid(T: Floats, tolerance: float = 1e-4) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,15 +18,19 @@ def partial_of(path: Path) -> Path:
 def appearing_whole(path: Path) -> Iterator[Path]:
     """A path to write to, moved to `path` at the end; nothing is left of it after an error.
 
-    What stood at `path` stays until then.  A device or a pipe is written to as it is.  An OSError
-    that names no file, as that of a full disk, gets the name of this one.
+    What stood at `path` stays until then, and its mode and links to it after that.  A device or a
+    pipe is written to as it is.  An OSError that names no file, as that of a full disk, gets the
+    name of this one.
     """
     if path.exists() and not path.is_file():
         yield path
         return
+    path = path.resolve() if path.is_symlink() else path
     part = partial_of(path)
     try:
         yield part
+        if path.exists():
+            shutil.copymode(path, part)
         os.replace(part, path)  # noqa: PTH105 - also where the file exists, on every system
     except OSError as error:
         error.filename = error.filename or str(path)

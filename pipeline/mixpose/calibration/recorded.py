@@ -14,7 +14,7 @@ from mixpose.calibration.rig import Rig
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import Progress, SeenFrame
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames import Source, pair
+from mixpose.frames import ImageSequence, Source, numbers_of, pair
 from mixpose.objective import View
 from mixpose.records import Floats, FrameSet, GridPattern, Indices, PointPattern
 from mixpose.runner import as_sensors, observe, open_sources
@@ -76,15 +76,18 @@ def read_frames(
         )
     found: list[SeenFrame] = []
     index = {setup.name: k for k, setup in enumerate(session.sensors)}
+    wanted = _some_of(opened, rules, runs=runs)
     length = max((source.length or 0 for source in opened.values()), default=0)
-    total = min(length, rules.most_read)
-    for start, stop, step in _stretches(opened, length, rules, runs=runs):
-        with closing(pair(opened, start, stop, step)) as sets:
-            for frame_set in sets:
-                progress("reading frames", len(found), total)
+    total = length if wanted is None else len(wanted)
+    opened = {name: _without_others(source, wanted) for name, source in opened.items()}
+    with closing(pair(opened)) as sets:
+        for frame_set in sets:
+            if wanted is not None and frame_set.number not in wanted:
+                continue
+            progress("reading frames", len(found), total)
+            if known is None or frame_set.number in known:
                 seen = _seen(session, frame_set, index)
-                wanted = known is None or seen.number in known
-                if wanted and any(len(points) for points in seen.points.values()):
+                if any(len(points) for points in seen.points.values()):
                     found.append(seen)
     if not found:
         raise RecordingError(
@@ -93,18 +96,29 @@ def read_frames(
     return informative(found, len(index), rules.most_candidates, runs=runs)
 
 
-def _stretches(
-    opened: Mapping[str, Source], length: int, rules: CalibrationRules, *, runs: bool
-) -> list[tuple[int | None, int | None, int]]:
-    """Which numbers are read: all, every n-th, or runs of neighbours spread evenly."""
-    if length <= rules.most_read:
-        return [(None, None, 1)]
-    if not runs:
-        return [(None, None, -(-length // rules.most_read))]
-    first = min((s.first for s in opened.values() if s.first is not None), default=0)
-    count = rules.most_read // _RUN
-    starts = first + np.linspace(0, length - _RUN, count).astype(int)
-    return [(int(start), int(start) + _RUN, 1) for start in np.unique(starts)]
+def _some_of(
+    opened: Mapping[str, Source], rules: CalibrationRules, *, runs: bool
+) -> set[int] | None:
+    """Which numbers are taken: all (None), or some, or runs of neighbours, spread evenly."""
+    known = [numbers_of(source) or set() for source in opened.values()]
+    numbers = sorted(set[int]().union(*known))
+    if max(map(len, known), default=0) <= rules.most_read:
+        return None
+    size = _RUN if runs else 1
+    starts = np.linspace(0, len(numbers) - size, rules.most_read // size).astype(int)
+    return {numbers[start + k] for start in starts.tolist() for k in range(size)}
+
+
+def _without_others(source: Source, wanted: Collection[int] | None) -> Source:
+    """A source without images of other numbers, which take long to decode."""
+    if wanted is None or not isinstance(source, ImageSequence):
+        return source
+    pairs = zip(source.paths, source.numbers, strict=True)
+    kept = [(path, number) for path, number in pairs if number in wanted]
+    if not kept:
+        return source
+    paths, numbers = zip(*kept, strict=True)
+    return replace(source, paths=paths, numbers=numbers)
 
 
 def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:

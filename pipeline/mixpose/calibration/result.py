@@ -144,10 +144,11 @@ def explained_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task)
 
 def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
     """What each sensor saw and met."""
-    found = {}
+    found, largest = {}, np.iinfo(np.intp).max
     for s, (rows, weight) in enumerate(adjusted.weighted):
         pairs, kept = rows.pairs, weight > _MET
-        named = np.array(numbers, dtype=np.intp)[pairs.frame[kept]]
+        # of longer numbers the first digits are enough for people
+        named = np.array([min(n, largest) for n in numbers], dtype=np.intp)[pairs.frame[kept]]
         found[s] = Sights(pairs.y[kept], rows.residual[kept], named, pairs.feature[kept])
     return found
 

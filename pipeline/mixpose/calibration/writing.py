@@ -23,9 +23,12 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     Comments and keys that were not calibrated stay; paths lead to the same files as before.
     """
     document = rewriting.document_of(session, target)
+    scale = found.after.scale
     for index, table in enumerate(document["sensor"]):
         _put_sensor(table, found, session, index)
-    scale = found.after.scale
+        for key in ("position", "range_bias") if scale != 1 else ():
+            if key in (errors := table.get("calibration_error", {})):
+                rewriting.put(errors, key, rewriting.plain(scale * float(errors[key])))
     first, *others = zip(rewriting.objects_of(document), session.objects, strict=True)
     if scale != 1 or any(block.kind == "body" for block in found.blocks):
         _put_body(first[0], first[1].body, found.after.points, scale)

@@ -139,8 +139,9 @@ class _Recording:
         def richness(number: int) -> float:
             return sum(each[number] for each in shown)
 
-        parts = np.array_split(np.array(self.numbers(), dtype=int), count)
-        best = [max(part.tolist(), key=richness) for part in parts if len(part)]
+        numbers = self.numbers()  # which may be larger than those of NumPy
+        parts = np.array_split(np.arange(len(numbers)), count)
+        best = [max((numbers[k] for k in part), key=richness) for part in parts if len(part)]
         best = [number for number in best if number not in known]
         yield from self.read(sorted(best, key=lambda n: (-richness(n), n)))
 

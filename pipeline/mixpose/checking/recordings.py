@@ -11,12 +11,11 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames import Source
+from mixpose.frames import Source, numbers_of
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.frames.source import Frames
-from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
 from mixpose.records import Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
@@ -183,15 +182,6 @@ def image_of(source: Source, number: int) -> Image | None:
     with closing(source.frames(number, number + 1)) as frames:
         frame = next(frames, None)
     return frame.data if frame is not None and isinstance(frame.data, np.ndarray) else None
-
-
-def numbers_of(source: Source) -> set[int] | None:
-    """Numbers of all frames of a recording, as far as can be told without decoding it."""
-    if isinstance(source, ImageSequence):
-        return set(source.numbers)
-    if isinstance(source, DetectionTable):
-        return set(source.numbers())
-    return None if source.length is None else set(range(source.length))
 
 
 def _frames(source: Source, damage: Damage, *, quick: bool) -> Frames:

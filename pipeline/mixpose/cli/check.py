@@ -17,7 +17,7 @@ from mixpose.cli.notices import bar
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
-from mixpose.frames import ALL_NUMBERS, Source
+from mixpose.frames import ALL_NUMBERS, Source, numbers_of
 from mixpose.frames.tables import DetectionTable
 from mixpose.judgement import expected_covariance
 from mixpose.records import Floats
@@ -180,9 +180,7 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, recordings.Su
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
     """Sensors whose frames hardly pair with those of others, told by numbers alone."""
-    numbers = {
-        name: found for name, each in sources.items() if (found := recordings.numbers_of(each))
-    }
+    numbers = {name: found for name, each in sources.items() if (found := numbers_of(each))}
     warnings = []
     for name, own in numbers.items():
         known = set().union(*(each for other, each in numbers.items() if other != name))

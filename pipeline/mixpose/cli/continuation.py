@@ -20,6 +20,8 @@ from mixpose.cli.request import RunRequest
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
 from mixpose.frames import Source, pair
+from mixpose.frames.capture import is_pipe
+from mixpose.frames.video import Video
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import ResumePoint, resume_point
 from mixpose.runner import Memory
@@ -94,7 +96,7 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
     sensor is live. Raises RecordingError if it holds no poses, or the recording cannot be read.
     """
     for name, source in opened.items():
-        if source.kind == "live":
+        if source.kind == "live" or (isinstance(source, Video) and is_pipe(source.address)):
             raise SessionError(
                 f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
                 "and name another file with -o"
@@ -110,6 +112,7 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         if reached is None:
             file.close()
             return Continuation(None, wanted)
+        _require_same_beginning(poses, reached.first, wanted, opened)
         file.rewind(reached.size, reached.checksum)
         after = _after(wanted, reached.frame)
         with closing(pair(opened, after.start, after.stop, after.step)) as frames:
@@ -128,6 +131,19 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         "are estimated again and left as they are"
     )
     return Continuation(file, wanted, there=reached)
+
+
+def _require_same_beginning(
+    poses: Path, begun: int, wanted: Selection, opened: dict[str, Source]
+) -> None:
+    """Raise SessionError where what was written begins at another frame than this run would."""
+    with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
+        first = next(frames, None)
+    if first is not None and first.number != begun:
+        raise SessionError(
+            f"--resume: {poses} begins with frame {begun}, this run with {first.number}; leave out "
+            "--resume to write the file anew, or give --start as it was"
+        )
 
 
 def _after(wanted: Selection, last: int) -> Selection:

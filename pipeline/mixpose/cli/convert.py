@@ -59,8 +59,9 @@ def convert_poses(request: ConvertRequest) -> None:
     if name == "rerun":
         write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
-        session = session_of(poses, request.session, allow_code=request.allow_code)
-        _unit(poses, request)
+        unit = _unit(poses, request)
+        given = request.session
+        session = session_of(poses, given, allow_code=request.allow_code, unit=unit)
         write_markers(poses, lines, session, name, request)
         return
     else:
@@ -127,7 +128,7 @@ def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floa
     """The pose (4, 4) of a camera of the session, that poses are moved by."""
     bodies = ", ".join(dict.fromkeys(line.label for line in poses.poses))
     try:
-        session = session_of(poses, request.session)
+        session = session_of(poses, request.session, unit=request.unit)
     except SessionError as error:
         raise SessionError(f"--relative-to {name}: no body, which are {bodies}; {error}") from error
     sensors = {setup.name: setup.sensor for setup in session.sensors}

@@ -168,10 +168,11 @@ class Summary:
 
     def warnings(self) -> list[str]:
         """What is most likely wrong with the geometry, once for each sensor at most."""
+        counted = "frames with a pose" if self.bodies == 1 else "poses"
         apart = {n for n, k in self.idle.items() if k >= _MOST * self.posed[n]}
         found = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
-            "frames with a pose: check its T_sensor_world, calibration and source, which "
+            f"{counted}: check its T_sensor_world, calibration and source, which "
             "mixpose check tries"
             for name in self.idle
             if name in apart
@@ -184,7 +185,7 @@ class Summary:
         # what names the cause stands for what only shows it
         found = [*([] if self.findings.tells_of_sensors(causes) else found), *seen, *causes]
         found += [
-            f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
+            f"sensor {name!r} was left out of {count} of {posed} {counted}: {why}"
             for (name, why), count in self.left_out.items()
         ]
         offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
@@ -212,14 +213,16 @@ class Summary:
                 remarks.append(f"sensor {name!r}: delay estimated as {late}")
             elif abs(seen.seconds) > max(_SURELY_LATE * seen.deviation, _LATE_S):
                 kind = "late" if seen.seconds > 0 else "early"
+                whole = round(told + seen.seconds, 4) + 0.0  # no minus zero
                 remarks.append(
                     f"sensor {name!r} is {kind} by {abs(seen.seconds):.4f} s {spread}: "
-                    f"delay = {told + seen.seconds:.4f} in its [[sensor]] takes it off"
+                    f"delay = {whole:.4f} in its [[sensor]] takes it off"
                 )
         return remarks
 
     def _split_text(self) -> str:
-        frames = f"in {self.split_frames} of {self.shared} frames with a pose"
+        counted = "frames with a pose" if self.bodies == 1 else "poses"
+        frames = f"in {self.split_frames} of {self.shared} {counted}"
         check = (
             "check the size of [object], its unit, T_sensor_world and calibration, if the body was "
             "in view of all"

@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 import uuid
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -25,6 +26,7 @@ from pathlib import Path
 from mixpose.cli.lines import held, note_path
 from mixpose.cli.notices import told_frames
 from mixpose.errors import SessionError
+from mixpose.whole_files import appearing_whole
 
 STATUS = "status.json"
 LOG = "log.txt"
@@ -124,10 +126,13 @@ def told(folder: Path) -> Outcome | None:
 def finished(job: Job) -> Outcome | None:
     """How a job ended before, if it is done and nothing about it has changed."""
     outcome = told(Path(job.folder) / job.name)
-    if outcome is None:
-        return None
-    same = (outcome.session_sha256, outcome.options, outcome.mixpose, outcome.state)
-    return outcome if same == (job.session_sha256, job.options, job.mixpose, DONE) else None
+    return outcome if outcome and outcome.state == DONE and _is_of(outcome, job) else None
+
+
+def _is_of(outcome: Outcome, job: Job) -> bool:
+    """Whether an outcome is of the same session, options and version as a job."""
+    same = (outcome.session_sha256, outcome.options, outcome.mixpose)
+    return same == (job.session_sha256, job.options, job.mixpose)
 
 
 def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
@@ -155,11 +160,13 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
 
 def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     part.mkdir(exist_ok=True)
+    goes_on = _goes_on(part, job)
     log, poses = part / LOG, part / job.poses
     command = [sys.executable, "-m", "mixpose.cli.child", "run", *job.options]
-    command += [f"--output={job.poses}"]
-    command += ["--resume"] if poses.suffix == ".jsonl" and poses.exists() else []
-    log.write_bytes(b"")
+    command += [f"--output={job.poses}", *(["--resume"] if goes_on else [])]
+    # what is begun says of what it is, should nothing come to say how it ended
+    _write_status(part, outcome_of(job, INTERRUPTED, _INTERRUPTED_STATUS))
+    log.touch()
     began = time.monotonic()
     status = running.run([*command, "--", job.session], part, log, threads)
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -172,7 +179,7 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     said = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
     outcome = replace(
         outcome_of(job, state, 128 - status if status < 0 else status),
-        frames=frames,
+        frames=_statuses_in(poses) if goes_on and poses.exists() else frames,
         bodies=bodies,
         warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
         reason=None if status == 0 else said,
@@ -180,14 +187,42 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     )
     if state == DONE:  # nothing is left to go on with
         note_path(poses).unlink(missing_ok=True)
-    text = json.dumps(asdict(outcome), indent=1, ensure_ascii=False)
-    (part / STATUS).write_text(text + "\n", encoding="utf-8")
+    _write_status(part, outcome)
     return outcome
 
 
+def _goes_on(part: Path, job: Job) -> bool:
+    """Whether poses of the same job are begun in a folder, which is emptied of all else."""
+    begun, poses = told(part), part / job.poses
+    if begun is not None and _is_of(begun, job) and poses.suffix == ".jsonl" and poses.exists():
+        return True
+    for left in part.iterdir():
+        left.unlink()
+    return False
+
+
+def _statuses_in(poses: Path) -> dict[str, int]:
+    """How many poses of each status a file holds, with those of runs that were interrupted."""
+    with poses.open(encoding="ascii") as lines:
+        whole = [json.loads(line) for line in lines if line.endswith("\n")]
+    return dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
+
+
+def _write_status(part: Path, outcome: Outcome) -> None:
+    text = json.dumps(asdict(outcome), indent=1, ensure_ascii=False)
+    with appearing_whole(part / STATUS) as file:
+        file.write_text(text + "\n", encoding="utf-8")
+
+
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
-    """Give a whole folder its name, unless another worker was faster."""
+    """Give a whole folder its name, unless another worker was faster.
+
+    Poses that are there are not given up for a run that failed.
+    """
     place = Path(job.folder) / job.name
+    there = told(place)
+    if outcome.state == FAILED and there is not None and there.state == DONE:
+        return replace(outcome, reason=f"{outcome.reason}; {job.name} is as it was before")
     while True:
         before = finished(job)
         if before is not None:

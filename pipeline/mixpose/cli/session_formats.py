@@ -208,10 +208,12 @@ def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dic
     return opened
 
 
-def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False) -> Session:
+def session_of(
+    poses: PoseFile, named: Path | None, *, allow_code: bool = False, unit: str | None = None
+) -> Session:
     """The session that poses were estimated with: the one `named`, or the one of their header.
 
-    Raises SessionError if it is not there or has another unit.
+    `unit` is that of poses which say none. Raises SessionError if it is not there or has another.
     """
     path = named
     if path is None:
@@ -226,9 +228,10 @@ def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False)
                 f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
             )
     session = load_session(path, allow_code=allow_code)
-    if poses.unit not in (None, session.unit):
+    unit = poses.unit or unit
+    if unit not in (None, session.unit):
         raise SessionError(
-            f"--session {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"
+            f"--session {path}: lengths in {session.unit}, but those of {poses.path} are in {unit}"
         )
     if poses.header.get("session_sha256") not in (None, session.sha256):
         warn(f"{path} is not as it was when {poses.path} was written")

@@ -33,6 +33,11 @@ def smooth_poses(request: SmoothRequest) -> None:
             f"{path}: was smoothed before, its frames are no longer independent; allowed: poses "
             "as mixpose run writes them"
         )
+    if any(line.ahead_s for line in poses.poses):
+        raise RecordingError(
+            f"{path}: holds poses that were foretold, which say no more than those before them; "
+            "allowed: poses as mixpose run -o writes them"
+        )
     if poses.unit is None:
         raise RecordingError(
             f"{path}: no header says the unit of its lengths; allowed: poses as mixpose run writes "

@@ -3,8 +3,12 @@
 `open_source` finds and opens what a session names; `pair` joins the sources of all sensors.
 """
 
-from mixpose.frames.images import read_image as read_image
-from mixpose.frames.opening import files_of as files_of, open_source as open_source
+from mixpose.frames.images import ImageSequence as ImageSequence, read_image as read_image
+from mixpose.frames.opening import (
+    files_of as files_of,
+    numbers_of as numbers_of,
+    open_source as open_source,
+)
 from mixpose.frames.pairing import pair as pair, paired_by_stamp as paired_by_stamp
 from mixpose.frames.prefetch import prefetch as prefetch
 from mixpose.frames.source import ALL_NUMBERS as ALL_NUMBERS, SensorKind as SensorKind

@@ -74,10 +74,18 @@ class ImageSequence(Source):
         """What is odd about the numbers: a file or two among numbered ones took them from all."""
         if self.is_stamped and self.has_fps:
             return (
-                "the names of its images end in nanoseconds, which are taken for their times, and "
+                "the names of its images end in times since 1970, which are taken for theirs, and "
                 "not fps; drop fps, or name a table of times"
             )
         values, places = [_ending(path) for path in self.paths], [*range(self.length)]
+        by_name = natural_order(self.paths)
+        if values == [*self.numbers] and [*self.paths] != by_name:
+            after = next(k for k, path in enumerate(by_name) if path != self.paths[k])
+            return (
+                f"{self.paths[after].name} comes before {by_name[after].name}, as frames go by the "
+                "numbers that names end in; end them in numbers that ascend, or in seconds or "
+                "nanoseconds since 1970"
+            )
         if self.length < 3 or [*self.numbers] != places or values == places:
             return None
         bare = [path.name for path, value in zip(self.paths, values, strict=True) if value is None]
@@ -140,7 +148,9 @@ def frame_numbers(paths: Sequence[Path]) -> list[int]:
 
 
 def _ending(path: Path) -> int | None:
-    """The number that the name of a file ends in."""
+    """The number that the name of a file ends in; of seconds since 1970 nanoseconds."""
+    if stamp := re.search(r"(?<![0-9])([0-9]{9,10})[.]([0-9]{1,9})$", path.stem):
+        return int(stamp[1] + stamp[2].ljust(9, "0"))
     found = re.search(r"[0-9]+$", path.stem)
     return int(found.group()) if found else None
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.capture import is_pipe
-from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
+from mixpose.frames.images import IMAGE_SUFFIXES, ImageSequence, natural_order, open_images
 from mixpose.frames.live import LiveSource, live_address
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
-from mixpose.frames.tables import open_table
+from mixpose.frames.tables import DetectionTable, open_table
 from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
@@ -46,6 +46,15 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
     ),
     "cloud": ({"detections"}, "a .csv table of points with columns x,y,z"),
 }
+
+
+def numbers_of(source: Source) -> set[int] | None:
+    """Numbers of all frames of a recording, as far as can be told without decoding it."""
+    if isinstance(source, ImageSequence):
+        return set(source.numbers)
+    if isinstance(source, DetectionTable):
+        return set(source.numbers())
+    return None if source.length is None else set(range(source.length))
 
 
 def open_source(spec: SourceSpec) -> Source:

@@ -65,6 +65,7 @@ class DetectionTable(Source):
     clock: Clock | None  # gives the time of a frame number; None means the times in the table
     # numbers of its moments, where it has times alone and others have moments that it lacks
     places: Sequence[int] = range(2**62)
+    has_fps: bool = False  # whether the session states a rate, which times of its own stand for
 
     @property
     def length(self) -> int:
@@ -87,6 +88,15 @@ class DetectionTable(Source):
             return "0 detections"
         numbers = source.numbers_text(contents.first, contents.last, contents.frames)
         return f"{contents.rows} detections, {numbers}"
+
+    def caution(self) -> str | None:
+        """What is odd: a rate of rows that have times and no numbers."""
+        if not self.has_fps:
+            return None
+        return (
+            "its rows have times and no frame numbers, which they go by, and not by fps; drop fps, "
+            "or add a column frame"
+        )
 
     def check_times(self, wanted: range) -> None:
         """See that each frame in the range has a time; reads the table once more."""
@@ -229,7 +239,9 @@ def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTa
             f"{path}, line 1: {fault}; the header of a {spec.kind} table is frame or time_s or "
             f"both, then {','.join(coordinates)}, optionally weight"
         )
-    return DetectionTable(path, columns, coordinates, clock)
+    has_fps = spec.fps is not None and "frame" not in columns
+    clock = None if has_fps else clock
+    return DetectionTable(path, columns, coordinates, clock, has_fps=has_fps)
 
 
 def _header_fault(columns: Sequence[str], coordinates: Sequence[str]) -> str | None:

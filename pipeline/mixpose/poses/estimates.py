@@ -123,6 +123,16 @@ def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
         return rigid.from_parts(T[..., :3, :3], T[..., :3, 3] * ratio)
 
     by_twist: Floats = np.diag([ratio] * 3 + [1.0] * 3)
-    lines = tuple(_changed(line, scaled, by_twist) for line in file.poses)
+    lines = tuple(
+        replace(
+            _changed(line, scaled, by_twist),
+            tip_object=None if line.tip_object is None else ratio * line.tip_object,
+            points={
+                name: replace(one, at=ratio * one.at, residual=ratio * one.residual)
+                for name, one in line.points.items()
+            },
+        )
+        for line in file.poses
+    )
     symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}
     return replace(file, poses=lines, unit=unit, symmetries=symmetries)

@@ -149,9 +149,9 @@ def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | Non
     if all(line.instance is None for line in truth.poses):
         return poses, None
     unit = poses.unit or truth.unit
-    truth = truth_of_then(truth, poses)
+    truth = in_unit(truth_of_then(truth, poses), unit)
     symmetries = {**poses.symmetries, **truth.symmetries}
-    lines, swaps = renumbered(poses.poses, in_unit(truth, unit).poses, symmetries)
+    lines, swaps = renumbered(poses.poses, truth.poses, symmetries)
     return replace(poses, poses=lines), swaps
 
 

@@ -106,6 +106,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
         **({"filled": True} if estimate.filled else {}),
+        **({"ahead_s": estimate.ahead_s} if estimate.ahead_s else {}),
     }
 
 
@@ -201,6 +202,7 @@ class ResumePoint:
     # of the file up to its end: bytes and CRC-32
     size: int
     checksum: int
+    first: int  # frame of the first line
 
 
 def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
@@ -228,7 +230,8 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
     if frame is None:
         return None
     lines = sum(line.frame == frame for line in so_far.poses)
-    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]))
+    first = so_far.poses[0].frame
+    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]), first)
 
 
 def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | None, int]:

@@ -25,7 +25,6 @@ class PoseLine(Estimate):
     """A pose line as read; one without a score, as of a truth file, counts as certain."""
 
     line: int = 0  # where it stands in the file, from 1
-    ahead_s: float = 0.0  # how much later than its frame the pose is, of one that was foretold
 
 
 _Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]

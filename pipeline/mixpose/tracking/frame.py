@@ -377,7 +377,7 @@ def follow(
     """
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
-    steady, branches = per_kind(body, rules.steady), list[Branch]()
+    steady, branches = per_kind(body.radius, rules.steady), list[Branch]()
     is_timed = track.is_timed_as(frame.time_s)
     for there, alike in found:
         one, T, deviation = there, there.T_world_object, there.deviation
@@ -404,7 +404,7 @@ def follow(
             if deviation is not None and parent.course and elapsed <= rules.longest_s:
                 course = parent.course.followed(moved, deviation, elapsed)
         if deviation is not None:
-            course = course or Course.begun(deviation, body, rules)
+            course = course or Course.begun(deviation, body.radius, rules)
         branches.append(replace(one, velocity=velocity, uncertainty=uncertainty, course=course))
     return replace(
         track,

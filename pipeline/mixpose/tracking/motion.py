@@ -71,9 +71,9 @@ class MotionRules:
         return min(self.surprise * (1 + misses), 1.0)
 
 
-def per_kind(body: Body, scale: Scale) -> Floats:
+def per_kind(radius: float, scale: Scale) -> Floats:
     """Lengths, in radii of a body, and angles for all directions alike (6,)."""
-    return np.array([scale[0] * body.radius] * 3 + [math.radians(scale[1])] * 3)
+    return np.array([scale[0] * radius] * 3 + [math.radians(scale[1])] * 3)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class RandomWalk:
     @classmethod
     def unknown(cls, body: Body, elapsed: float, rules: MotionRules) -> RandomWalk:
         """A guess that is wide enough for most."""
-        squares = rules.guess_weight * per_kind(body, rules.unknown) ** 2
+        squares = rules.guess_weight * per_kind(body.radius, rules.unknown) ** 2
         return cls(squares / max(elapsed, 1e-9), rules.guess_weight, rules)
 
     def joined(self, moved: Floats, radius: float, elapsed: float) -> RandomWalk:
@@ -155,7 +155,7 @@ class Expected(NamedTuple):
 @lru_cache(maxsize=64)
 def at_rest(body: Body, rules: MotionRules) -> Expected:
     """Nothing is known of a velocity but how large it may be; not to be written to."""
-    fastest, none = per_kind(body, rules.fastest), np.zeros(6)
+    fastest, none = per_kind(body.radius, rules.fastest), np.zeros(6)
     fastest.flags.writeable = none.flags.writeable = False
     return Expected(none, none, fastest, none, rules.quickest * fastest)
 
@@ -172,16 +172,16 @@ class Course:
     means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F Kalman filters
     covariances: Floats  # (F, 6, 4, 4)
     log_likelihoods: Floats  # (F, 2), of lengths and of angles
-    body: Body
+    radius: float  # of the body
     rules: MotionRules
 
     @classmethod
-    def begun(cls, deviation: Floats, body: Body, rules: MotionRules) -> Course:
+    def begun(cls, deviation: Floats, radius: float, rules: MotionRules) -> Course:
         """A course of one pose with standard deviations (6,)."""
-        count, fastest = rules.sudden[2], per_kind(body, rules.fastest)
+        count, fastest = rules.sudden[2], per_kind(radius, rules.fastest)
         spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(3))], axis=1)
         covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(4), (count, 6, 4, 4))
-        return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), body, rules)
+        return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), radius, rules)
 
     def expected(self, moved: Floats | None, elapsed: float) -> Expected:
         """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
@@ -223,7 +223,7 @@ class Course:
         variance = covariances[:, :, 0, 0] + deviation**2
         off = rest**2 / variance
         if off.min(axis=0).max() > self.rules.lost:
-            return Course.begun(deviation, self.body, self.rules)
+            return Course.begun(deviation, self.radius, self.rules)
         gains = covariances[..., 0] / variance[..., None]
         means = means + gains * rest[..., None]
         covariances = covariances - gains[..., None] * covariances[..., None, 0, :]
@@ -233,7 +233,7 @@ class Course:
         turning += cross(moved[3:, None, None], turning) / 2
         seen = -0.5 * (np.log(variance) + off)
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
-        return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)
+        return Course(means, covariances, logs - logs.max(axis=0), self.radius, self.rules)
 
     @lru_cache(maxsize=16)  # noqa: B019, as few courses are kept as that
     def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:
@@ -243,7 +243,7 @@ class Course:
         F = np.where(j >= i, elapsed**on / factorial[on], 0.0)
         # of white noise in the derivative of the jerk
         Q = elapsed**ahead / (ahead * factorial[3 - i] * factorial[3 - j])
-        units = np.repeat([self.body.radius**2, 1.0], 3)
+        units = np.repeat([self.radius**2, 1.0], 3)
         noise = (
             10 ** np.linspace(*self.rules.sudden)[:, None, None, None] * units[:, None, None] * Q
         )

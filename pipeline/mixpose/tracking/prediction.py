@@ -49,7 +49,7 @@ class Foreseen:
             moved = twist_between(self.T_world_object, T)
             course = self.course.followed(moved, deviation, elapsed)
         else:
-            course = Course.begun(deviation, self.body, self.rules)
+            course = Course.begun(deviation, self.body.radius, self.rules)
         return replace(self, T_world_object=T, time_s=time_s, course=course)
 
     def ahead(self, estimate: Estimate, seconds: float) -> Estimate:

@@ -132,10 +132,10 @@ class Companion:
 
     def expected(self, T_other: Floats, body: Body, rules: MotionRules) -> Branch:
         """Where the body is expected beside the other one."""
-        n, few, guess = self.count, rules.known_from, per_kind(body, rules.unknown) ** 2
+        n, few, guess = self.count, rules.known_from, per_kind(body.radius, rules.unknown) ** 2
         # what is guessed before anything is known counts as some frames
         spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
-        variances = np.maximum(spread, per_kind(body, rules.steady) ** 2)
+        variances = np.maximum(spread, per_kind(body.radius, rules.steady) ** 2)
         wide = variances.reshape(2, 3) @ T_other[:3, :3].T ** 2
         return Branch(T_other @ self.T_other_object, uncertainty=np.sqrt(wide.ravel()))
 

@@ -71,7 +71,7 @@ class Tracker(Setup):
 
         Raises ValueError if T_start is no rotation and translation.
         """
-        start = per_kind(body, rules.motion.start)
+        start = per_kind(body.radius, rules.motion.start)
         if distance is not None:
             start[:3] = distance
         if rotation_deg is not None:

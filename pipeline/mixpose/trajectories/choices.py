@@ -67,24 +67,37 @@ def choices(
 def _followed(
     track: Track, alternatives: Sequence[Alternatives], model: MotionModel, rules: SmoothingRules
 ) -> tuple[list[tuple[int, ...]], Floats]:
-    """The likeliest paths, each a choice per time, and their log likelihoods."""
-    first, white = alternatives[0], white_parts(track, np.array([model.white]))
-    noise = noise_of(track, model.intensities[None])
-    states = begun(track, model.order, white[0].repeat(len(first.poses), axis=0))
-    states = states._replace(poses=first.poses)
-    paths: list[tuple[int, ...]] = [(k,) for k in range(len(first.poses))]
-    logs: Floats = np.log(first.weights)
-    for k, elapsed in enumerate(np.diff(track.times).tolist(), 1):
-        ahead, _ = foretold(states, elapsed, np.repeat(noise, len(logs), axis=0))
-        R = white[k]
-        S = ahead.covariances[:, :6, :6] + R
-        off_track = -0.5 * (rules.none + np.linalg.slogdet(S)[1])
+    """The likeliest paths, each a choice per time, and their log likelihoods.
+
+    A path begins at the first time, or later, where all before show something else.
+    """
+    white, noise = (
+        white_parts(track, np.array([model.white])),
+        noise_of(track, model.intensities[None]),
+    )
+
+    def first(k: int) -> States:
         one = alternatives[k]
-        found: list[States] = []
+        states = begun(track, model.order, white[k].repeat(len(one.poses), axis=0))
+        return states._replace(poses=one.poses)
+
+    def ahead_of(states: States, k: int) -> tuple[States, Floats]:
+        """At the next time, and the log likelihood that this shows something else."""
+        elapsed, count = float(track.times[k] - track.times[k - 1]), len(states.poses)
+        ahead, _ = foretold(states, elapsed, np.repeat(noise, count, axis=0))
+        S = ahead.covariances[:, :6, :6] + white[k]
+        return ahead, -0.5 * (rules.none + np.linalg.slogdet(S)[1])
+
+    states, before = first(0), 0.0 if alternatives[0].may_be_none else -np.inf
+    paths: list[tuple[int, ...]] = [(k,) for k in range(len(states.poses))]
+    logs: Floats = np.log(alternatives[0].weights)
+    for k in range(1, len(alternatives)):
+        ahead, off_track = ahead_of(states, k)
+        one, found = alternatives[k], list[States]()
         all_paths: list[tuple[int, ...]] = []
         all_logs: list[float] = []
         for j, (pose, weight) in enumerate(zip(one.poses, one.weights.tolist(), strict=True)):
-            state, _, own = updated(ahead, pose, R)
+            state, _, own = updated(ahead, pose, white[k])
             found.append(state)
             all_paths += [(*path, j) for path in paths]
             all_logs += (logs + own + np.log(weight)).tolist()
@@ -92,6 +105,12 @@ def _followed(
             found.append(ahead)
             all_paths += [(*path, _NONE) for path in paths]
             all_logs += (logs + off_track).tolist()
+        if before > -np.inf:  # what was before is as far off as from what begins there
+            before += float(ahead_of(first(k - 1), k)[1].max())
+            found.append(first(k))
+            all_paths += [(*[_NONE] * k, j) for j in range(len(one.poses))]
+            all_logs += (before + np.log(one.weights)).tolist()
+            before = before if one.may_be_none else -np.inf
         logs = np.array(all_logs)
         kept = np.argsort(-logs, kind="stable")[: rules.paths]
         kept = kept[logs[kept] > logs.max() - 2 * rules.none]

@@ -39,6 +39,7 @@ from mixpose.trajectories.track import (
     without,
 )
 
+_ROUNDED_S = 1e-6  # of differences of times, which are since 1970 at worst
 _ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
 
 
@@ -163,7 +164,7 @@ def _segments(
 ) -> list[_Segment]:
     """Lines with poses, cut at the longest gaps, with the frames between that are to be filled."""
     step = int(np.median(np.diff([lines[k].frame for k in posed])))
-    cuts = np.flatnonzero(np.diff(times[posed]) > longest) + 1
+    cuts = np.flatnonzero(np.diff(times[posed]) > longest + _ROUNDED_S) + 1
     segments = []
     for part in np.split(np.array(posed), cuts):
         own: list[PoseLine | None] = []
@@ -172,13 +173,15 @@ def _segments(
         moments: list[float] = []
         for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
             line = lines[k]
-            if frames and times[k] - moments[-1] <= fill_s:
-                lost = [lines[i].frame for i in range(last + 1, k)]
-                between = _between(frames[-1], line.frame, step, lost)
-                share = np.array([(n - frames[-1]) / (line.frame - frames[-1]) for n in between])
+            if frames and times[k] - moments[-1] <= fill_s + _ROUNDED_S:
+                told = slice(last, k + 1)
+                at = [each.frame for each in lines[told]]
+                between = _between(frames[-1], line.frame, step, at[1:-1])
                 own += [None] * len(between)
                 known += [known[-1]] * len(between)
-                moments += (moments[-1] + share * (times[k] - moments[-1])).tolist()
+                # frame numbers may be beyond what numbers of NumPy hold
+                since = np.array([n - at[0] for n in at], dtype=np.float64)
+                moments += np.interp([n - at[0] for n in between], since, times[told]).tolist()
                 frames += between
             own.append(line)
             known.append(line)
@@ -252,8 +255,39 @@ def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dic
 def _without_foreign(
     track: Track, model: MotionModel, rules: SmoothingRules
 ) -> tuple[Track, SmoothedTrack]:
-    """A track without poses that lie where those around them forbid, and the track smoothed."""
-    limit = float(chdtri(int(track.free.sum()), rules.foreign))
+    """A track without poses that lie where those around them forbid, and the track smoothed.
+
+    The first is one of them if it is the last of the way back, from which all is told then.
+    """
+    if _off(track, smooth_track(track, model), model, -1)[0] > _limit(track, rules):
+        left, result = _without_foreign_after_first(_reversed(track), model, rules)
+        if not left.measured[-1]:
+            poses, covariances = result.poses[::-1], result.covariances[::-1]
+            return _reversed(left), replace(result, poses=poses, covariances=covariances)
+    return _without_foreign_after_first(track, model, rules)
+
+
+def _reversed(track: Track) -> Track:
+    """The same, back from the last time to the first."""
+    return replace(
+        track,
+        times=-track.times[::-1],
+        poses=track.poses[::-1],
+        covariances=track.covariances[::-1],
+        measured=track.measured[::-1],
+    )
+
+
+def _limit(track: Track, rules: SmoothingRules) -> float:
+    """Squared distance of a pose from what all others say, beyond which it may be a wrong one."""
+    return float(chdtri(int(track.free.sum()), rules.foreign))
+
+
+def _without_foreign_after_first(
+    track: Track, model: MotionModel, rules: SmoothingRules
+) -> tuple[Track, SmoothedTrack]:
+    """The same, where the first pose is right."""
+    limit = _limit(track, rules)
     wrong = logs_of_wrong(track, white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
@@ -261,7 +295,7 @@ def _without_foreign(
         off = _off(track, smooth_track(track, model), model, -1)
         padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
         bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
-        bad[[0, -1]] = False
+        bad[0] = False
         if not bad.any():
             break
         # but at a corner the others tell of sudden motion as well
