@@ -214,3 +214,11 @@ def test_functions_of_the_session_are_run_where_allowed_and_found_from_where_it_
     assert command(*words, "x.toml", "--allow-code", cwd=tmp_path).returncode == 0
     (tmp_path / "other/spots.py").write_bytes((tmp_path / "spots.py").read_bytes())
     assert command(*words, "other/x.toml", "--allow-code", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize("frames", [2, 3, 5, 10])
+def test_true_poses_of_a_body_that_rests_are_all_one(frames: int) -> None:
+    poses = np.repeat(FLOOR[None], frames, axis=0)
+    lines: list[Estimate] = [replace(one, covariance=None) for one in estimates_at(poses)]
+    found = floor_of(lines, "z", ABOVE)
+    np.testing.assert_allclose(found.T_old_new, FLOOR, atol=1e-9)

@@ -9,8 +9,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from command_line import LONGEST_S, command, has_written, started, wait_until
 from long_recordings import RANGE_FRAMES, long_ranges
 
 from mixpose.cli.lines import LineFile
-from mixpose.cli.recording_job import Job, Running, finished, run_job
+from mixpose.cli.recording_job import Job, Running, finished, outcome_of, run_job
 from mixpose.cli.request import RunRequest
 from mixpose.cli.several import names_of, run_sessions, sessions_of
 from mixpose.errors import SessionError
@@ -340,3 +341,58 @@ def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
     for path in begun:
         assert 1 < len(poses_of(path)) <= RANGE_FRAMES
     assert not [path for path in folder.iterdir() if path.name[:2] in ("c", ".c")]
+
+
+def job_of(folder: Path, *options: str) -> Job:
+    return Job(str(RANGES), "ab", str(folder), "ranges", "poses.jsonl", options, "0")
+
+
+def begun(folder: Path, job: Job) -> Path:
+    """What an interrupted run of a job left: its first four frames."""
+    part = folder / ".ranges.unfinished"
+    part.mkdir(parents=True)
+    words = ["run", RANGES, "-o", part / "poses.jsonl", *job.options, "--stop", "4"]
+    assert command(*words).returncode == 0
+    status = asdict(outcome_of(job, "interrupted", 130))
+    (part / "status.json").write_text(json.dumps(status), encoding="utf-8")
+    return part
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"options": ("--start=2",)},
+        {"session_sha256": "cd"},
+        {"mixpose": "1"},
+    ],
+)
+def test_what_was_begun_otherwise_is_begun_anew(tmp_path: Path, changed: dict[str, Any]) -> None:
+    begun(tmp_path, replace(job_of(tmp_path), **changed))
+    outcome = run_job(job_of(tmp_path, "--stop=6"))
+    assert outcome.state == "done", outcome.reason
+    assert [line["frame"] for line in poses_of(tmp_path / "ranges" / "poses.jsonl")[1:]] == [
+        *range(6)
+    ]
+    assert sum(outcome.frames.values()) == 6
+
+
+def test_a_recording_that_goes_on_counts_the_poses_of_all_its_runs(tmp_path: Path) -> None:
+    job = job_of(tmp_path)
+    part = begun(tmp_path, job)
+    (part / "log.txt").write_text("mixpose: warning: of the first run\n", encoding="utf-8")
+    outcome = run_job(job)
+    assert outcome.state == "done", outcome.reason
+    poses = poses_of(tmp_path / "ranges" / "poses.jsonl")[1:]
+    assert outcome.frames == Counter(line["status"] for line in poses)
+    assert len({line["frame"] for line in poses}) == len(poses) > 4
+    assert "of the first run" in (tmp_path / "ranges" / "log.txt").read_text(encoding="utf-8")
+
+
+def test_poses_stay_where_a_run_with_other_options_fails(tmp_path: Path) -> None:
+    assert run_job(job_of(tmp_path, "--stop=3")).state == "done"
+    before = (tmp_path / "ranges" / "poses.jsonl").read_bytes()
+    failed = run_job(replace(job_of(tmp_path, "--stop=4"), session=str(RANGES.parent)))
+    assert failed.state == "failed"
+    assert str(failed.reason).endswith("; ranges is as it was before")
+    assert (tmp_path / "ranges" / "poses.jsonl").read_bytes() == before
+    assert status_of(tmp_path / "ranges")["state"] == "done"

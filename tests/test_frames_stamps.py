@@ -91,3 +91,25 @@ def test_times_beyond_all_clocks_pair_too(tmp_path: Path) -> None:
         (tmp_path / f"{name}.csv").write_text("time_s,u,v\n0,1,1\n1e305,1,1\n", encoding="utf-8")
         sources[name] = open_source(SourceSpec(name, f"{name}.csv", tmp_path, "camera"))
     assert [len(each.frames) for each in pair(paired_by_stamp(sources))] == [2, 2]
+
+
+def test_names_that_end_in_seconds_since_1970_are_stamps(tmp_path: Path) -> None:
+    names = ["1305031102.9", "1305031103.000019", "1305031103.24"]
+    for name in names:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4), np.uint8))
+    source = open_source(SourceSpec("left", "*.png", tmp_path, "camera"))
+    frames = list(source.frames())
+    assert [frame.number for frame in frames] == [
+        1305031102_900000000,
+        1305031103_000019000,
+        1305031103_240000000,
+    ]
+    assert [frame.time_s for frame in frames] == pytest.approx([float(n) for n in names], abs=1e-6)
+    assert source.caution() is None
+
+
+def test_numbers_that_do_not_go_with_the_names_are_told(tmp_path: Path) -> None:
+    for name in ("12-30-58", "12-30-59", "12-31-00"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4), np.uint8))
+    source = open_source(SourceSpec("left", "*.png", tmp_path, "camera"))
+    assert str(source.caution()).startswith("12-31-00.png comes before 12-30-58.png, as frames go")

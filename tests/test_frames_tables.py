@@ -171,3 +171,13 @@ def test_numbers_that_cannot_be_reckoned_with_are_told(
 def test_frames_may_be_numbered_by_nanoseconds(tmp_path: Path) -> None:
     (frame,) = table(tmp_path, "frame,u,v\n1700000000000000000,1,2\n").frames()
     assert frame.number == 1_700_000_000_000_000_000
+
+
+def test_times_of_a_table_without_numbers_stand_for_a_rate(tmp_path: Path) -> None:
+    text = "time_s,u,v\n0.5,1,1\n0.75,3,3\n2,4,4\n"
+    source = table(tmp_path, text, fps=25.0)
+    assert [frame.time_s for frame in source.frames()] == [0.5, 0.75, 2.0]
+    assert "which they go by, and not by fps" in str(source.caution())
+    numbered = table(tmp_path, "frame,u,v\n0,1,1\n5,3,3\n", fps=25.0)
+    assert [frame.time_s for frame in numbered.frames()] == [0.0, 0.2]
+    assert numbered.caution() is None

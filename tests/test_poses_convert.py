@@ -406,3 +406,15 @@ def test_poses_relative_to_a_camera_are_seen_by_it_where_the_object_is(tmp_path:
     assert seen @ np.linalg.solve(found, seen) == pytest.approx(
         twist @ np.linalg.solve(source.covariance, twist), rel=1e-4
     )
+
+
+def test_a_session_in_another_unit_than_the_poses_is_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "truth.jsonl"
+    line = {"frame": 0, "object": "tool", "T_world_object": np.eye(4).tolist(), "time_s": 0.0}
+    path.write_text(json.dumps(line) + "\n")
+    given = ["--session", str(TRUTH.parent / "session.toml"), "--unit", "m"]
+    for more in (["--format", "tum", "--relative-to", "camera"], ["--format", "trc"]):
+        message = refused(capfd, path, *more, *given)
+        assert f"lengths in mm, but those of {path} are in m" in message

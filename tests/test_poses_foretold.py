@@ -147,3 +147,15 @@ def test_evaluate_reads_what_a_receiver_wrote(tmp_path: Path) -> None:
     assert read_poses(tmp_path / "poses.jsonl").poses[0].ahead_s == AHEAD
     result = command("evaluate", tmp_path / "poses.jsonl", tmp_path / "truth.jsonl", "--json")
     assert json.loads(result.stdout)["translation"]["max"] < 0.1
+
+
+def test_poses_that_were_foretold_stay_so_and_are_not_smoothed(tmp_path: Path) -> None:
+    covariance = covariance_of(0.1, 0.001)
+    lines = [pose_line(k, T, covariance, ahead_s=AHEAD) for k, T in enumerate(moving(20)[1])]
+    path, again = tmp_path / "foretold.jsonl", tmp_path / "again.jsonl"
+    write_poses(path, lines)
+    assert command("convert", path, "-o", again).returncode == 0
+    assert {line.ahead_s for line in read_poses(again).poses} == {AHEAD}
+    ended = command("smooth", again, "-o", tmp_path / "smooth.jsonl")
+    assert ended.returncode == 3
+    assert "holds poses that were foretold" in ended.stderr

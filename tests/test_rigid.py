@@ -106,3 +106,12 @@ def test_one_pose_has_the_twist_that_it_has_among_many() -> None:
 def test_a_shift_is_no_turn() -> None:
     moved = perturb(POSES, np.tile([30.0, -40.0, 5.0, 0.0, 0.1, 0.0], (50, 1)))
     np.testing.assert_allclose(rotation_angle_deg(POSES, moved), np.degrees(0.1), atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [1e-9, 9e-6, 1e-3, 2.0, np.pi - 1e-6, np.pi])
+def test_quaternions_hold_the_smallest_and_the_largest_turns(angle: float) -> None:
+    turn = angle * np.array([0.6, 0.0, 0.8])
+    T = from_rotation_vector(turn, np.zeros(3))
+    q = quaternion_xyzw(T)
+    assert q[3] >= 0
+    np.testing.assert_allclose(q[:3] * np.sign(q[0]), np.sin(angle / 2) * turn / angle, atol=1e-12)

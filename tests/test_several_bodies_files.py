@@ -239,3 +239,34 @@ def test_of_identical_bodies_all_have_the_directions_held_that_the_first_starts_
         assert one.T_world_object is not None
         away = [np.abs(one.T_world_object - place).max() for place in truth]
         assert away[one.instance or 0] < 0.5
+
+
+def test_symmetries_of_a_truth_in_another_unit_are_none_that_exchange_bodies(
+    tmp_path: Path,
+) -> None:
+    def file(name: str, unit: str, length: float, *, turned: bool) -> PoseFile:
+        half = rigid.from_rotation_vector([0, 0, np.pi], [200.0 * length, 0, 0])
+        lines = []
+        for frame in range(20):
+            for number in (0, 1):
+                T = at(length * (230.0 * number + 3 * frame))
+                away = turned and frame % 3 == 0
+                T = T @ half if away and not number else T
+                status: Status = "lost" if away and number else "ok"
+                pose = None if status == "lost" else T
+                lines.append(
+                    Estimate(frame, None, "b", status, pose, None, 1.0, {}, instance=number)
+                )
+        path = tmp_path / name
+        header = Header(unit, None, None, "0.1.0", 0, symmetries={"b": np.array([np.eye(4), half])})
+        with path.open("w", encoding="utf-8") as stream:
+            writer = FORMATS["jsonl"](stream, header)
+            for line in lines:
+                writer.write(line)
+        return read_poses(path)
+
+    poses = file("poses.jsonl", "mm", 1.0, turned=True)
+    for unit, length in (("mm", 1.0), ("m", 1e-3)):
+        found = evaluate(poses, file("truth.jsonl", unit, length, turned=False))
+        assert found.swaps is not None
+        assert found.swaps.count == 0

@@ -14,6 +14,7 @@ from mixpose.records import Floats, Hypothesis
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.smoothing import smooth_body
 
+FAR = ([80.0, 0, 0, 0.5, 0, 0], [-20.0, 90, 0, 0, 0.9, 0])  # no part of any motion
 QUICK = SmoothingRules(frames=40, block=40)  # enough to tell how the bodies of these tests move
 
 
@@ -108,3 +109,30 @@ def test_two_tracks_that_are_equally_smooth_stay_ambiguous() -> None:
     assert {one.status for one in smooth.estimates} == {"ambiguous"}
     assert smooth.decided == 0
     assert smooth.estimates[20].hypotheses[0].weight < 0.999
+
+
+@pytest.mark.parametrize("doubted", [[0], [0, 1], [59]])
+def test_frames_at_either_end_may_show_nothing_of_the_body(doubted: list[int]) -> None:
+    covariance = covariance_of(0.1, 0.001)
+    poses = measured(swinging(60), covariance)
+    lines = lines_of(poses, covariance)
+    for k in doubted:
+        far = [rigid.perturb(poses[k], np.array(off)) for off in FAR]
+        lines[k] = with_rival(lines[k], *far)
+    smooth = smooth_body(lines, rules=QUICK)
+    assert {one.frame for one in smooth.estimates if one.status != "ok"} == {*doubted}
+    assert smooth.refused == ()
+
+
+@pytest.mark.parametrize("end", [0, 59])
+def test_a_wrong_pose_at_either_end_is_told(end: int) -> None:
+    truth, covariance = swinging(60), covariance_of(0.1, 0.001)
+    poses = measured(truth, covariance)
+    lines = lines_of(poses, covariance)
+    lines[end] = replace(lines[end], T_world_object=rigid.perturb(poses[end], np.array(FAR[0])))
+    smooth = smooth_body(lines, rules=QUICK)
+    assert smooth.refused == (end,)
+    one = smooth.estimates[end]
+    assert one.status == "ambiguous"
+    assert one.T_world_object is not None
+    assert np.abs(rigid.twist_between(truth[end], one.T_world_object)[:3]).max() < 1.0

@@ -131,3 +131,29 @@ def test_a_body_that_rests_and_is_put_elsewhere_is_smoothed_on_both_sides() -> N
     before, after = rms_errors(truth, poses), rms_errors(truth, poses_of(smooth.estimates))
     assert max(np.divide(after, before)) < 0.5  # of 30 poses at rest: 1/sqrt(30), and 3 that move
     assert squared_errors(truth, smooth.estimates).max() < 3.7  # of 6 numbers 99.9 %
+
+
+def test_lost_frames_are_filled_at_their_own_times() -> None:
+    truth, covariance = swinging(40), covariance_of(0.1, 0.001)
+    lines = lines_of(measured(truth, covariance), covariance)
+    # of four frames that nobody sees the third is late, as where a camera drops frames
+    for k in range(20, 24):
+        moved = 0.03 if k == 22 else 0.0
+        lost = replace(lines[k], status="lost", T_world_object=None, covariance=None)
+        lines[k] = replace(lost, time_s=0.04 * k + moved)
+    found = smooth_body(lines, rules=QUICK, fill_s=1.0)
+    assert [one.time_s for one in found.estimates] == [one.time_s for one in lines]
+    late = swinging(4000, interval_s=0.0004)[2275]  # at 0.91 s
+    T = found.estimates[22].T_world_object
+    assert T is not None
+    assert np.abs(rigid.twist_between(late, T)[:3]).max() < 0.5  # it goes by 2 in 0.03 s
+
+
+@pytest.mark.parametrize("begun", [0.0, 1.7e9])
+def test_gaps_of_the_longest_that_is_filled_are(begun: float) -> None:
+    covariance = covariance_of(0.1, 0.001)
+    lines = at_times(lines_of(swinging(40), covariance), begun + 0.1 * np.arange(40))
+    kept = [line for line in lines if line.frame % 5 != 4]
+    found = smooth_body(kept, rules=QUICK, fill_s=0.2)
+    # but the last, after which there is none
+    assert [one.frame for one in found.estimates if one.filled] == [4, 9, 14, 19, 24, 29, 34]
