@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from calibration_texts import kalibr
+from command_line import command
 from simulated_rigs import NO_FRAME_HELD_BACK, POINTS, alone, cameras, recording, task_of
 
 from mixpose.calibration import Calibration, Rig, calibrate
+from mixpose.calibration.recorded import read_frames
+from mixpose.calibration.result import sights_of
 from mixpose.calibration.rig import centre_of
+from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.words import in_length, in_world
 from mixpose.calibration.writing import calibrated_text
 from mixpose.rigid import inverse
@@ -158,3 +163,59 @@ def test_a_known_length_scales_bodies_that_were_not_looked_at(tmp_path: Path) ->
     found = in_length(calibrated(session, free={}), f"left:right={2 * np.linalg.norm(b - a)}")
     for one, other in zip(session.objects, written(session, found).objects, strict=True):
         np.testing.assert_allclose(other.body.nodes.points, 2 * one.body.nodes.points, atol=1e-6)
+
+
+def test_a_known_length_scales_what_a_calibration_may_be_off_by(tmp_path: Path) -> None:
+    error = "calibration_error = { focal = 0.001, position = 0.25 }\n"
+    text = text_of().replace("resolution", f"{error}resolution", 1)
+    session = session_in(tmp_path, text)
+    a, b = (centre_of(one.sensor) for one in session.sensors)
+    found = in_length(calibrated(session, free={}), f"left:right={2 * np.linalg.norm(b - a)}")
+    changed = written(session, found).sensors[0].calibration_error
+    assert changed is not None
+    assert changed.position == pytest.approx(0.5)
+    assert changed.focal == 0.001
+
+
+def rows_of(numbers: list[int]) -> str:
+    rng = np.random.default_rng(0)
+    rows = [
+        f"{n},{k / 30},{u:.2f},{v:.2f}"
+        for k, n in enumerate(numbers)
+        for u, v in rng.uniform(0, 500, (4, 2))
+    ]
+    return "frame,time_s,u,v\n" + "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize("runs", [False, True])
+@pytest.mark.parametrize(
+    "numbers",
+    [range(2000), range(0, 20_000, 10), range(10**18, 10**18 + 2000 * 33_333_333, 33_333_333)],
+    ids=["counted", "with gaps", "stamps"],
+)
+def test_frames_of_long_recordings_are_taken_evenly_whatever_their_numbers(
+    tmp_path: Path, numbers: range, runs: bool
+) -> None:
+    text = text_of().partition('[[sensor]]\nname = "right"')[0].replace("fps = 30\n", "")
+    session = session_in(tmp_path, text)
+    (tmp_path / "left.csv").write_text(rows_of([*numbers]), encoding="utf-8")
+    rules = CalibrationRules(most_candidates=10_000)
+    frames = read_frames(session, {}, rules, lambda *_: None, runs=runs, known=None)
+    assert len(frames) == rules.most_read // 8 * 8
+    places = [numbers.index(frame.number) for frame in frames]
+    assert (places[0], places[-1]) == (0, 1999)
+    assert max(np.diff(places)) <= (2000 / len(frames) + 1) * (8 if runs else 1)
+
+
+def test_numbers_longer_than_those_of_numpy_are_looked_at(tmp_path: Path) -> None:
+    session = session_in(tmp_path, text_of())
+    for name in ("left", "right"):
+        rows = rows_of([10**20 + k for k in range(20)])
+        (tmp_path / f"{name}.csv").write_text(rows, encoding="utf-8")
+    checked = command("check", session.path)
+    assert checked.returncode in (0, 1)
+    assert "frames 100000000000000000000-" in checked.stdout
+    pairs = SimpleNamespace(frame=np.array([0, 1]), feature=np.array([0, 1]), y=np.zeros((2, 2)))
+    rows_met: Any = SimpleNamespace(pairs=pairs, residual=np.zeros((2, 2)))
+    adjusted: Any = SimpleNamespace(weighted=[(rows_met, np.ones(2))])
+    assert sights_of(adjusted, [10**20, 3])[0].frame.tolist() == [np.iinfo(np.intp).max, 3]

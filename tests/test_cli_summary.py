@@ -163,3 +163,10 @@ def test_squares_of_a_chessboard_that_are_a_millimetre_too_large(
         for estimate in mixpose.run(replace(session, body=body), selection=Selection(1, 2)):
             counted.add(estimate)
         assert (counted.warnings() == []) is is_silent
+
+
+def test_poses_of_several_bodies_are_not_called_frames() -> None:
+    session = load_session(SYNTHETIC / "several_bodies" / "session.toml")
+    out = [replace(met(0.9), used=False, why="it contradicts the others")]
+    found = summary(session, *[[*out, met(0.9)]] * 8)
+    assert any("was left out of 8 of 8 poses: it contradicts" in one for one in found.warnings())

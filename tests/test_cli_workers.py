@@ -351,8 +351,8 @@ def begun(folder: Path, job: Job) -> Path:
     """What an interrupted run of a job left: its first four frames."""
     part = folder / ".ranges.unfinished"
     part.mkdir(parents=True)
-    words = ["run", RANGES, "-o", part / "poses.jsonl", *job.options, "--stop", "4"]
-    assert command(*words).returncode == 0
+    to = part / "poses.jsonl"
+    assert command("run", RANGES, "-o", to, *job.options, "--stop", "4").returncode == 0
     status = asdict(outcome_of(job, "interrupted", 130))
     (part / "status.json").write_text(json.dumps(status), encoding="utf-8")
     return part

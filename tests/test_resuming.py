@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from mixpose.cli import lines, main
+from mixpose.cli.continuation import Note
 from mixpose.cli.lines import LineFile, note_path
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
@@ -67,6 +68,8 @@ def test_a_run_in_pieces_writes_the_bytes_of_a_run_at_once(name: str, tmp_path: 
     whole, parts = tmp_path / "whole.jsonl", tmp_path / "parts.jsonl"
     assert command("run", session, "-o", whole) == 0
     assert command("run", session, "-o", parts, "--stop", "4") == 0
+    note = decode(Note, json.loads(note_path(parts).read_bytes()))  # or all is estimated again
+    assert note.frame == 3
     assert command("run", session, "-o", parts, "--stop", "5", "--resume") == 0
     assert command("run", session, "-o", parts, "--resume") == 0
     assert without_latency(parts) == without_latency(whole)
@@ -193,6 +196,42 @@ def test_a_full_disk_under_a_file_that_appears_whole_is_told_with_its_name(tmp_p
     with pytest.raises(OSError, match=r"No space left on device: .*summary\.json"):
         write()
     assert list(tmp_path.iterdir()) == []
+
+
+@needs_posix
+def test_a_file_that_appears_whole_keeps_its_mode_and_links_to_it(tmp_path: Path) -> None:
+    file, link = tmp_path / "session.toml", tmp_path / "link.toml"
+    file.write_text("old", encoding="ascii")
+    file.chmod(0o640)
+    link.symlink_to(file)
+    with appearing_whole(link) as part:
+        part.write_text("new", encoding="ascii")
+    assert link.is_symlink()
+    assert file.read_text(encoding="ascii") == "new"
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert {path.name for path in tmp_path.iterdir()} == {"session.toml", "link.toml"}
+
+
+def test_poses_that_begin_elsewhere_are_not_gone_on_with(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    poses, whole = tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
+    assert command("run", RANGES, "-o", whole, "--start", "4") == 0
+    assert command("run", RANGES, "-o", poses, "--start", "4", "--stop", "8") == 0
+    assert command("run", RANGES, "-o", poses, "--resume") == 2
+    message = f"--resume: {poses} begins with frame 4, this run with 0; leave out --resume"
+    assert message in capfd.readouterr().err
+    assert command("run", RANGES, "-o", poses, "--start", "4", "--resume") == 0
+    assert without_latency(poses) == without_latency(whole)
+
+
+@needs_posix
+def test_a_pipe_is_not_gone_on_with(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pipe, poses = tmp_path / "camera", tmp_path / "poses.jsonl"
+    os.mkfifo(pipe)
+    assert command("run", VIDEO, "-o", poses, "--stop", "2") == 0
+    assert command("run", VIDEO, "-o", poses, "--resume", "--source", f"camera={pipe}") == 2
+    assert "sensor 'camera' is live, what it missed is gone" in capfd.readouterr().err
 
 
 @needs_posix

@@ -117,8 +117,8 @@ def test_frames_at_either_end_may_show_nothing_of_the_body(doubted: list[int]) -
     poses = measured(swinging(60), covariance)
     lines = lines_of(poses, covariance)
     for k in doubted:
-        far = [rigid.perturb(poses[k], np.array(off)) for off in FAR]
-        lines[k] = with_rival(lines[k], *far)
+        one, other = (rigid.perturb(poses[k], np.array(off)) for off in FAR)
+        lines[k] = with_rival(lines[k], one, other)
     smooth = smooth_body(lines, rules=QUICK)
     assert {one.frame for one in smooth.estimates if one.status != "ok"} == {*doubted}
     assert smooth.refused == ()
