@@ -40,9 +40,11 @@ from mixpose.calibration.task import Hypotheses
 from mixpose.calibration.telling import doubts_of
 from mixpose.errors import RecordingError
 from mixpose.rigid import (
+    from_rotation_vector,
     inverse,
     perturb,
     rotation_angle_deg,
+    transform,
     twist_between,
 )
 from mixpose.sensors import RangeSensor
@@ -66,6 +68,31 @@ def test_a_camera_off_by_2_degrees_and_20_mm_that_is_7_ms_late_is_put_right() ->
     assert found.noise == pytest.approx(0.02, rel=0.2)
     assert found.residuals[1].held < 0.05 < found.residuals[1].before
     assert len(found.used) == 40
+
+
+@pytest.mark.parametrize("deg", [0.0, 0.3, 4.0])
+def test_cameras_that_stand_about_where_they_are_told_are_not_searched_alone(
+    deg: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another body like it beside it, which each camera alone takes for it as well."""
+    monkeypatch.setattr("mixpose.calibration.searching._hypotheses", searched_in_vain)
+    sensors = cameras(3)
+    other = transform(from_rotation_vector([0.4, -0.3, 0.9], [150.0, 60, 90]), POINTS * 1.02)
+    frames = recording(sensors, 20, 0.02)
+    beside = recording(sensors, 20, 0.02, points=other, seed=2)
+    both = tuple(
+        replace(a, points={k: np.concatenate([y, b.points[k]]) for k, y in a.points.items()})
+        for a, b in zip(frames, beside, strict=True)
+    )
+    task = bumped(task_of(sensors, both), 2, deg, 5 * deg)
+    found = calibrate(task, NO_FRAME_HELD_BACK)
+    assert len(found.used) == 20
+    T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
+    assert rotation_angle_deg(T, sensors[2].T_sensor_world) < 0.02
+
+
+def searched_in_vain(*_: object) -> None:
+    raise AssertionError("cameras were searched alone")
 
 
 def test_a_step_is_as_large_as_the_deviations_of_what_it_moves() -> None:

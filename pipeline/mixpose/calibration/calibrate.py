@@ -17,8 +17,13 @@ from mixpose.calibration.profile import profiled
 from mixpose.calibration.recorded import held_back_with
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.searching import searched
-from mixpose.calibration.start import Start, start_from_cameras, starts_together
+from mixpose.calibration.searching import are_sure_together, searched
+from mixpose.calibration.start import (
+    Start,
+    start_from_cameras,
+    start_where_they_stand,
+    starts_together,
+)
 from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
@@ -42,8 +47,10 @@ def calibrate(
     Raises a RecordingError if the body is not found in enough frames.
     """
     if task.cameras:
-        known = searched(task, rules, progress, {} if found is None else found)
-        best = _from_cameras(task, known, rules, progress)
+        best = _as_it_stands(task, rules, progress)
+        if best is None:
+            known = searched(task, rules, progress, {} if found is None else found)
+            best = _from_cameras(task, known, rules, progress)
     else:
         starts = starts_together(task, _probed(task, rules, progress), progress)
         best = _best(task, starts, rules, progress)
@@ -63,6 +70,31 @@ def calibrate(
         )
     told = run.profiled()
     return replace(told, residuals=run.residuals(), contradicted=run.contradicted())
+
+
+def _as_it_stands(
+    task: Task, rules: CalibrationRules, progress: Progress
+) -> tuple[int, _Run] | None:
+    """The run from where the session has all cameras; None where that leaves any unexplained.
+
+    Together they know the body among others that each alone may take for it.
+    """
+    if task.known is not None or task.times_matter or len(task.cameras) < 2:
+        return None
+    few = task.frames[:: -(-len(task.frames) // rules.probes)]
+    if not are_sure_together(replace(task, frames=few)):
+        return None
+    start = start_where_they_stand(task, progress)
+    best = _best(task, [start], rules, progress)
+    if best is not None and (wrong := best[1].found.doubtful(rules)):
+        # which are placed by what the others know
+        frames = tuple(frame.without(wrong) for frame in start.frames)
+        best = _best(task, [replace(start, frames=frames, unlinked=wrong)], rules, progress)
+    if best is None:
+        return None
+    found = best[1].found
+    fits = bool((found.noise < rules.failed * task.sigmas).all()) and found.are_linked
+    return best if fits and not found.doubtful(rules) else None
 
 
 def _from_cameras(

@@ -86,6 +86,16 @@ class Calibration:
     contradicted: Contradiction | None = None  # what is held, and the recording says otherwise
     T_new_old: Floats | None = None  # (4, 4): to the world of `after`, where it is another one
 
+    @property
+    def are_linked(self) -> bool:
+        """Whether frames that sensors share link all of them."""
+        parts = list[set[int]]()  # frames of sensors that are linked
+        for one in self.sights.values():
+            own = set(one.frame.tolist())
+            shared = [part for part in parts if part & own]
+            parts = [part for part in parts if not part & own] + [own.union(*shared)]
+        return len(parts) == 1
+
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
         """Sensors that most likely stand elsewhere: what they saw is not explained."""
         return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))

@@ -54,6 +54,16 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
     return Hypotheses(poses, np.array([one.log_evidence for one in kept]))
 
 
+def likeliest_poses(task: Task, progress: Progress) -> tuple[tuple[SeenFrame, ...], Floats]:
+    """Frames of which all sensors together know a pose, believed or not, and these (K, 4, 4)."""
+    found: list[tuple[SeenFrame, Floats]] = []
+    for done, (frame, T, _) in enumerate(_tracked(task, 1.0)):
+        progress("searching the body with all sensors", done, len(task.frames))
+        if T is not None:
+            found.append((frame, T))
+    return tuple(frame for frame, _ in found), np.array([T for _, T in found]).reshape(-1, 4, 4)
+
+
 def joint_poses(
     task: Task, rules: CalibrationRules, progress: Progress
 ) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
@@ -70,6 +80,12 @@ def joint_poses(
         found = sorted(found, key=lambda each: each[0].number) if few else sure
         poses = np.array([T for _, T, _ in found]).reshape(-1, 4, 4)
         yield tuple(frame for frame, _, _ in found), poses
+
+
+def are_sure_together(task: Task) -> bool:
+    """Whether all sensors together are sure of the body in most frames."""
+    sure = [is_sure for _, _, is_sure in _tracked(task, 1.0)]
+    return sum(sure) > len(sure) / 2
 
 
 def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats | None, bool]]:

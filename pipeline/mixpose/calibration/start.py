@@ -16,7 +16,7 @@ import numpy as np
 
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.searching import joint_poses
+from mixpose.calibration.searching import joint_poses, likeliest_poses
 from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse, mean_motion, rotation_angle_deg, transform
@@ -97,6 +97,12 @@ def _from_known_poses(
         through[sensor] = (None, link.frames)
     frames = tuple(task.frames[k].without(unlinked) for k in kept)
     return Start(State(rig, poses), frames, through, tuple(unlinked))
+
+
+def start_where_they_stand(task: Task, progress: Progress) -> Start:
+    """The rig as it is believed to be, and the likeliest poses that all sensors together know."""
+    frames, poses = likeliest_poses(task, progress)
+    return Start(State(task.rig, poses), frames, {}, ())
 
 
 def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
