@@ -17,7 +17,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.checking import judge
 from mixpose.checking.keys import told_apart
 from mixpose.checking.placement import expected_count, fewest_count
-from mixpose.checking.recordings import Survey, some_of
+from mixpose.checking.recordings import Survey, has_twins, order_warnings, some_of
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
@@ -419,3 +419,14 @@ def test_lines_of_several_bodies_have_their_names(capsys: pytest.CaptureFixture[
     for title in ("symmetry", "in view", "accuracy"):
         found = re.findall(rf"^{title} +(\w+): ", report, flags=re.MULTILINE)
         assert found == ["tool", "reference", "rod"]
+
+
+def test_rows_that_are_repeated_and_times_that_go_back_are_told() -> None:
+    times = {3: 0.1, 4: 0.2, 5: 0.15}
+    own = Survey((3, 4, 5), (3, 4, 5), (4, 4, 4), (), times=times, doubled=(4,))
+    first, second = order_warnings({"left": own})
+    assert "stands twice or more in 1 of 3 frames, as 4: are rows" in first
+    assert "'left': frame 5 is at 0.15 s and the frame before it at 0.2 s; a run ends" in second
+    assert order_warnings({"left": replace(own, times={3: 0.1, 4: 0.1}, doubled=())}) == []
+    assert has_twins(np.array([[1.0, 2], [3, 4], [1, 2]]))
+    assert not has_twins(np.array([[1.0, 2], [3, 4], [1, 3]]))

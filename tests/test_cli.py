@@ -325,3 +325,14 @@ def test_help_of_simulate_has_its_options_in_groups() -> None:
     text = command("simulate", "--help").stdout
     found = [len(part.split("\n  -")) - 1 for part in re.split(r"^\w[\w ,]+:$", text, flags=re.M)]
     assert max(found) < 10
+
+
+def test_an_interrupt_of_what_writes_at_its_end_does_not_say_that_something_is_written() -> None:
+    script = (
+        "from mixpose import cli\n"
+        "cli._status = lambda arguments: exec('raise KeyboardInterrupt')\n"
+        "cli.main(['learn', 'session.toml'])\n"
+    )
+    words = [sys.executable, "-c", script]
+    result = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (130, "mixpose: interrupted\n")

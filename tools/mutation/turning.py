@@ -124,16 +124,20 @@ MUTANTS = (
     Mutant(
         "poses-foretold-are-held-against-their-frame",
         "poses/evaluate.py",
-        "truth = in_unit(truth_of_then(truth, poses), unit)",
-        "truth = in_unit(truth, unit)",
+        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
+        "truth = in_unit(truth, unit)\n"
+        "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
         "poses that were foretold rightly are said to be wrong by what the body moved",
         (_FORETOLD,),
     ),
     Mutant(
         "poses-foretold-numbers-by-their-frame",
         "poses/evaluate.py",
-        "    truth = truth_of_then(truth, poses)\n    symmetries",
-        "    symmetries",
+        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
+        "truth = in_unit(truth, unit)\n"
+        "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
         "identical bodies are numbered by where they were before",
         (_FORETOLD,),
     ),

@@ -23,4 +23,8 @@ from mixpose.body.look_alikes import (
 )
 from mixpose.body.model import Body as Body, Gravity as Gravity, Nodes as Nodes, Shape as Shape
 from mixpose.body.sampling import Sampler as Sampler, uniforms as uniforms
-from mixpose.body.symmetry import symmetries as symmetries
+from mixpose.body.symmetry import (
+    default_tolerance as default_tolerance,
+    is_on_a_line as is_on_a_line,
+    symmetries as symmetries,
+)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import combinations
+from itertools import chain, combinations
 from typing import TypeAlias
 
 import numpy as np
@@ -120,31 +120,40 @@ def like_features(
 
 @lru_cache(maxsize=256)
 def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlike, ...]:
-    """The largest parts of two bodies that are congruent, largest first, none within another.
+    """The largest parts of two bodies that are congruent, the closest first.
 
     Parts have three features or more that are not on a line.  Of a body by itself the identity is
     left out.  At most 60 features of each are compared: triples of more take minutes.
     """
     points, targets = body.means[:60], other.means[:60]
-    found: list[LookAlike] = []
-    for triple in combinations(range(len(points)), FEWEST):
+    found: dict[Pairs, LookAlike] = {}
+    most, partners = 0, np.full((0, len(points)), -1)  # of each part's features
+    # the widest tells the motions of all of a body best
+    first = [widest_triple(points)] if len(points) >= FEWEST else []
+    for triple in chain(first, combinations(range(len(points)), FEWEST)):
         base = list(triple)
         if _is_narrow(points[base], tolerance):
             continue
         images = congruent_triples(points[base], targets, 2 * tolerance)
         if body is other:
             images = images[(images != base).any(axis=1)]
-        for known in found:
-            images = images[~_within(images, base, known)]
+        images = images[~_are_among(images, partners[:, base])]
         while len(images):
             part = _grown(body, other, base, images[0], tolerance)
             images = images[1:]
-            if part is None or any(part.pairs <= known.pairs for known in found):
+            if part is None:
                 continue
-            found = [known for known in found if not known.pairs <= part.pairs]
-            found.append(part)
-            images = images[~_within(images, base, part)]
-    return tuple(sorted(found, key=lambda part: (-len(part.features), part.off)))
+            own = np.full((1, len(points)), -1)
+            own[0, list(part.features)] = part.partners
+            partners = np.concatenate([partners, own])
+            images = images[~_are_among(images, own[:, base])]
+            if len(part.features) > most:
+                most, found = len(part.features), {}
+            if len(part.features) == most:
+                found[part.features, part.partners] = part
+        if most == len(points):  # all others as large have this triple, too
+            break
+    return tuple(sorted(found.values(), key=lambda part: part.off))
 
 
 def other_tilt(
@@ -331,10 +340,10 @@ def _grown(
     return _fitted(body, other, np.flatnonzero(near), partners[near])
 
 
-def _within(images: NDArray[np.intp], base: list[int], part: LookAlike) -> NDArray[np.bool_]:
-    """Whether a part pairs a triple of the body with images (K, 3) of it."""
-    partners = dict(part.pairs)
-    return np.asarray((images == [partners.get(own, -1) for own in base]).all(axis=1))
+def _are_among(triples: NDArray[np.intp], known: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Whether triples (K, 3) of numbers are among known ones (F, 3)."""
+    one, other = (each @ [1_000_000, 1000, 1] for each in (triples, known))
+    return np.isin(one, other[(known >= 0).all(axis=1)])
 
 
 def _modulo_symmetry(other: Body, part: LookAlike) -> Pairs:

@@ -35,7 +35,7 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
     points = points if len(distinct) == len(points) else distinct  # seen as one
     centre = points.mean(axis=0)
     centred = points - centre
-    if np.linalg.svd(centred, compute_uv=False)[1] <= tolerance:
+    if is_on_a_line(points, tolerance):
         return from_parts(*_line_symmetries(centred, centre, tolerance))
     base = centred[list(widest_triple(centred))]
     tree = cKDTree(centred)
@@ -51,6 +51,11 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
             found.append(R)
     rotations = _closed(np.array(found), centred, tree, 2 * tolerance)
     return from_parts(rotations, centre - rotations @ centre)
+
+
+def is_on_a_line(points: Floats, tolerance: float) -> bool:
+    """Whether points (N, 3) lie on one line, about which any turn leaves them as they are."""
+    return bool(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] <= tolerance)
 
 
 def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float) -> Floats:

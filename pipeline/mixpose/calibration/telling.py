@@ -291,7 +291,9 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
             f"{one.residual_after:.3g} {of}" + ("  MOVED" if one.moved and are_told else "")
         )
     lines += [f"{'not known':<20}{found.after.names[k]}: shares no view" for k in found.unlinked]
-    if not bumped:
+    if len(found.after.names) < 2:
+        lines.append("nothing to hold it against: one sensor alone shows where the body is")
+    elif not bumped:
         lines.append("the calibration holds" + (", of what shares views" if found.unlinked else ""))
     elif are_told:
         lines.append(f"the calibration no longer holds: {', '.join(bumped)} moved")

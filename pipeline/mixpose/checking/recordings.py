@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +17,7 @@ from mixpose.frames.prefetch import prefetch
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.frames.source import Frames
 from mixpose.frames.video import Video
-from mixpose.records import Image, PointPattern, RawFrame
+from mixpose.records import Floats, Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
@@ -46,6 +46,7 @@ class Survey:
     is_whole: bool = True  # whether all frames were looked at
     times: Mapping[int, float] = field(default_factory=dict)  # of frames that have one, in s
     repeated: tuple[int, ...] = ()  # frames that show something, and the same as the one before
+    doubled: tuple[int, ...] = ()  # frames of a table in which a detection stands twice or more
     # frames that were counted, with the points found in place of an image; none where too many
     found: Mapping[int, RawFrame] = field(default_factory=dict)
 
@@ -78,6 +79,7 @@ def survey(
     counts: dict[int, int | None] = {}
     numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
     times, repeated, before = dict[int, float](), list[int](), None
+    doubled = list[int]()
     size: tuple[int, int] | None = None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
@@ -93,6 +95,8 @@ def survey(
                 if looked_at is not None and frame.number not in looked_at:
                     done()
                     continue
+            if isinstance(frame.data, PointPattern) and has_twins(frame.data.points):
+                doubled.append(frame.number)
             observation = observation_of(session, setup, frame)
             pattern = observation.pattern
             if isinstance(pattern, PointPattern):
@@ -118,6 +122,7 @@ def survey(
         is_whole=not quick,
         times=times,
         repeated=tuple(repeated),
+        doubled=tuple(doubled),
         found=found,
     )
 
@@ -135,6 +140,32 @@ def _spread(numbers: Sequence[int], most: int) -> list[int]:
     """Some of the numbers from the first to the last."""
     places = np.linspace(0, len(numbers) - 1, min(most, len(numbers)))
     return [numbers[int(place)] for place in places]
+
+
+def has_twins(points: Floats) -> bool:
+    """Whether any two of points (n, m) are the same, to the last digit."""
+    return len(np.unique(points, axis=0)) < len(points)
+
+
+def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
+    """Tables whose detections stand there twice, and recordings whose times go back."""
+    warnings = []
+    for name, own in surveys.items():
+        if own.doubled:
+            warnings.append(
+                f"sensor {name!r}: the same detection stands twice or more in "
+                f"{len(own.doubled)} of {len(own.numbers)} frames, as {own.doubled[0]}: are rows "
+                "of its table repeated? Each counts as a feature of its own"
+            )
+        ordered = sorted(own.times.items())
+        back = [(k, b, a) for (_, a), (k, b) in pairwise(ordered) if b < a]
+        if back:
+            number, later, earlier = back[0]
+            warnings.append(
+                f"sensor {name!r}: frame {number} is at {later:g} s and the frame before it at "
+                f"{earlier:g} s; a run ends there, as times that go back tell no velocity"
+            )
+    return warnings
 
 
 def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:

@@ -298,13 +298,14 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
             f"k1 = {k[0]:.2g}, k2 = {k[1]:.2g}"
         )
 
-    copied = f", but that of {twins[0]!r}" if twins else ""
+    is_copied = len(twins) == 1  # cameras of a kind may all have the same
+    copied = f", but that of {twins[0]!r}" if is_copied else ""
     return Unknown(
         f"the calibration of {name!r} {{is}} not that of its images{copied}",
         remedy,
         np.array([_FOCAL, centre, centre, _BENT, _BENT]),
         sensor=other,
-        cost=-_COPIED if twins else 0.0,
+        cost=-_COPIED if is_copied else 0.0,
     )
 
 

@@ -17,6 +17,19 @@ from mixpose.threads import ask_for_one_blas_thread
 WRONG_USAGE = 2
 INTERRUPTED = 130
 
+# commands that write what they found when they have all of it
+_AT_ONCE = {
+    "align",
+    "check",
+    "convert",
+    "design",
+    "evaluate",
+    "inspect",
+    "learn",
+    "pivot",
+    "smooth",
+}
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit status.
@@ -26,11 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     is taken like an interrupt from the keyboard.
     """
     _replace_closed_streams()
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with _ended_like_interrupted():
-            status = _status(list(sys.argv[1:] if arguments is None else arguments))
+            status = _status(words)
     except KeyboardInterrupt:  # while the commands were being imported
-        status = _interrupted()
+        status = _interrupted(words)
     except EOFError as error:  # likewise
         from mixpose.cli.cut import cut_message  # noqa: PLC0415
 
@@ -107,15 +121,16 @@ def _status(arguments: list[str]) -> int:
         reason = error.strerror or str(error)
         return _fail(f"{place}cannot be written or read: {reason}", WRONG_USAGE)
     if outcome == INTERRUPTED:  # which is also what typer makes of a keyboard interrupt
-        return _interrupted()
+        return _interrupted(arguments)
     return outcome if isinstance(outcome, int) else 0
 
 
-def _interrupted() -> int:
+def _interrupted(arguments: list[str]) -> int:
     # where the interrupt fell into an `exec`, as of a dataclass that was being imported, Python
     # would end by the signal whatever the status; the next `exec` makes it forget that
     exec("")
-    return _fail("interrupted; everything so far is written", INTERRUPTED)
+    written = "" if _AT_ONCE & {*arguments[:1]} else "; everything so far is written"
+    return _fail(f"interrupted{written}", INTERRUPTED)
 
 
 def _show_traceback(wanted: bool) -> None:

@@ -65,7 +65,10 @@ def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate
     number = int(frame)
     replaced = named_sources(sources)
     with closing(run(session, sources=replaced, selection=Selection(number, number + 1))) as found:
-        ok = [one for one in found if one.label == label and one.status == "ok"]
+        told = [one for one in found if one.label == label]
+    if not told:
+        raise RecordingError(f"--floor {words}: there is no frame {number}; name another one")
+    ok = [one for one in told if one.status == "ok"]
     if not ok:
         raise RecordingError(f"--floor {words}: {label} is not ok in this frame; name another one")
     return ok

@@ -11,6 +11,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.body import default_tolerance, is_on_a_line
 from mixpose.checking import geometry, keys, lookalikes, placement, recordings
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.notices import bar
@@ -98,6 +99,7 @@ def check_session(request: CheckRequest) -> None:
     report.warnings = [
         *shared,
         *_pairing_warnings(opened),
+        *recordings.order_warnings(surveys),
         *recordings.time_warnings(surveys),
         *recordings.frozen_warnings(surveys),
         *report.warnings,
@@ -133,6 +135,9 @@ def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
     alike, of = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
     within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
     same = f"{alike} orientations look the same{within}" if alike > 1 else "none"
+    points = body.nodes.points
+    if is_on_a_line(points, default_tolerance(points)):
+        same = "all turns about the line of its features look the same: no frame has its pose"
     written = "; the pose nearest to the previous one is written" if alike > 1 else ""
     report.say("symmetry", f"{of}{same}{written}")
 

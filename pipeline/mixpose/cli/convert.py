@@ -67,8 +67,10 @@ def convert_poses(request: ConvertRequest) -> None:
     else:
         _write(poses, lines, name, T_sensor_world, request)
     if request.output is not None:
-        count = f"{len(lines)} pose{'s' * (len(lines) != 1)}"
-        say(f"{count} -> {', '.join(map(str, outputs))}")
+        # other formats have no place for frames without a pose
+        posed = sum(line.T_world_object is not None for line in lines)
+        many = len(lines) if name in ("jsonl", "csv", "rerun") else posed
+        say(f"{many} pose{'s' * (many != 1)} -> {', '.join(map(str, outputs))}")
 
 
 def _write(

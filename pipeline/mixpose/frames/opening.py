@@ -155,8 +155,11 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
             f"{path}: matches {len(files)} files and none is an image (the first is "
             f"{min(files).name}); allowed are images or one other file"
         )
+    # a folder of such a name is there
+    as_pattern = ", as [ ] stand for one of the characters in them: [[] is a [" * ("[" in pattern)
     raise RecordingError(
-        f"{path}: no such file, and nothing matches; source of {spec.sensor!r}; {_looked_in(path)}"
+        f"{path}: no such file, and nothing matches{as_pattern}; source of {spec.sensor!r}; "
+        f"{_looked_in(path)}"
     )
 
 

@@ -120,10 +120,11 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
     options = light.options
     missing = _sorted_out(finding, expected, light)
     lines = []
+    ground, shine = ("dark", "bright") if options.polarity == "bright" else ("bright", "dark")
     if found := missing["nothing"]:
         lines.append(
-            f"not met and dark there: {some(found, body)}; hidden, out of light, or the pose is "
-            "wrong"
+            f"not met and {ground} there: {some(found, body)}; hidden, out of light, or the pose "
+            "is wrong"
         )
     if found := missing["faint"]:
         level = (min(found.values()) + float(np.median(light.raw))) / 2  # and the background
@@ -142,7 +143,7 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
         )
     if found := missing["other"]:
         lines.append(
-            f"not met though bright there: {some(found, body)}; they run into something else, are "
+            f"not met though {shine} there: {some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
             f"{levels.apart(finding, expected, light, body, list(found))}"
         )

@@ -264,7 +264,9 @@ def unlike(body: Body, poses: Floats, cell: float, *, whole: bool = False) -> In
     """
     corners = body.means if whole else body.means[[0, len(body) // 2, -1]]
     places = transform(poses, corners).reshape(len(poses), corners.size)
-    cells = np.round(places / (cell * body.radius)).astype(np.int64)
+    cells = np.round(places / (cell * body.radius))
+    # what is farther off than that, or nowhere, is in one place
+    cells = np.clip(np.nan_to_num(cells), -(2.0**62), 2.0**62).astype(np.int64)
     keys = cells @ np.random.default_rng(0).integers(1, 2**40, cells.shape[1])
     return np.sort(np.unique(keys, return_index=True)[1])
 
