@@ -295,9 +295,10 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
         K, k = matrix(given, v), other(name, camera, v).distortion[:2]
         return (
             f"with about fx = {K[0, 0]:.5g}, cx = {K[0, 2]:.4g}, cy = {K[1, 2]:.4g}, "
-            f"k1 = {k[0]:.2g}, k2 = {k[1]:.2g}"
+            f"k1 = {k[0]:.2g}, k2 = {k[1]:.2g}{moved}"
         )
 
+    moved = " (or it was moved: mixpose calibrate --check tells)" * bool(others)
     is_copied = len(twins) == 1  # cameras of a kind may all have the same
     copied = f", but that of {twins[0]!r}" if is_copied else ""
     return Unknown(

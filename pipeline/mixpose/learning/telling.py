@@ -22,6 +22,7 @@ MARK = ",".join(LEARNT_COLUMNS)
 _HARDLY = 0.1  # of what other sensors meet, below which one does not see a body where it is
 _ALIKE = 0.03  # of the radius: markers nearer are in one place to those who tell poses apart
 _ONE_AXIS = 0.2  # of the turn about the main axis that there is about any other
+_TILTED_DEG = 5.0  # root mean square about another axis: enough, however far the main one turns
 
 
 def _digits_of(learnt: Learnt) -> int:
@@ -101,7 +102,7 @@ def _doubts_of_motion(learnt: Learnt, name: str) -> list[str]:
             "move along are not told apart"
         ]
     _, sizes, axes = np.linalg.svd(turns - np.median(turns, axis=0), full_matrices=False)
-    if sizes[1] < _ONE_AXIS * sizes[0]:
+    if sizes[1] < min(_ONE_AXIS * sizes[0], _TILTED_DEG * np.sqrt(len(turns))):
         axis = ", ".join(f"{value:.2f}" for value in axes[0])
         return [
             f"{name}: turned about one axis only, ({axis}) of the world; missing: turns about "
