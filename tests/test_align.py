@@ -222,3 +222,9 @@ def test_true_poses_of_a_body_that_rests_are_all_one(frames: int) -> None:
     lines: list[Estimate] = [replace(one, covariance=None) for one in estimates_at(poses)]
     found = floor_of(lines, "z", ABOVE)
     np.testing.assert_allclose(found.T_old_new, FLOOR, atol=1e-9)
+
+
+def test_a_frame_that_is_not_there_is_said_to_be_so(tmp_path: Path) -> None:
+    session = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
+    done = command("align", session, "--floor", "tracker@500", "-o", tmp_path / "a.toml")
+    assert_one_line(done, 3, "--floor tracker@500: there is no frame 500; name another one")

@@ -430,3 +430,16 @@ def test_rows_that_are_repeated_and_times_that_go_back_are_told() -> None:
     assert order_warnings({"left": replace(own, times={3: 0.1, 4: 0.1}, doubled=())}) == []
     assert has_twins(np.array([[1.0, 2], [3, 4], [1, 2]]))
     assert not has_twins(np.array([[1.0, 2], [3, 4], [1, 3]]))
+
+
+def test_a_body_on_a_line_is_told_to_have_no_pose(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = cut_to(recording, 6)
+    text = path.read_text(encoding="utf-8")
+    points = re.search(r"^points = \[.*?^\]", text, re.MULTILINE | re.DOTALL)
+    assert points is not None
+    line = "points = [[0, 0, 0], [30, 0, 0], [70, 0, 0], [100, 0, 0]]"
+    path.write_text(text.replace(points[0], line), encoding="utf-8")
+    report = report_on(path, capsys, quick=True)
+    assert "all turns about the line of its features look the same: no frame has its pose" in report

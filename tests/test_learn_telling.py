@@ -54,6 +54,8 @@ def turning(along: float, across: float) -> Floats:
         (12.0, 12.0, "turned by 14.7 deg at most; missing: turns of 30 deg or more"),
         (40.0, 6.0, "turned about one axis only, (0.00, 0.00, 1.00) of the world"),
         (40.0, 12.0, None),  # 0.3 of the turn about the main axis, and 0.2 are asked for
+        (150.0, 12.0, None),  # 8.5 deg RMS, and 5 are enough whatever the main axis turns by
+        (150.0, 6.0, "turned about one axis only"),
     ],
 )
 def test_turns_that_are_missing_are_named(along: float, across: float, missing: str | None) -> None:
@@ -117,6 +119,15 @@ def test_bodies_that_share_three_markers_are_named_with_them() -> None:
     these, those = names.split(": where")[0].split(" of second lie like ")
     pairs = dict(zip(these.split(", "), those.removesuffix(" of first").split(", "), strict=True))
     assert pairs == {"m0": "m3", "m1": "m0", "m2": "m2"}
+
+
+def test_bodies_alike_that_are_never_seen_at_a_time_may_be_one() -> None:
+    one, other = learnt(turning(40.0, 20.0)), learnt(turning(40.0, 20.0), POINTS[:4])
+    (told,) = look_alikes([one, other], ["first", "second"])
+    assert told.endswith("the two cannot be told apart")
+    later = replace(other, numbers=other.numbers + 1000)
+    (told,) = look_alikes([one, later], ["first", "second"])
+    assert told.endswith("never seen at a time, and may be one: leave out the lesser")
 
 
 def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it() -> None:

@@ -152,6 +152,21 @@ def test_a_marker_before_something_bright_is_parted_by_a_threshold_only_in_even_
     assert (re.search(r"threshold = \d+ parts them", text) is None) == lit
 
 
+def test_of_dark_markers_what_is_bright_is_their_ground(
+    recording: Path, pose: NDArray[np.float64]
+) -> None:
+    session = mixpose.load_session(recording / "session.toml")
+    y, _ = session.sensors[0].sensor.project(transform(pose, session.body.means))
+    image = left_image(recording)
+    cv2.circle(image, np.rint(y[0]).astype(int).tolist(), 20, int(np.median(image)), -1)
+    write_left(recording, 255 - image)
+    text = (recording / "session.toml").read_text(encoding="utf-8")
+    dark = text.replace("[extract]", '[extract]\npolarity = "dark"', 1)
+    (recording / "session.toml").write_text(dark, encoding="utf-8")
+    told = advice_for(recording / "session.toml", FRAME, pose)
+    assert "not met and bright there: features 1, 6;" in told  # 6 is hidden in the frame
+
+
 def test_thresholds_of_images_of_parts_are_told_to_three_digits(
     recording: Path, pose: NDArray[np.float64]
 ) -> None:

@@ -418,3 +418,11 @@ def test_a_session_in_another_unit_than_the_poses_is_refused(
     for more in (["--format", "tum", "--relative-to", "camera"], ["--format", "trc"]):
         message = refused(capfd, path, *more, *given)
         assert f"lengths in mm, but those of {path} are in m" in message
+
+
+def test_formats_without_lost_frames_count_the_others(
+    poses: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name, many in (("all.csv", 4), ("all.tum", 3)):
+        assert convert(poses, "-o", tmp_path / name) == 0
+        assert capfd.readouterr().err == f"mixpose: {many} poses -> {tmp_path / name}\n"

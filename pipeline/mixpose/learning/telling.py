@@ -21,6 +21,7 @@ MARK = ",".join(LEARNT_COLUMNS)
 
 _HARDLY = 0.1  # of what other sensors meet, below which one does not see a body where it is
 _ALIKE = 0.03  # of the radius: markers nearer are in one place to those who tell poses apart
+_TOGETHER = 0.1  # of the frames of the one that is seen less: fewer are wrong ones
 _ONE_AXIS = 0.2  # of the turn about the main axis that there is about any other
 _TILTED_DEG = 5.0  # root mean square about another axis: enough, however far the main one turns
 
@@ -119,6 +120,12 @@ def _turns(learnt: Learnt) -> Floats:
     return np.asarray((turns * turns.mean().inv()).as_rotvec())
 
 
+def _are_together(one: Learnt, other: Learnt) -> bool:
+    """Whether two bodies are seen at the same time, now and then."""
+    seen = [set(each.numbers.tolist()) for each in (one, other)]
+    return len(seen[0] & seen[1]) >= _TOGETHER * min(map(len, seen))
+
+
 def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
     """Bodies that share three markers or more, which may be mistaken for each other."""
     told = []
@@ -129,8 +136,8 @@ def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
             if parts:
                 a = ", ".join(bodies[k].names[n] for n in parts[0].features)
                 b = ", ".join(bodies[other].names[n] for n in parts[0].partners)
-                told.append(
-                    f"markers {a} of {names[k]} lie like {b} of {names[other]}: where no others "
-                    "are seen the two cannot be told apart"
-                )
+                said = "where no others are seen the two cannot be told apart"
+                if not _are_together(bodies[k], bodies[other]):
+                    said = "the two are never seen at a time, and may be one: leave out the lesser"
+                told.append(f"markers {a} of {names[k]} lie like {b} of {names[other]}: {said}")
     return told
