@@ -16,6 +16,7 @@ from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.frames.source import Frames
+from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
 from mixpose.records import Floats, Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
@@ -166,6 +167,21 @@ def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
                 f"{earlier:g} s; a run ends there, as times that go back tell no velocity"
             )
     return warnings
+
+
+def numbering_warnings(sources: Mapping[str, Source]) -> list[str]:
+    """Tables of times without numbers beside recordings with numbers, which tell no moments."""
+    stamped = [
+        name for name, one in sources.items() if isinstance(one, DetectionTable) and one.stamps
+    ]
+    others = [name for name in sources if name not in stamped]
+    if not others:
+        return []
+    return [
+        f"sensor {name!r}: its table has times and no frame numbers, so that its frames count from "
+        f"0 and are taken with those of {others[0]!r} of the same number; add a column frame"
+        for name in stamped
+    ]
 
 
 def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:

@@ -99,6 +99,7 @@ def check_session(request: CheckRequest) -> None:
     report.warnings = [
         *shared,
         *_pairing_warnings(opened),
+        *recordings.numbering_warnings(opened),
         *recordings.order_warnings(surveys),
         *recordings.time_warnings(surveys),
         *recordings.frozen_warnings(surveys),
