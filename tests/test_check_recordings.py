@@ -430,11 +430,11 @@ def test_lines_of_several_bodies_have_their_names(capsys: pytest.CaptureFixture[
 
 def test_rows_that_are_repeated_and_times_that_go_back_are_told() -> None:
     times = {3: 0.1, 4: 0.2, 5: 0.15}
-    own = Survey((3, 4, 5), (3, 4, 5), (4, 4, 4), (), times=times, doubled=(4,))
+    own = Survey((3, 4, 5), (3, 4, 5), (4, 4, 4), (), times=times, doubled=(4, 5))
     first, second = order_warnings({"left": own})
-    assert "stands twice or more in 1 of 3 frames, as 4: are rows" in first
+    assert "stands twice or more in 2 of 3 frames, as 4: are rows" in first
     assert "'left': frame 5 is at 0.15 s and the frame before it at 0.2 s; a run ends" in second
-    assert order_warnings({"left": replace(own, times={3: 0.1, 4: 0.1}, doubled=())}) == []
+    assert order_warnings({"left": replace(own, times={3: 0.1, 4: 0.1}, doubled=(4,))}) == []
     assert has_twins(np.array([[1.0, 2], [3, 4], [1, 2]]))
     assert not has_twins(np.array([[1.0, 2], [3, 4], [1, 3]]))
 

@@ -1,6 +1,7 @@
 """Calibration: the objective maximised over sensors and body, without correspondences.
 
-detections  →  each camera alone (hypotheses)  →  links between sensors  →  start of all poses
+detections  →  all sensors together, where they stand about as told  →  start of all poses
+            or each camera alone (hypotheses)  →  links between sensors  →  start of all poses
 →  rig and poses together, through narrowing blurs (least squares with soft pairs)
 →  what is determined, how well, and whether frames held back agree
 """

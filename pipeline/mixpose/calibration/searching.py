@@ -96,7 +96,8 @@ def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats | No
     tracker = Tracker.create(task.body, options, task.T_held, rotation_deg=turn, distance=distance)
     track = tracker.begin()
     for frame in task.frames:
-        views = [_view(task, s, y, factor) for s, y in frame.points.items() if len(y)]
+        seen = [_view(task, s, y, factor) for s, y in frame.points.items() if len(y)]
+        views = [own for view in seen for own in plane_views(view)]
         track, estimate = tracker.advance(track, frame.number, frame.time_s, views)
         yield frame, estimate.T_world_object, estimate.status == "ok"
 

@@ -20,7 +20,13 @@ from mixpose.checking.rules import DiagnosisRules
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
-from mixpose.sensors import CloudPlane, CloudSensor, FisheyeCamera, PinholeCamera
+from mixpose.sensors import (
+    CloudPlane,
+    CloudSensor,
+    FisheyeCamera,
+    PinholeCamera,
+    RangeSensor,
+)
 from mixpose.session import SensorSetup, Session
 
 # of mm, cm and m
@@ -72,8 +78,11 @@ def changes(session: Session) -> Iterator[Change]:
     cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
     clouds = [setup.name for setup in session.sensors if isinstance(setup.sensor, CloudSensor)]
     are_points = all(isinstance(feature, PointFeature) for feature in session.body.features)
+    ranges = [setup.name for setup in session.sensors if isinstance(setup.sensor, RangeSensor)]
     if clouds:
-        yield from _of_clouds(clouds)
+        yield from _in_another_unit("points", clouds, CloudPlane)
+    if ranges:
+        yield from _in_another_unit("ranges", ranges, RangeSensor)
     if are_points:
         if len(clouds) < len(session.sensors):  # beside nothing else it is told of the cloud
             yield from of_units(session.body)
@@ -149,18 +158,18 @@ def of_camera(view: View, **changed: Floats) -> View:
     return replace(view, sensor=replace(camera, **changed))
 
 
-def _of_clouds(names: Sequence[str]) -> Iterator[Change]:
-    """Points in space in another unit than that of the session."""
+def _in_another_unit(what: str, names: Sequence[str], kind: type) -> Iterator[Change]:
+    """What a kind of sensors measures in a unit of length that is not that of the session."""
+
+    def of(view: View, factor: float) -> View:
+        is_one = isinstance(view.sensor, kind)
+        return _with_points(view, lambda points: factor * points) if is_one else view
+
     for factor, where in _UNITS:
         yield Change(
-            f"the points of {called(names)} {{are}} in another unit than the session",
+            f"the {what} of {called(names)} {{are}} in another unit than the session",
             f"with them {where}",
-            lambda views, k=factor: [  # type: ignore[misc]
-                _with_points(view, lambda points: k * points)
-                if isinstance(view.sensor, CloudPlane)
-                else view
-                for view in views
-            ],
+            lambda views, k=factor: [of(view, k) for view in views],  # type: ignore[misc]
         )
 
 

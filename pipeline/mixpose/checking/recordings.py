@@ -23,6 +23,7 @@ from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
 LISTED = 5  # frame numbers that are named
+_TELLING = 6  # numbers of a frame: fewer are those of the frame before by chance
 _QUICK = 5  # frames that are looked at where not all are
 # images of a sensor in which features are counted: to find them takes five times as long as to read
 # an image, and the median of so many is as good as that of all
@@ -88,6 +89,8 @@ def survey(
             if frame.time_s is not None:
                 times[frame.number] = frame.time_s
             shown = shown_by(frame)
+            if shown is not None and shown.size < _TELLING:
+                shown = None
             if shown is not None and shown.any() and is_same(before, shown):
                 repeated.append(frame.number)
             before = shown
@@ -152,7 +155,7 @@ def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
     """Tables whose detections stand there twice, and recordings whose times go back."""
     warnings = []
     for name, own in surveys.items():
-        if own.doubled:
+        if 2 * len(own.doubled) > len(own.numbers):  # ranges to a cm are the same now and then
             warnings.append(
                 f"sensor {name!r}: the same detection stands twice or more in "
                 f"{len(own.doubled)} of {len(own.numbers)} frames, as {own.doubled[0]}: are rows "
