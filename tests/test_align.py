@@ -228,3 +228,23 @@ def test_a_frame_that_is_not_there_is_said_to_be_so(tmp_path: Path) -> None:
     session = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
     done = command("align", session, "--floor", "tracker@500", "-o", tmp_path / "a.toml")
     assert_one_line(done, 3, "--floor tracker@500: there is no frame 500; name another one")
+
+
+@pytest.mark.parametrize("where", ["", "object."])
+@pytest.mark.parametrize("more", ["", "distance = 3.0"])
+def test_a_start_in_dotted_keys_is_moved(tmp_path: Path, where: str, more: str) -> None:
+    body, cameras = SESSION.split("[start]", maxsplit=1)[0], SESSION.split("[[sensor]]", 1)[1]
+    keys = "rotation_vector = [0.1, 0.2, 0.3]", "translation = [1, 2, 3]", more
+    start = "".join(f"start.{key}\n" for key in keys if key)
+    text = f"{start}{body}" if not where else f"{body}{start}"
+    (tmp_path / "session.toml").write_text(f"{text}\n[[sensor]]{cameras}", encoding="utf-8")
+    write_poses(tmp_path / "poses.jsonl", estimates_at(FLOOR[None]))
+    words = ("align", "session.toml", "--floor", "poses.jsonl", "-o", "aligned.toml")
+    done = command(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    old, new = (package.load_session(tmp_path / name) for name in ("session.toml", "aligned.toml"))
+    assert old.start is not None
+    assert new.start is not None
+    moved = FLOOR @ new.start.T_world_object
+    np.testing.assert_allclose(moved, old.start.T_world_object, atol=1e-9)
+    assert new.start.distance == old.start.distance

@@ -372,3 +372,19 @@ def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path: Path)
     lost = Estimate(0, None, "tracker", "lost", None, None, 0.0, {"left": SensorReport(False)})
     with pytest.raises(SessionError, match=re.escape("seen: cannot be written")):
         overlay.watch(FrameSet(0, None, {}), [], lost)
+
+
+def test_all_pictures_of_a_camera_without_a_resolution_are_of_one_size(tmp_path: Path) -> None:
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    setup = replace(session.sensors[0], resolution=None)
+    session = replace(session, sensors=(setup,))
+    folder = tmp_path / "seen"
+    with Overlay(session, folder) as overlay:
+        for number, far in enumerate((400.0, 905.0, 200.0)):
+            pattern = PointPattern(np.array([[far, far]]), np.ones(1))
+            frame_set = FrameSet(number, None, {setup.name: RawFrame(number, None, pattern)})
+            lost = Estimate(number, None, session.labels[0], "lost", None, None, 0.0, {})
+            overlay.watch(frame_set, [], lost)
+    pictures = [cv2.imread(str(path)) for path in folder.iterdir()]
+    assert len({one.shape for one in pictures if one is not None}) == 1
+    assert len(pictures) == 3

@@ -20,7 +20,7 @@ from mixpose.publishing import SENDERS, Publishing
 from mixpose.publishing.address import parse
 from mixpose.publishing.channel import Backlog
 from mixpose.publishing.message import Message
-from mixpose.records import Estimate, Hypothesis, Moment
+from mixpose.records import Estimate, Hypothesis, MeasuredPoint, Moment
 from mixpose.rigid import perturb, twist_between
 from mixpose.session import load_session
 from mixpose.simulation.motion import plan_motion
@@ -211,6 +211,9 @@ def test_lost_frames_stay_lost_and_hypotheses_are_not_foretold() -> None:
     assert known.ahead(lost, 0.02).T_world_object is None
     doubtful = replace(ESTIMATE, status="ambiguous", hypotheses=(Hypothesis(POSE, 1.0),))
     assert known.ahead(doubtful, 0.02).hypotheses == ()
+    # features were measured where they were then
+    seen = replace(ESTIMATE, points={"1": MeasuredPoint(np.zeros(3), 0.1)})
+    assert known.ahead(seen, 0.02).points == {}
 
 
 def test_direction_that_is_not_estimated_is_not_foretold_to_move() -> None:

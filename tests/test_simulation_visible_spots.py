@@ -7,7 +7,7 @@ import pytest
 
 from mixpose.body import Body, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.sensors import CloudSensor, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.render import ImageFormat, render_image
 from mixpose.simulation.visible_spots import View, displacements, facing, look
@@ -23,6 +23,8 @@ def view_of(sensor: Sensor, count: int = 8, *, spacing: float = 1.0, ridge: floa
     low, high = sensor.lower, sensor.upper
     if sensor.dimension == 1:
         low, high = np.zeros(1), np.array([2000.0])
+    if sensor.dimension == 3:
+        low, high = np.full(3, -2000.0), np.full(3, 2000.0)
     return View(sensor, low, high, np.ones(count), spacing, ridge)
 
 
@@ -145,3 +147,29 @@ def test_features_that_sag_are_displaced_along_gravity_however_the_body_is_turne
     np.testing.assert_allclose(in_world[..., 2].std(axis=0), 2.0, rtol=0.05)
     # each feature by itself: by chance the correlation is 0.016
     assert abs((in_world[:, 0, 2] * in_world[:, 1, 2]).mean() / 2.0**2) < 0.06
+
+
+SPHERES = Body("spheres", BODY.features, shape="sphere", radii=np.full(8, 3.0))
+
+
+@pytest.mark.parametrize(
+    "sensor",
+    [RangeSensor(np.array([0.0, -800, 900])), CloudSensor(np.eye(4))],
+    ids=["range", "cloud"],
+)
+def test_spheres_are_points_to_what_takes_no_images(sensor: Sensor) -> None:
+    of_spheres, of_points = (
+        look(view_of(sensor), body, T, SimulationOptions(1), np.random.default_rng(0))
+        for body in (SPHERES, BODY)
+    )
+    np.testing.assert_allclose(of_spheres.points, of_points.points, atol=1e-9)
+
+
+def test_spheres_are_seen_where_they_are_displaced_to() -> None:
+    offsets = np.random.default_rng(1).normal(0, 5, (8, 3))
+    seen = look(
+        view_of(CAMERA), SPHERES, T, SimulationOptions(1), np.random.default_rng(0), offsets=offsets
+    )
+    expected, _ = CAMERA.project(transform(T, POINTS + offsets))
+    # centres of outlines are off those of spheres of 3 at 900 by 0.01 px
+    np.testing.assert_allclose(seen.points, expected, atol=0.05)

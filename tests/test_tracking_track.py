@@ -276,3 +276,19 @@ def test_a_pose_that_looks_like_the_one_before_is_no_turn_by_what_lies_between()
     np.testing.assert_allclose(as_told.velocity[3:], [0, 0, 10 * (np.pi / 2 + 0.01)], atol=1e-9)
     np.testing.assert_allclose(alike.velocity, [20.0, 0, 0, 0, 0, 0.1], atol=1e-9)
     assert (alike.uncertainty[3:] < as_told.uncertainty[3:]).all()
+
+
+def test_directions_that_are_held_tell_no_motion_from_another() -> None:
+    """Held ones never move, so that the steadiest filter foretells them best."""
+    free, held = np.repeat([0.1, 0.002], 3), np.array([0.1, 0.1, 0.1, 0.0, 0.0, 0.0])
+    step = np.array([5.0, -3.0, 2.0, 0.0, 0.0, 0.0])
+    courses = [Course.begun(each, EIGHT.radius, RULES) for each in (free, held)]
+    for k in range(12):
+        moved = step * np.cos(k)
+        courses = [
+            course.followed(moved, each, 0.1)
+            for course, each in zip(courses, (free, held), strict=True)
+        ]
+    one, other = courses
+    assert not other.log_likelihoods[:, 1].any()
+    np.testing.assert_array_equal(one.log_likelihoods[:, 0], other.log_likelihoods[:, 0])

@@ -19,6 +19,7 @@ from report_runs import RECORDING, SYNTHETIC, estimate
 from mixpose import rigid
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats, PointPattern, RawFrame
+from mixpose.sensors import CloudSensor
 from mixpose.session import Session, load_session
 
 pytest.importorskip("viser")
@@ -211,4 +212,6 @@ def test_up_is_up_in_the_images() -> None:
     upside_down = rigid.from_rotation_vector([0, 0, np.pi], [0, 0, 0])
     turned = tuple(replace(one, sensor=one.sensor.moved(upside_down)) for one in session.sensors)
     np.testing.assert_allclose(up_of(replace(session, sensors=turned)), [0.0, 1.0, 0.0], atol=1e-9)
-    assert up_of(replace(session, sensors=())).tolist() == [0.0, 0.0, 1.0]
+    cloud = replace(session.sensors[0], sensor=CloudSensor(np.eye(4)))
+    for sensors in ((), (cloud,)):  # which have no image
+        assert up_of(replace(session, sensors=sensors)).tolist() == [0.0, 0.0, 1.0]

@@ -12,7 +12,7 @@ import cv2
 from mixpose.errors import SessionError, reporting
 from mixpose.objective import View
 from mixpose.pictures.canvas import Picture, fit_into
-from mixpose.pictures.scene import draw_scene
+from mixpose.pictures.scene import draw_scene, with_sizes
 from mixpose.pictures.signature import is_ours, refuse_foreign, sign_video, write_png
 from mixpose.records import Estimate, FrameSet
 from mixpose.session import Session
@@ -35,7 +35,7 @@ class Overlay:
     """
 
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
-        self._session = session
+        self._session, self._is_sized = session, False
         self._sink = _sink(path, resume)
         self._estimates: list[Estimate] = []
 
@@ -49,6 +49,8 @@ class Overlay:
         """Draw one frame, with the last of its bodies."""
         self._estimates.append(estimate)
         if len(self._estimates) == len(self._session.labels):
+            if not self._is_sized:  # by the first frame, for all
+                self._session, self._is_sized = with_sizes(self._session, frame_set), True
             picture = draw_scene(self._session, frame_set, *self._estimates)
             self._sink.add(picture, estimate.frame, estimate.time_s)
             self._estimates = []

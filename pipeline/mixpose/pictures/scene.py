@@ -7,6 +7,7 @@ A range sensor's frame is a strip: what it measured, and where the pose has the 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeAlias, cast
 
 import cv2
@@ -150,6 +151,22 @@ def _zoom(size: Size, room: Size | None) -> float:
         return 1.0
     zoom = min(room[0] / size[0], room[1] / size[1])
     return zoom if zoom < 1 else float(min(int(zoom), _MOST_ENLARGED))
+
+
+def with_sizes(session: Session, frame_set: FrameSet) -> Session:
+    """A session whose cameras all have the size of a picture, as a frame shows them.
+
+    One without a resolution, whose frames are detections, would be as large as each frame needs.
+    """
+
+    def sized(setup: SensorSetup) -> SensorSetup:
+        frame = frame_set.frames.get(setup.name)
+        data = None if frame is None else frame.data
+        if setup.resolution or setup.sensor.dimension != 2 or isinstance(data, np.ndarray):
+            return setup
+        return replace(setup, resolution=_size_of(data))
+
+    return replace(session, sensors=tuple(map(sized, session.sensors)))
 
 
 def _size_of(data: Pattern | None) -> Size:

@@ -260,9 +260,14 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         largest = float(np.quantile(rows[met], 0.98)) if met.any() else 1.0
         steps = np.diff(series.x)
         half = 0.5 * (float(np.median(steps)) if steps.size else 1.0)
-        x = np.append(series.x - half, series.x[-1] + half)
+        # empty where frames are missing
+        gaps = np.flatnonzero(series.breaks)
+        gaps = gaps[gaps > 0]
+        x = np.insert(series.x - half, gaps, series.x[gaps - 1] + half)
+        x = np.append(x, series.x[-1] + half)
+        rows = np.insert(rows, gaps, np.nan, axis=1)
         y = np.arange(len(rows) + 1) - 0.5
-        shown = np.ma.masked_invalid(np.where(met, rows, np.nan))
+        shown = np.ma.masked_invalid(np.where(np.isfinite(rows), rows, np.nan))
         mesh = axes.pcolormesh(x, y, shown, vmin=0.0, vmax=largest, cmap="viridis", rasterized=True)
         unmet = np.ma.masked_where(~np.isinf(rows), np.ones_like(rows))
         axes.pcolormesh(x, y, unmet, vmin=0.0, vmax=1.0, cmap="Reds", rasterized=True)

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import tomlkit
+from tomlkit.exceptions import NonExistentKey
 
 from mixpose.errors import SessionError
 from mixpose.records import Floats
@@ -19,6 +20,7 @@ from mixpose.session.setup import Session
 ALL_DIGITS = 17  # of float64
 Role: TypeAlias = Literal["source", "times", "file"]
 _BOM = "\ufeff"
+_MOTION = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation")
 _BARE_END = re.compile(r"(?<!\r)\n")
 
 
@@ -78,7 +80,7 @@ def put(table: Any, key: str, value: Any, said: str | None = None) -> None:
 
 def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits: int = 10) -> None:
     """Set a rigid motion (4, 4), in place of what says it otherwise."""
-    for other in ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation"):
+    for other in _MOTION:
         table.pop(other, None)
     put(table, key, plain(T, digits), said)
 
@@ -91,7 +93,13 @@ def put_starts(document: Any, session: Session, T_new_old: Floats, scale: float 
             continue
         T = one.start.T_world_object.copy()
         T[:3, 3] *= scale
-        put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        told = home["start"].unwrap()
+        try:
+            put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        except (IndexError, NonExistentKey):  # of keys as start.translation none can be taken out
+            del home["start"]
+            home["start"] = {key: told[key] for key in told.keys() - {*_MOTION, "T_world_object"}}
+            put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
         if scale != 1 and one.start.distance is not None:
             put(home["start"], "distance", plain(scale * one.start.distance))
 

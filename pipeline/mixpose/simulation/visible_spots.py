@@ -118,7 +118,8 @@ def look(
             owner = count + len(false) + i
             spots.add(view, actor.body, i, owner, pose_later, actor.levels[i], None, actor.mirror)
     late = time_s + view.shutter.late_s
-    covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
+    arms = view.scenery.arms if view.sensor.dimension == 2 else ()
+    covers = [arm.outline(view.unbounded, late) for arm in arms]
     return spots.visible(tuple(one for one in covers if len(one)))
 
 
@@ -184,14 +185,19 @@ class _Spots:
         mirror: Floats | None = None,
     ) -> None:
         """Add what is seen of one feature, at each moment of its exposure."""
-        point = body.means[feature]
+        point, is_image = body.means[feature], view.sensor.dimension == 2
         poses = view.shutter.poses(view.sensor, point, pose_after)
         for T in poses:
             M = T.copy() if mirror is None else mirror @ T
             if offset is not None:
                 M[:3, 3] += M[:3, :3] @ offset
             sized = body.radii is not None and body.radii[feature] > 0
-            edge = outline(view.unbounded, body, feature, T, mirror) if sized else None
+            if is_image and sized:
+                moved = T.copy()
+                moved[:3, 3] += 0.0 if offset is None else T[:3, :3] @ offset
+                edge = outline(view.unbounded, body, feature, moved, mirror)
+            else:
+                edge = None
             if edge is not None:
                 y, shares = centroid(edge)[None], np.ones(1)
                 if (y < view.sensor.lower).any() or (y > view.sensor.upper).any():

@@ -231,7 +231,8 @@ class Course:
         # derivatives by the turn itself, not by its logarithm
         turning = means[:, 3:, 1:].swapaxes(0, 1)
         turning += cross(moved[3:, None, None], turning) / 2
-        seen = -0.5 * (np.log(variance) + off)
+        # what is held tells no motion from another
+        seen = np.where(deviation > 0, -0.5 * (np.log(variance) + off), 0.0)
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
         return Course(means, covariances, logs - logs.max(axis=0), self.radius, self.rules)
 

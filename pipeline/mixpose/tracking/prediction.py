@@ -61,7 +61,8 @@ class Foreseen:
         """
         T, covariance, course = estimate.T_world_object, estimate.covariance, self.course
         later = None if estimate.time_s is None else estimate.time_s + seconds
-        estimate = replace(estimate, time_s=later, hypotheses=())
+        # features were measured then, and not there
+        estimate = replace(estimate, time_s=later, hypotheses=(), points={})
         if T is None or covariance is None or course is None:
             return estimate
         twist, grown = course.ahead(seconds)

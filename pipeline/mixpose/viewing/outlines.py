@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -62,11 +63,9 @@ def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
 
 def up_of(session: Session) -> Floats:
     """The world's direction (3,) that is up in the images: an axis where one nearly is; else z."""
-    ups = [
-        -setup.sensor.T_sensor_world[1, :3]
-        for setup in session.sensors
-        if hasattr(setup.sensor, "T_sensor_world")
-    ]
+    # ranges and clouds have no image
+    cameras: list[Any] = [s.sensor for s in session.sensors if s.sensor.dimension == 2]
+    ups = [-camera.T_sensor_world[1, :3] for camera in cameras]
     total = np.sum(ups, axis=0) if ups else np.zeros(3)
     if np.linalg.norm(total) < 0.1 * max(len(ups), 1):
         return np.array([0.0, 0.0, 1.0])

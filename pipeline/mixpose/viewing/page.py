@@ -17,6 +17,7 @@ from mixpose.pictures.canvas import GREY, Picture, stacked, words
 from mixpose.pictures.overlay import BODY_COLOURS, STATUS_COLOURS
 from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for, with_bodies
 from mixpose.records import Estimate, Status
+from mixpose.sensors import CloudSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
@@ -89,6 +90,10 @@ class Page:
     def _draw(
         self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: Shown
     ) -> Picture:
+        if isinstance(setup.sensor, CloudSensor):
+            picture = np.zeros((60, 320, 3), np.uint8)
+            words(picture, "points in space", (10, 40), GREY)
+            return picture
         if setup.sensor.dimension != 2:
             return stacked(draw_strips(posed, setup, shown.frame))
         cameras = sum(one.sensor.dimension == 2 for one in self._session.sensors)
