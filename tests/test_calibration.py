@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,6 +90,26 @@ def test_cameras_that_stand_about_where_they_are_told_are_not_searched_alone(
     assert len(found.used) == 20
     T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
     assert rotation_angle_deg(T, sensors[2].T_sensor_world) < 0.02
+
+
+@pytest.mark.parametrize("held", [0, 2])
+def test_a_camera_that_is_held_stays_where_it_is_told_however_far_off(held: int) -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 12, 0.02)
+    free = {s: ("pose",) for s in range(3) if s != held}
+    task = bumped(task_of(sensors, frames, free=free), held, 4.0, 60.0)
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    assert found.after.sensors[held] is task.rig.sensors[held]
+
+
+def test_a_bumped_camera_beside_right_ranges_is_put_right() -> None:
+    truth = cameras(3)
+    sensors: list[Any] = [*truth, *(RangeSensor(place) for place in PLACES)]
+    frames = recording(sensors, 12, 0.02)
+    task = bumped(task_of(sensors, frames, free={1: ("pose",), 2: ("pose",)}), 2, 4.0, 60.0)
+    found = calibrate(task, NO_FRAME_HELD_BACK)
+    T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
+    assert rotation_angle_deg(T, truth[2].T_sensor_world) < 0.2
 
 
 def searched_in_vain(*_: object) -> None:

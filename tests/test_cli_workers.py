@@ -396,3 +396,27 @@ def test_poses_stay_where_a_run_with_other_options_fails(tmp_path: Path) -> None
     assert str(failed.reason).endswith("; ranges is as it was before")
     assert (tmp_path / "ranges" / "poses.jsonl").read_bytes() == before
     assert status_of(tmp_path / "ranges")["state"] == "done"
+
+
+def test_a_run_that_failed_is_not_gone_on_with(tmp_path: Path) -> None:
+    job = job_of(tmp_path)
+    part = begun(tmp_path, job)
+    (part / "sub").mkdir()
+    failed = json.dumps(asdict(outcome_of(job, "failed", 3)))
+    (part / "status.json").write_text(failed, encoding="utf-8")
+    stamp = (part / "poses.jsonl").stat().st_mtime_ns
+    assert run_job(job).state == "done"
+    assert (tmp_path / "ranges" / "poses.jsonl").stat().st_mtime_ns > stamp
+    # written at once, and not from the fourth frame on
+    (line,) = (tmp_path / "ranges" / "log.txt").read_text(encoding="utf-8").splitlines()[-1:]
+    assert line.startswith("mixpose: 20 frames: ")
+
+
+def test_poses_that_were_damaged_meanwhile_fail_in_one_line(tmp_path: Path) -> None:
+    job = job_of(tmp_path)
+    poses = begun(tmp_path, job) / "poses.jsonl"
+    lines = poses.read_bytes().splitlines(keepends=True)
+    poses.write_bytes(b"".join([*lines[:2], b"\0" * 40 + b"\n", *lines[3:]]))
+    outcome = run_job(job)
+    assert outcome.state == "failed"
+    assert str(outcome.reason).startswith("poses.jsonl:3: not JSON")

@@ -112,4 +112,15 @@ def test_numbers_that_do_not_go_with_the_names_are_told(tmp_path: Path) -> None:
     for name in ("12-30-58", "12-30-59", "12-31-00"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((4, 4), np.uint8))
     source = open_source(SourceSpec("left", "*.png", tmp_path, "camera"))
-    assert str(source.caution()).startswith("12-31-00.png comes before 12-30-58.png, as frames go")
+    assert str(source.caution()).startswith(
+        "12-31-00.png comes before 12-30-58.png, as frames go by the last"
+    )
+
+
+def test_a_number_of_a_camera_before_a_point_is_no_time(tmp_path: Path) -> None:
+    for number in range(4):
+        path = tmp_path / f"cam_1234567890.{number:04d}.png"
+        cv2.imwrite(str(path), np.zeros((4, 4), np.uint8))
+    source = open_source(SourceSpec("left", "*.png", tmp_path, "camera", fps=25.0))
+    assert [frame.number for frame in source.frames()] == [0, 1, 2, 3]
+    assert source.caution() is None

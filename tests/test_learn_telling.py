@@ -127,7 +127,7 @@ def test_bodies_alike_that_are_never_seen_at_a_time_may_be_one() -> None:
     assert told.endswith("the two cannot be told apart")
     later = replace(other, numbers=other.numbers + 1000)
     (told,) = look_alikes([one, later], ["first", "second"])
-    assert told.endswith("never seen at a time, and may be one: leave out the lesser")
+    assert told.endswith("hardly ever seen at a time, and may be one: leave one out")
 
 
 def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it() -> None:

@@ -136,3 +136,13 @@ def test_a_wrong_pose_at_either_end_is_told(end: int) -> None:
     assert one.status == "ambiguous"
     assert one.T_world_object is not None
     assert np.abs(rigid.twist_between(truth[end], one.T_world_object)[:3]).max() < 1.0
+
+
+def test_wrong_poses_at_both_ends_are_told() -> None:
+    covariance = covariance_of(0.1, 0.001)
+    lines = lines_of(measured(swinging(60), covariance), covariance)
+    for end, off in zip((0, 59), FAR, strict=True):
+        T = lines[end].T_world_object
+        assert T is not None
+        lines[end] = replace(lines[end], T_world_object=rigid.perturb(T, np.array(off)))
+    assert smooth_body(lines, rules=QUICK).refused == (0, 59)

@@ -79,15 +79,17 @@ def _as_it_stands(
 
     Together they know the body among others that each alone may take for it.
     """
-    if task.known is not None or task.times_matter or len(task.cameras) < 2:
+    if task.known is not None or task.times_matter or len(task.cameras) < 2 or not task.frames:
         return None
     few = task.frames[:: -(-len(task.frames) // rules.probes)]
     if not are_sure_together(replace(task, frames=few)):
         return None
     start = start_where_they_stand(task, progress)
     best = _best(task, [start], rules, progress)
-    if best is not None and (wrong := best[1].found.doubtful(rules)):
-        # which are placed by what the others know
+    wrong = () if best is None else best[1].found.doubtful(rules)
+    if any("pose" not in task.free.get(s, ()) for s in wrong):  # one that is held stays
+        return None
+    if wrong:  # they are placed by what the others know
         frames = tuple(frame.without(wrong) for frame in start.frames)
         best = _best(task, [replace(start, frames=frames, unlinked=wrong)], rules, progress)
     if best is None:

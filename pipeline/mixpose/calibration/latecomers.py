@@ -49,9 +49,12 @@ def placed(
     sure = replace(rules, undetermined=np.inf)
     bundle = Bundle(own, blocks, known, lambda _: np.zeros((0, 6)), task.sigmas, sure)
     best, best_met = None, 0.0
-    session: list[Floats] = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
-    now: list[Floats] = [one.T_sensor_world for one in state.rig.sensors]  # type: ignore[attr-defined]
-    told = [session[sensor] @ inverse(session[a]) @ now[a] for a in linked] or [session[sensor]]
+    before: Any = task.rig.sensors  # of which those that are asked for stand somewhere, turned
+    now: Any = state.rig.sensors
+    own_T = before[sensor].T_sensor_world
+    told = [own_T @ inverse(before[a].T_sensor_world) @ now[a].T_sensor_world for a in linked] or [
+        own_T
+    ]
     for T in _starts(state, sensor, np.array(told), own, rules):
         start = State(state.rig.placed(sensor, T), state.poses)
         blurs = np.array(noise)

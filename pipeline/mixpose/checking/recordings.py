@@ -177,7 +177,11 @@ def numbering_warnings(sources: Mapping[str, Source]) -> list[str]:
     stamped = [
         name for name, one in sources.items() if isinstance(one, DetectionTable) and one.stamps
     ]
-    others = [name for name in sources if name not in stamped]
+    others = [
+        name
+        for name, one in sources.items()
+        if name not in stamped and not (isinstance(one, ImageSequence) and one.is_stamped)
+    ]
     if not others:
         return []
     return [

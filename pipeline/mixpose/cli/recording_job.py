@@ -176,12 +176,16 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
     told = [found for line in lines if (found := told_frames(line))]
     frames, bodies = told[-1] if told else ({}, 1)  # as the run said in the end
+    if goes_on and state != FAILED:
+        with suppress(OSError, ValueError, KeyError):
+            frames = _statuses_in(poses)
     said = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
     outcome = replace(
         outcome_of(job, state, 128 - status if status < 0 else status),
-        frames=_statuses_in(poses) if goes_on and poses.exists() else frames,
+        frames=frames,
         bodies=bodies,
-        warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
+        # a run that goes on may say again what the one before it said
+        warnings=sum(line.startswith("mixpose: warning: ") for line in set(lines)),
         reason=None if status == 0 else said,
         seconds=round(time.monotonic() - began, 3),
     )
@@ -194,10 +198,11 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
 def _goes_on(part: Path, job: Job) -> bool:
     """Whether poses of the same job are begun in a folder, which is emptied of all else."""
     begun, poses = told(part), part / job.poses
-    if begun is not None and _is_of(begun, job) and poses.suffix == ".jsonl" and poses.exists():
+    is_begun = begun is not None and begun.state == INTERRUPTED and _is_of(begun, job)
+    if is_begun and poses.suffix == ".jsonl" and poses.exists():
         return True
     for left in part.iterdir():
-        left.unlink()
+        shutil.rmtree(left) if left.is_dir() else left.unlink()
     return False
 
 
@@ -220,14 +225,14 @@ def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
     Poses that are there are not given up for a run that failed.
     """
     place = Path(job.folder) / job.name
-    there = told(place)
-    if outcome.state == FAILED and there is not None and there.state == DONE:
-        return replace(outcome, reason=f"{outcome.reason}; {job.name} is as it was before")
     while True:
-        before = finished(job)
+        before, there = finished(job), told(place)
         if before is not None:
             shutil.rmtree(part, ignore_errors=True)
             return before
+        if outcome.state == FAILED and there is not None and there.state == DONE:
+            shutil.rmtree(part, ignore_errors=True)
+            return replace(outcome, reason=f"{outcome.reason}; {job.name} is as it was before")
         old = place.with_name(f".{job.name}.{uuid.uuid4().hex}")
         with suppress(FileNotFoundError):
             place.rename(old)  # of another session, or failed

@@ -77,14 +77,14 @@ class ImageSequence(Source):
                 "the names of its images end in times since 1970, which are taken for theirs, and "
                 "not fps; drop fps, or name a table of times"
             )
-        values, places = [_ending(path) for path in self.paths], [*range(self.length)]
+        values, places = _endings(self.paths), [*range(self.length)]
         by_name = natural_order(self.paths)
-        if values == [*self.numbers] and [*self.paths] != by_name:
+        are_alike = len({re.sub("[0-9]+", "0", str(path)) for path in by_name}) == 1
+        if are_alike and values == [*self.numbers] and [*self.paths] != by_name:
             after = next(k for k, path in enumerate(by_name) if path != self.paths[k])
             return (
                 f"{self.paths[after].name} comes before {by_name[after].name}, as frames go by the "
-                "numbers that names end in; end them in numbers that ascend, or in seconds or "
-                "nanoseconds since 1970"
+                "last number of a name alone; should they go by others before it, name them anew"
             )
         if self.length < 3 or [*self.numbers] != places or values == places:
             return None
@@ -143,16 +143,25 @@ def frame_numbers(paths: Sequence[Path]) -> list[int]:
     The number that a name without its extension ends in, where every name ends in one and no two
     are alike; else the place in `paths`, from 0.
     """
-    numbers = [number for path in paths if (number := _ending(path)) is not None]
+    numbers = [number for number in _endings(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
 
 
-def _ending(path: Path) -> int | None:
-    """The number that the name of a file ends in; of seconds since 1970 nanoseconds."""
-    if stamp := re.search(r"(?<![0-9])([0-9]{9,10})[.]([0-9]{1,9})$", path.stem):
-        return int(stamp[1] + stamp[2].ljust(9, "0"))
-    found = re.search(r"[0-9]+$", path.stem)
-    return int(found.group()) if found else None
+def _endings(paths: Sequence[Path]) -> list[int | None]:
+    """The number that each name ends in; nanoseconds, where all end in seconds since 1970."""
+    stamps = [re.search(r"(?<![0-9])(1[0-9]{9})[.]([0-9]{1,9})$", path.stem) for path in paths]
+    times = [int(found[1] + found[2].ljust(9, "0")) for found in stamps if found]
+    if len(times) == len(paths) > 1 and not _are_counted([found[0] for found in stamps if found]):
+        return [*times]
+    found = [re.search(r"[0-9]+$", path.stem) for path in paths]
+    return [int(one.group()) if one else None for one in found]
+
+
+def _are_counted(stamps: Sequence[str]) -> bool:
+    """Whether names as 1234567890.0001 have a number of a camera, and behind the point count up."""
+    seconds, parts = zip(*(stamp.split(".") for stamp in stamps), strict=True)
+    counts = sorted(map(int, parts))
+    return len({*seconds}) == 1 and counts[-1] - counts[0] < 2 * len(counts)
 
 
 def natural_order(paths: Sequence[Path]) -> list[Path]:

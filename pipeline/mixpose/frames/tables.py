@@ -94,8 +94,8 @@ class DetectionTable(Source):
         if not self.has_fps:
             return None
         return (
-            "its rows have times and no frame numbers, which they go by, and not by fps; drop fps, "
-            "or add a column frame"
+            "its rows have times and no frame numbers, which they go by, and not by fps; add a "
+            "column frame where the clocks of sensors differ"
         )
 
     def check_times(self, wanted: range) -> None:

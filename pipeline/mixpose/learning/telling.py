@@ -137,7 +137,8 @@ def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
                 a = ", ".join(bodies[k].names[n] for n in parts[0].features)
                 b = ", ".join(bodies[other].names[n] for n in parts[0].partners)
                 said = "where no others are seen the two cannot be told apart"
-                if not _are_together(bodies[k], bodies[other]):
-                    said = "the two are never seen at a time, and may be one: leave out the lesser"
+                most = 2 * len(parts[0].features) > min(len(first), len(second))
+                if most and not _are_together(bodies[k], bodies[other]):
+                    said = "the two are hardly ever seen at a time, and may be one: leave one out"
                 told.append(f"markers {a} of {names[k]} lie like {b} of {names[other]}: {said}")
     return told

@@ -257,13 +257,17 @@ def _without_foreign(
 ) -> tuple[Track, SmoothedTrack]:
     """A track without poses that lie where those around them forbid, and the track smoothed.
 
-    The first is one of them if it is the last of the way back, from which all is told then.
+    The first is one of them if it is the last of the way back, which tells where it should be.
     """
     if _off(track, smooth_track(track, model), model, -1)[0] > _limit(track, rules):
-        left, result = _without_foreign_after_first(_reversed(track), model, rules)
+        left, back = _without_foreign_after_first(_reversed(track), model, rules)
         if not left.measured[-1]:
-            poses, covariances = result.poses[::-1], result.covariances[::-1]
-            return _reversed(left), replace(result, poses=poses, covariances=covariances)
+            left, rest = _without_foreign_after_first(track.part(slice(1, None)), model, rules)
+            poses = np.concatenate([back.poses[-1:], rest.poses])
+            covariances = np.concatenate([back.covariances[-1:], rest.covariances])
+            measured = np.append(False, left.measured)
+            result = replace(rest, poses=poses, covariances=covariances)
+            return replace(track, measured=measured), result
     return _without_foreign_after_first(track, model, rules)
 
 
