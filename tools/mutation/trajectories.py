@@ -38,7 +38,7 @@ MUTANTS = (
         ("test_align.py",),
     ),
     Mutant(
-        "smooth-first-pose-is-always-right",
+        "trajectories-first-pose-is-always-right",
         "trajectories/smoothing.py",
         "model, -1)[0] > _limit(track, rules):",
         "model, -1)[0] > np.inf:",
@@ -46,7 +46,7 @@ MUTANTS = (
         ("test_smooth_choices.py",),
     ),
     Mutant(
-        "smooth-first-frame-shows-the-body",
+        "trajectories-first-frame-shows-the-body",
         "trajectories/choices.py",
         "before = first(0), 0.0 if alternatives[0].may_be_none else -np.inf",
         "before = first(0), -np.inf",
@@ -78,7 +78,7 @@ MUTANTS = (
         ("test_calibration.py",),
     ),
     Mutant(
-        "several-failed-runs-are-gone-on-with",
+        "cli-failed-runs-are-gone-on-with",
         "cli/recording_job.py",
         "begun.state == INTERRUPTED and _is_of(begun, job)",
         "_is_of(begun, job)",
@@ -86,7 +86,7 @@ MUTANTS = (
         ("test_cli_workers.py",),
     ),
     Mutant(
-        "several-poses-give-way-to-a-failure",
+        "cli-poses-give-way-to-a-failure",
         "cli/recording_job.py",
         "if outcome.state == FAILED and there is not None and there.state == DONE:",
         "if False:",
