@@ -255,3 +255,11 @@ def test_a_camera_whose_detections_do_not_fit_is_doubted() -> None:
     assert found.explained.min() > 0.8
     told = doubts_of(replace(found, explained=np.array([0.9, 0.2])), "mm")
     assert told == ["s1: 20 % of its detections fit: it may stand elsewhere"]
+
+
+def test_one_camera_has_nothing_to_be_held_against() -> None:
+    sensors = cameras(1)
+    frames = recording(sensors, 8, 0.05)
+    task = task_of(sensors, frames, free={})
+    found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
+    assert check_lines(found, "mm")[-1].startswith("nothing to hold it against: one sensor alone")

@@ -17,6 +17,7 @@ from mixpose.checking.changes import Change
 from mixpose.checking.evidence import best_pose
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Tried, diagnosis, simplest
+from mixpose.checking.values import _calibration
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
 from mixpose.cli.findings import Findings
@@ -200,3 +201,16 @@ def test_frames_that_are_lost_ask_for_the_cause_as_those_in_doubt_do(
     for line in causes:
         assert line.startswith("the body of [object] is mirrored: ")
         assert line.endswith(", frames that are not ok would be ok")
+
+
+def test_cameras_that_all_have_one_calibration_copied_none(right: Session) -> None:
+    """As cameras of one kind have, of which a third one is beside two here."""
+    left, other = right.sensors
+    lens = cast("Any", other.sensor)
+    one = replace(
+        cast("Any", left.sensor), camera_matrix=lens.camera_matrix, distortion=lens.distortion
+    )
+    both = [replace(left, sensor=one), other]
+    for cameras, copied in ((both, True), ([*both, replace(other, name="third")], False)):
+        found = _calibration(cameras[0], cameras)
+        assert ("but that of 'right'" in found.what) == copied

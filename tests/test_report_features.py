@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,3 +75,31 @@ def test_features_of_lost_frames_and_of_sensors_without_a_frame_are_not_shown(po
     for name, first in (("left", 1), ("right", 2)):
         values = np.array(list(shown[name].values()))
         assert np.isnan(values).all(axis=0).tolist() == [True] * first + [False] * (4 - first)
+
+
+def test_frames_that_are_missing_are_left_empty(
+    poses: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.axes import Axes
+
+    from mixpose.report import figures
+
+    drawn: list[Any] = []
+    draw: Any = Axes.pcolormesh
+
+    def seen(axes: Axes, x: Any, y: Any, cells: Any, **rest: Any) -> Any:
+        drawn.append((x, y, cells))
+        return draw(axes, x, y, cells, **rest)
+
+    monkeypatch.setattr(Axes, "pcolormesh", seen)
+    file = read_poses(poses)
+    moved = tuple(
+        replace(line, frame=line.frame + 80 * (k > 1), time_s=k + 80.0 * (k > 1))
+        for k, line in enumerate(file.poses)
+    )
+    figures.features(series_of(replace(file, poses=moved)), lambda _: "px")
+    x, _, cells = drawn[0]
+    assert x.tolist() == [-0.5, 0.5, 1.5, 81.5, 82.5, 83.5]
+    assert cells.mask[:, 2].all()  # from 1.5 to 81.5
+    assert not cells.mask[:, 3].all()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
 from mixpose.search import LIVE, THOROUGH, Candidate, SearchBudget, SearchState, search_frame
+from mixpose.search.poses import unlike
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import ParallelBeam, PinholeCamera
 from mixpose.tracking import estimate_pose
@@ -299,3 +301,12 @@ def test_one_face_of_a_large_body_is_found_among_all_its_faces() -> None:
         assert len(y) == 16
         # 0.5 px of 240 px turn what is flat by 2 to 6°
         assert rotation_angle_deg(best, T) < 10
+
+
+def test_poses_that_are_nowhere_are_told_apart_without_a_warning() -> None:
+    body = Body("three", tuple(PointFeature(p) for p in 10 * np.eye(3)))
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1, 0, 3], poses[2, 0, 3], poses[3, 0, 3] = 1e300, np.inf, 5.0
+    with np.errstate(all="raise", invalid="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert {0, 3} <= {*unlike(body, poses, 0.1).tolist()}
