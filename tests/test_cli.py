@@ -223,17 +223,27 @@ def test_an_interrupt_leaves_whole_lines_and_status_130(tmp_path: Path) -> None:
     assert 1 < len(lines_of(poses.read_text(encoding="utf-8"))) <= RANGE_FRAMES
 
 
-def test_an_interrupt_of_code_that_is_being_made_is_status_130_as_well() -> None:
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "interrupted; everything so far is written"),
+        # which writes at its end what it found
+        (["learn", "session.toml"], "interrupted"),
+    ],
+)
+def test_an_interrupt_of_code_that_is_being_made_is_status_130_as_well(
+    words: list[str], said: str
+) -> None:
     # dataclasses are made by `exec`; Python ends by the signal where one is left by an interrupt
     script = (
         "from mixpose import cli\n"
         "cli._status = lambda arguments: exec('raise KeyboardInterrupt')\n"
-        "cli.main([])\n"
+        f"cli.main({words!r})\n"
     )
-    words = [sys.executable, "-c", script]
-    result = subprocess.run(words, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 130
-    assert result.stderr == "mixpose: interrupted; everything so far is written\n"
+    assert result.stderr == f"mixpose: {said}\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes to head are a POSIX habit")
@@ -325,14 +335,3 @@ def test_help_of_simulate_has_its_options_in_groups() -> None:
     text = command("simulate", "--help").stdout
     found = [len(part.split("\n  -")) - 1 for part in re.split(r"^\w[\w ,]+:$", text, flags=re.M)]
     assert max(found) < 10
-
-
-def test_an_interrupt_of_what_writes_at_its_end_does_not_say_that_something_is_written() -> None:
-    script = (
-        "from mixpose import cli\n"
-        "cli._status = lambda arguments: exec('raise KeyboardInterrupt')\n"
-        "cli.main(['learn', 'session.toml'])\n"
-    )
-    words = [sys.executable, "-c", script]
-    result = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert (result.returncode, result.stderr) == (130, "mixpose: interrupted\n")

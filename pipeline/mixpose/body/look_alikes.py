@@ -60,11 +60,6 @@ class LookAlike:
         return float(rotation_angle_deg(self.T_body_other, np.eye(4)))
 
     @cached_property
-    def pairs(self) -> set[tuple[int, int]]:
-        """Features, each with its partner."""
-        return set(zip(self.features, self.partners, strict=True))
-
-    @cached_property
     def is_step(self) -> bool:
         """Whether features are shifted, by far the most of the way the same for all of them."""
         points = self.body.means[list(self.features)]

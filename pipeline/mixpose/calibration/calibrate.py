@@ -94,9 +94,8 @@ def _as_it_stands(
         best = _best(task, [replace(start, frames=frames, unlinked=wrong)], rules, progress)
     if best is None:
         return None
-    found = best[1].found
-    fits = bool((found.noise < rules.failed * task.sigmas).all()) and found.are_linked
-    return best if fits and not found.doubtful(rules) else None
+    run, found = best[1], best[1].found
+    return best if run.fits and found.are_linked and not found.doubtful(rules) else None
 
 
 def _from_cameras(
@@ -135,8 +134,7 @@ def _best(
         if not len(start.frames):
             continue
         one = _Run(task, start, rules, progress)
-        fits = bool((one.found.noise < rules.failed * task.sigmas).all())
-        worth = (fits, one.found.certainty)
+        worth = (one.fits, one.found.certainty)
         if best is None or worth > best[0]:
             best = (worth, number, one)
         if worth >= (True, rules.certain):
@@ -157,6 +155,11 @@ class _Run:
         self._interval = float(np.median(steps))
         self._lay_out(start.unlinked)
         self.found = self._result()
+
+    @property
+    def fits(self) -> bool:
+        """Whether residuals are smaller than chance leaves them."""
+        return bool((self.found.noise < self._rules.failed * self._asked.sigmas).all())
 
     def _lay_out(self, unlinked: Collection[int]) -> None:
         """Seek what is free of sensors that are linked by now."""

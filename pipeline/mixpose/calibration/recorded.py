@@ -14,7 +14,7 @@ from mixpose.calibration.rig import Rig
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import Progress, SeenFrame
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames import ImageSequence, Source, numbers_of, pair
+from mixpose.frames import ImageSequence, Source, numbers_of, pair, spread_over
 from mixpose.objective import View
 from mixpose.records import Floats, FrameSet, GridPattern, Indices, PointPattern
 from mixpose.runner import as_sensors, observe, open_sources
@@ -104,9 +104,7 @@ def _some_of(
     numbers = sorted(set[int]().union(*known))
     if max(map(len, known), default=0) <= rules.most_read:
         return None
-    size = _RUN if runs else 1
-    starts = np.linspace(0, len(numbers) - size, rules.most_read // size).astype(int)
-    return {numbers[start + k] for start in starts.tolist() for k in range(size)}
+    return {*spread_over(numbers, rules.most_read, _RUN if runs else 1)}
 
 
 def _without_others(source: Source, wanted: Collection[int] | None) -> Source:

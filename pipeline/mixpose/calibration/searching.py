@@ -8,7 +8,7 @@ be adjusted to what was found.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -56,12 +56,7 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
 
 def likeliest_poses(task: Task, progress: Progress) -> tuple[tuple[SeenFrame, ...], Floats]:
     """Frames of which all sensors together know a pose, believed or not, and these (K, 4, 4)."""
-    found: list[tuple[SeenFrame, Floats]] = []
-    for done, (frame, T, _) in enumerate(_tracked(task, 1.0)):
-        progress("searching the body with all sensors", done, len(task.frames))
-        if T is not None:
-            found.append((frame, T))
-    return tuple(frame for frame, _ in found), np.array([T for _, T in found]).reshape(-1, 4, 4)
+    return _apart(_posed(task, 1.0, progress))
 
 
 def joint_poses(
@@ -69,17 +64,29 @@ def joint_poses(
 ) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
     """Frames whose pose all sensors together know, and the poses (K, 4, 4), blur after blur."""
     for factor in rules.widened:
-        found: list[tuple[SeenFrame, Floats, bool]] = []
-        for done, (frame, T, is_sure) in enumerate(_tracked(task, factor)):
-            progress("searching the body with all sensors", done, len(task.frames))
-            if T is not None:
-                found.append((frame, T, is_sure))
+        found = _posed(task, factor, progress)
         sure = [each for each in found if each[2]]
         # where hardly any pose is believed, the likeliest are a start, and deviations will tell
         few = len(sure) < rules.believed * len(task.frames)
-        found = sorted(found, key=lambda each: each[0].number) if few else sure
-        poses = np.array([T for _, T, _ in found]).reshape(-1, 4, 4)
-        yield tuple(frame for frame, _, _ in found), poses
+        yield _apart(sorted(found, key=lambda each: each[0].number) if few else sure)
+
+
+def _posed(task: Task, factor: float, progress: Progress) -> list[tuple[SeenFrame, Floats, bool]]:
+    """Frames that have a pose at a factor times σ_ε, the pose, and whether it is believed."""
+    found = []
+    for done, (frame, T, is_sure) in enumerate(_tracked(task, factor)):
+        progress("searching the body with all sensors", done, len(task.frames))
+        if T is not None:
+            found.append((frame, T, is_sure))
+    return found
+
+
+def _apart(
+    found: Sequence[tuple[SeenFrame, Floats, bool]],
+) -> tuple[tuple[SeenFrame, ...], Floats]:
+    """Frames, and their poses (K, 4, 4)."""
+    poses = np.array([T for _, T, _ in found]).reshape(-1, 4, 4)
+    return tuple(frame for frame, _, _ in found), poses
 
 
 def are_sure_together(task: Task) -> bool:

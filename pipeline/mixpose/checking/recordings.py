@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames import Source, numbers_of
+from mixpose.frames import Source, numbers_of, spread_over
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.repeated import is_same, shown_by
@@ -137,13 +137,7 @@ def some_of(sources: Mapping[str, Source]) -> set[int] | None:
     if not known:
         return None
     numbers = sorted(set.intersection(*known) or set.union(*known))
-    return set(_spread(numbers, _COUNTED))
-
-
-def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """Some of the numbers from the first to the last."""
-    places = np.linspace(0, len(numbers) - 1, min(most, len(numbers)))
-    return [numbers[int(place)] for place in places]
+    return set(spread_over(numbers, _COUNTED))
 
 
 def has_twins(points: Floats) -> bool:
@@ -258,7 +252,7 @@ def _whole(source: Source, damage: Damage) -> Iterator[RawFrame]:
 def _images(source: ImageSequence, damage: Damage, *, quick: bool) -> Iterator[RawFrame]:
     """Each image by itself: after a damaged one the next can be read all the same."""
     numbers = source.numbers
-    for number in _spread(numbers, _QUICK) if quick else numbers:
+    for number in spread_over(numbers, _QUICK) if quick else numbers:
         try:
             for frame in source.frames(number, number + 1):
                 if source.resolution is None and isinstance(frame.data, np.ndarray):

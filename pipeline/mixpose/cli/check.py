@@ -137,8 +137,7 @@ def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
     within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
     same = f"{alike} orientations look the same{within}" if alike > 1 else "none"
     points = body.nodes.points
-    turns = {*TWIST_NAMES[3:]} <= {*session.estimator.free}
-    if turns and is_on_a_line(points, default_tolerance(points)):
+    if free_mask(session.estimator)[3:].all() and is_on_a_line(points, default_tolerance(points)):
         same = "all turns about the line of its features look the same: no frame has its pose"
     written = "; the pose nearest to the previous one is written" if alike > 1 else ""
     report.say("symmetry", f"{of}{same}{written}")

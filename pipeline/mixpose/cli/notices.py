@@ -107,6 +107,7 @@ class Summary:
         self.idle_for = MEETS_NOTHING
         self.findings, self.path = Findings(session), session.path
         self.bodies = len(session.labels)
+        self.counted = "frames with a pose" if self.bodies == 1 else "poses"
         self.statuses: Counter[str] = Counter()
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
@@ -168,11 +169,10 @@ class Summary:
 
     def warnings(self) -> list[str]:
         """What is most likely wrong with the geometry, once for each sensor at most."""
-        counted = "frames with a pose" if self.bodies == 1 else "poses"
         apart = {n for n, k in self.idle.items() if k >= _MOST * self.posed[n]}
         found = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
-            f"{counted}: check its T_sensor_world, calibration and source, which "
+            f"{self.counted}: check its T_sensor_world, calibration and source, which "
             "mixpose check tries"
             for name in self.idle
             if name in apart
@@ -185,7 +185,7 @@ class Summary:
         # what names the cause stands for what only shows it
         found = [*([] if self.findings.tells_of_sensors(causes) else found), *seen, *causes]
         found += [
-            f"sensor {name!r} was left out of {count} of {posed} {counted}: {why}"
+            f"sensor {name!r} was left out of {count} of {posed} {self.counted}: {why}"
             for (name, why), count in self.left_out.items()
         ]
         offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
@@ -221,8 +221,7 @@ class Summary:
         return remarks
 
     def _split_text(self) -> str:
-        counted = "frames with a pose" if self.bodies == 1 else "poses"
-        frames = f"in {self.split_frames} of {self.shared} {counted}"
+        frames = f"in {self.split_frames} of {self.shared} {self.counted}"
         check = (
             "check the size of [object], its unit, T_sensor_world and calibration, if the body was "
             "in view of all"

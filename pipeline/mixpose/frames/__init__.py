@@ -8,6 +8,7 @@ from mixpose.frames.opening import (
     files_of as files_of,
     numbers_of as numbers_of,
     open_source as open_source,
+    spread_over as spread_over,
 )
 from mixpose.frames.pairing import pair as pair, paired_by_stamp as paired_by_stamp
 from mixpose.frames.prefetch import prefetch as prefetch

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from difflib import SequenceMatcher
 from pathlib import Path
 
+import numpy as np
+
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.capture import is_pipe
 from mixpose.frames.images import IMAGE_SUFFIXES, ImageSequence, natural_order, open_images
@@ -55,6 +57,12 @@ def numbers_of(source: Source) -> set[int] | None:
     if isinstance(source, DetectionTable):
         return set(source.numbers())
     return None if source.length is None else set(range(source.length))
+
+
+def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
+    """So many at most of the numbers, from the first to the last, in runs of neighbours."""
+    starts = np.linspace(0, len(numbers) - run, min(most, len(numbers)) // run)
+    return [numbers[int(start) + k] for start in starts for k in range(run)]
 
 
 def open_source(spec: SourceSpec) -> Source:
@@ -155,7 +163,6 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
             f"{path}: matches {len(files)} files and none is an image (the first is "
             f"{min(files).name}); allowed are images or one other file"
         )
-    # a folder of such a name is there
     as_pattern = ", as [ ] stand for one of the characters in them: [[] is a [" * ("[" in pattern)
     raise RecordingError(
         f"{path}: no such file, and nothing matches{as_pattern}; source of {spec.sensor!r}; "

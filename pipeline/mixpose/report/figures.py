@@ -165,8 +165,8 @@ def mark_ambiguous(axes: Axes, x: Floats, y: Floats, series: Series) -> None:
 
 
 def _broken(values: Floats, breaks: Flags) -> Floats:
-    """Values with a NaN before each break."""
-    return np.insert(values, np.flatnonzero(breaks), np.nan)
+    """Values (..., n) with a NaN before each break."""
+    return np.insert(values, np.flatnonzero(breaks), np.nan, axis=-1)
 
 
 def drawn(figure: Figure) -> str:
@@ -262,10 +262,9 @@ def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         half = 0.5 * (float(np.median(steps)) if steps.size else 1.0)
         # empty where frames are missing
         gaps = np.flatnonzero(series.breaks)
-        gaps = gaps[gaps > 0]
         x = np.insert(series.x - half, gaps, series.x[gaps - 1] + half)
         x = np.append(x, series.x[-1] + half)
-        rows = np.insert(rows, gaps, np.nan, axis=1)
+        rows = _broken(rows, series.breaks)
         y = np.arange(len(rows) + 1) - 0.5
         shown = np.ma.masked_invalid(np.where(np.isfinite(rows), rows, np.nan))
         mesh = axes.pcolormesh(x, y, shown, vmin=0.0, vmax=largest, cmap="viridis", rasterized=True)

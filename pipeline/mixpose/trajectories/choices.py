@@ -71,10 +71,8 @@ def _followed(
 
     A path begins at the first time, or later, where all before show something else.
     """
-    white, noise = (
-        white_parts(track, np.array([model.white])),
-        noise_of(track, model.intensities[None]),
-    )
+    white = white_parts(track, np.array([model.white]))
+    noise = noise_of(track, model.intensities[None])
 
     def first(k: int) -> States:
         one = alternatives[k]
