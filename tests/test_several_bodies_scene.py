@@ -275,7 +275,7 @@ def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -
     three = body("twin", twin.means[:3])
     views = views_of([three], [at(16.0)], 8)
     (track,), _ = scene.advance(tracks, 8, None, views)
-    assert track.known
+    assert track.is_identified
 
 
 def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:

@@ -19,7 +19,7 @@ def odds(cameras: list[PinholeCamera], *met: int, known: bool = False, in_view: 
     """Of another thing, where each camera meets so many of the features, from the first on."""
     views = [view_of(str(k), cameras[k], np.ones((1, 2))) for k in range(len(met))]
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = replace(tracker.begin(), known=known)
+    track = replace(tracker.begin(), is_identified=known)
     numbers = np.arange(in_view)
     seen = [
         Seen(np.zeros((in_view, 2, 6)), str(k), shares=np.where(numbers < each, 1.0, 0.0))

@@ -188,7 +188,7 @@ def test_a_pose_is_expected_as_much_as_the_prediction_is_believed() -> None:
     first = data.predictions[0]
     T = first.T_world_object[None]
     whole, little = (
-        replace(data, predictions=[replace(first, weight=weight)]).expectation(T)[0]
+        replace(data, predictions=[replace(first, weight=weight)]).log_densities(T)[0]
         for weight in (1.0, 1e-2)
     )
     # of the rest, that it is anywhere, there is next to nothing so near
@@ -201,7 +201,7 @@ def test_beside_a_camera_poses_that_are_hardly_likely_are_no_starts() -> None:
     camera = PinholeCamera(K, np.zeros(5), (640, 480), np.eye(4))
     seen = View("camera", camera, Observation(PointPattern(np.zeros((1, 2)), np.ones(1)), 1.0))
     assert len(predicted(data, [])) == len(data.predictions)
-    beside = data.seen_otherwise(views=[*data.views, seen])
+    beside = data.changed(views=[*data.views, seen])
     assert 0 < len(predicted(beside, [])) < len(data.predictions)
     assert list(within(beside, [])) == []
 

@@ -229,7 +229,7 @@ def frame_of(tracked: Body, T: Floats, T_other: Floats) -> tuple[Frame, ScoredPo
     tracker = Tracker.create(tracked, OPTIONS)
     data = tracker.data(tracker.begin(), 0, None, views_of([tracked] * 2, [T, T_other], 0))
     likelihood = likelihood_of(data)
-    starts = [Start(each, data.close) for each in (T, T_other)]
+    starts = [Start(each, data.close_uncertainty) for each in (T, T_other)]
     one, other = (likelihood.judge(likelihood.fit(start), start) for start in starts)
     return data, one, other
 

@@ -92,7 +92,7 @@ _PREDICTION = (
     Mutant(
         "tracking-prediction-of-one-symmetric-pose",
         "tracking/frame.py",
-        "T = nearest_alike(T_world_object, self.body, one.T_world_object)",
+        "T = nearest_alike(T_world_object, self.body, branch.T_world_object)",
         "T = T_world_object",
         "a pose that looks as predicted counts as unexpected",
         (_TRACK,),
@@ -132,9 +132,10 @@ _PREDICTION = (
     Mutant(
         "tracking-fast-bodies-expected-at-rest",
         "tracking/frame.py",
-        "return branch.course.expected(moved if is_there else None, elapsed)",
-        "expected = branch.course.expected(moved if is_there else None, elapsed)\n"
-        "        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected",
+        "return branch.motion_filter.expected(moved if seen else None, elapsed)",
+        "expected = branch.motion_filter.expected(moved if seen else None, elapsed)\n"
+        "        return resting if (np.abs(expected.velocity) > resting.deviation).any() "
+        "else expected",
         "late cameras contradict each other where a body moves faster than most",
         (_TWIN,),
     ),
@@ -149,8 +150,8 @@ _PREDICTION = (
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "np.linalg.norm(away, axis=1).argmin()",
-        "np.linalg.norm(away, axis=1).argmax()",
+        "np.linalg.norm(twists, axis=1).argmin()",
+        "np.linalg.norm(twists, axis=1).argmax()",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),

@@ -125,7 +125,7 @@ MUTANTS = (
     Mutant(
         "tracking-twin-that-moves-as-the-other-did",
         "tracking/tracker.py",
-        "is_new = one.proposer == SECOND_POSE",
+        "is_new = pose.proposer == SECOND_POSE",
         "is_new = False",
         "the body is expected to go on as from its mirror image to itself",
         (_TWIN,),

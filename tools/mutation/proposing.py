@@ -173,8 +173,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers.py",
-        "yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)",
-        "yield Start(poses[0], frame.close, T_moved=moved)",
+        "yield frame.rival(best, there, frame.close_uncertainty, T_moved=moved, left_out=out)",
+        "yield Start(poses[0], frame.close_uncertainty, T_moved=moved)",
         "a chessboard is followed a square off",
         (_STARTS,),
     ),
@@ -197,8 +197,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers.py",
-        "for one in (*likely, frame.beside)",
-        "for one in (*likely[:1], frame.beside)",
+        "for one in (*likely, frame.companion_prediction)",
+        "for one in (*likely[:1], frame.companion_prediction)",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),

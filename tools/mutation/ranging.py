@@ -58,7 +58,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-maxima-forgotten",
         "tracking/tracker.py",
-        "sorted(verdict.faint if fuse else (), key=lambda each: -each[1])",
+        "sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])",
         "list[tuple[ScoredPose, float]]()",
         "where frames tell that another turn is right, that has to be found anew in one of them",
         (_MAXIMA,),
@@ -122,7 +122,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-poses-expected-as-likely-ones",
         "tracking/frame.py",
-        "logs = np.logaddexp(logs, one.log_belief(surprise) + near)",
+        "logs = np.logaddexp(logs, branch.log_belief(surprise) + near)",
         "logs = np.logaddexp(logs, near)",
         "where the track is most likely wrong a better pose elsewhere is not looked for",
         (_MAXIMA,),

@@ -60,8 +60,8 @@ MUTANTS = (
     Mutant(
         "tracking-covariance-of-the-curvature-alone",
         "tracking/telling.py",
-        "covariance = with_likely_turns(covariance, *given)",
-        "with_likely_turns(covariance, *given)",
+        "covariance = with_likely_turns(covariance, *arguments)",
+        "with_likely_turns(covariance, *arguments)",
         "ellipsoids of poses hold only what the curvature allows",
         (_TILTS, "test_tracking.py"),
     ),
@@ -116,8 +116,8 @@ MUTANTS = (
     Mutant(
         "tracking-everything-is-expected",
         "tracking/frame.py",
-        "return there < -self.rules.acceptance.log_doubt",
-        "return there < 100",
+        "return behind < -self.rules.acceptance.log_doubt",
+        "return behind < 100",
         "a body turned by a quarter from one frame to the next is as was expected",
         (_PROPOSERS,),
     ),
@@ -184,8 +184,8 @@ MUTANTS = (
     Mutant(
         "tracking-tilts-judged-again-as-if-nobody-followed-them",
         "tracking/tracker.py",
-        "start = Start(one.T_world_object, wide, left_out=one.left_out, T_moved=one.T_moved)",
-        "start = Start(one.T_world_object, wide, left_out=one.left_out)",
+        "start = Start(pose.T_world_object, wide, left_out=pose.left_out, T_moved=pose.T_moved)",
+        "start = Start(pose.T_world_object, wide, left_out=pose.left_out)",
         "of two tilts that nothing tells apart the followed one is ok, once another body is there",
         (_TILTS,),
     ),

@@ -42,7 +42,7 @@ class Confusion(NamedTuple):
         return Alternative(self.what, max(self.log_odds, min(known, self.alone)))
 
 
-def taken_for(
+def confusions_of(
     frames: Mapping[int, Frame], told: Mapping[int, Verdict]
 ) -> dict[int, list[Confusion]]:
     """What else all that bodies meet may be, by body, of those that meet something.
@@ -55,7 +55,7 @@ def taken_for(
 
     @cache
     def instead(k: int, j: int) -> list[Confusion]:
-        against = look_alikes_of(frames[k], bests[k], frames[j])
+        against = confusions_with(frames[k], bests[k], frames[j])
         return sorted(against, key=lambda one: one.log_odds)
 
     found = {k: [*instead(k, k)] for k in bests}
@@ -66,7 +66,7 @@ def taken_for(
         against = [instead(*step)[-1] for step in steps]
         log_odds, alone = sum(one.log_odds for one in against), sum(one.alone for one in against)
         asked = [(k, j, one.what) for (k, j), one in zip(steps, against, strict=True)]
-        before = max(frames[k].track.alike.get(what, -math.inf) for k, _, what in asked)
+        before = max(frames[k].track.confused.get(what, -math.inf) for k, _, what in asked)
         for k, j, what in asked:
             if j in sure:
                 changed = Confusion(what, log_odds, alone, before)
@@ -110,7 +110,7 @@ def _exchanges(
             yield [(k, j), (j, i)]
 
 
-def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
+def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
     """Parts of another body, or of its own, that what a pose meets might be as well."""
     met = met_features(data, best)
     parts = list(_in_place_of(data, best, met, other))
@@ -119,15 +119,15 @@ def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Conf
     T = best.T_world_object
     here = Start(T, left_out=best.left_out)
     own = likelihood_of(data).density(Fit(T), here, best.matches)
-    seen = other.seen_otherwise(views=data.views, still=data.still)
+    seen = other.changed(views=data.views, static_views=data.static_views)
     likelihood = likelihood_of(seen)
     # what a pose meets does not depend on what is drawn
     drawn = replace(data.finest, projection=project_body(data.finest.projection.sensors, seen.body))
-    as_it_stands = likelihood_of(replace(seen, drawn=drawn))
+    as_it_stands = likelihood_of(replace(seen, precomputed=drawn))
     for part, T_other in parts:
         there = as_it_stands.density(Fit(T_other), here, best.matches)
         if there - own > -other.rules.look_alikes.behind:  # else it is none, however fitted
-            start = other.rival(best, T_other, other.close, left_out=best.left_out)
+            start = other.rival(best, T_other, other.close_uncertainty, left_out=best.left_out)
             there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
         known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
         alone = there - own - known
@@ -166,8 +166,8 @@ def _is_open(data: Frame, part: LookAlike, other: Frame) -> bool:
     Of a body that is new, was away, or in doubt so far.
     """
     track, rules = data.track, data.rules
-    is_new = track.believed < rules.proposals.believed or track.misses or track.doubted
-    is_doubted = track.alike.get(part.reason, -math.inf) > rules.acceptance.log_doubt
+    is_new = track.ok_count < rules.proposals.believed or track.misses or track.doubted
+    is_doubted = track.confused.get(part.reason, -math.inf) > rules.acceptance.log_doubt
     return other.body is not data.body and bool(is_new or is_doubted)
 
 

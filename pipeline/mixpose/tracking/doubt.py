@@ -74,7 +74,10 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     # a sure pose that has rivals may have them for a reason that can be told
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
-    rules, sensors = data.rules, {view.name: view.sensor for view in data.still or data.views}
+    rules, sensors = (
+        data.rules,
+        {view.name: view.sensor for view in data.static_views or data.views},
+    )
     own = _of_contradiction(data, best), of_reflection(data, best)
     names = {one.name for one in own}
     before = {name: odds for name, odds in data.track.mistaken.items() if name not in names}
@@ -136,7 +139,9 @@ def _alternatives(
     """What else a frame may show that a sure pose is told from."""
     rules, noise = data.rules.acceptance, data.rules.judgement.noise
     if data.options.mirrors and is_flat(data):
-        known = data.other_at(best.T_world_object)  # where it was seen beside its mirror image
+        known = data.log_odds_other_at(
+            best.T_world_object
+        )  # where it was seen beside its mirror image
         yield Alternative(IN_A_MIRROR, 0.0 if known is None else known)
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(UNSURE, _of_chance_that_lasts(best, told))
@@ -167,7 +172,7 @@ def _told(data: Frame, best: ScoredPose) -> tuple[float, Shape | None]:
     needs no others.
     """
     track, T, rules = data.track, best.T_world_object, data.rules
-    if track.believed:
+    if track.ok_count:
         return math.inf, None
     alone = best.log_evidence
     if track.frame is not None:
@@ -199,7 +204,7 @@ def of_other_things(data: Frame, judged: ScoredPose) -> float:
     covered = np.minimum(in_view, 2)[seen.met_by == 0].sum()
     odds = 3 * (met - 2) * math.log(rules.look_alikes.alike)
     odds -= covered * rules.judgement.detection.log_missed
-    return float(odds - (_gained(data, judged) if data.track.known else 0.0))
+    return float(odds - (_gained(data, judged) if data.track.is_identified else 0.0))
 
 
 def _most_told(data: Frame) -> float:
@@ -215,7 +220,7 @@ def _of_contradiction(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, known = data.track, (data.rules.acceptance, data.rules.judgement.noise)
     before = track.mistaken.get(CONTRADICTION, 0.0)
-    if others_miss(judged, _noise_before(data, judged), track.agreed, *known):
+    if others_miss(judged, _noise_before(data, judged), track.sensors_agreed, *known):
         before = _as_likely_as_not(data)
     elif before and two_agree(judged, *known):
         before = 0.0
@@ -242,7 +247,7 @@ def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, lasts = data.track, not data.options.mirrors
     before = track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
-    is_early = track.believed < data.rules.proposals.believed
+    is_early = track.ok_count < data.rules.proposals.believed
     asked = before > 0 or (lasts and is_early and before > -_most_told(data))
     odds = _reflected(data, judged, asked, before)
     if odds == -math.inf:  # what is known of it holds
@@ -272,7 +277,7 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool, before: float) -> f
         value = float(data.finest.weights[:, 0] @ seen.explained)
         if asked or there.finest.value(T) > value / 16:
             # fitted, which may end at clutter, and where it is asked for as it stands
-            rival = data.rival(judged, T, data.close, ahead=likely)
+            rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
             starts = [rival, *([Start(T)] if asked else [])]
             near = max([_evidence(there, one) for one in starts]) - own
             if near > likely:
@@ -294,7 +299,7 @@ def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
     rules, seen, track = data.rules, judged.matches, data.track
     are_few = judged.measurements - 6 <= rules.look_alikes.by_chance
-    if not are_few or track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
+    if not are_few or track.ok_count >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
     is_missed, noise = (seen.missed > 0.5).any(), rules.judgement.noise
     return bool(is_missed) or is_far_off(seen, _noise_before(data, judged), rules.acceptance, noise)
@@ -312,4 +317,4 @@ def _evidence(data: Frame, start: Start) -> float:
 
 def _mirrored(data: Frame, chosen: Mask) -> Frame:
     """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
-    return data.of_body(mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist())))
+    return data.with_body(mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist())))

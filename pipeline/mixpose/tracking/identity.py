@@ -99,7 +99,7 @@ def identify(
         hidden = 0.5 if one.track.misses else rules.motion.hidden
         # one that nobody saw yet is as seldom in view as one that was is somewhere else
         hidden = hidden if one.predictions else 1 - rules.motion.surprise
-        rows.append([*(math.log1p(-hidden) + one.expectation(there)).tolist(), math.log(hidden)])
+        rows.append([*(math.log1p(-hidden) + one.log_densities(there)).tolist(), math.log(hidden)])
     places = np.array([*(pose.T_world_object[:3, 3] for pose in poses), np.full(3, np.nan)])
     assignment = Assignment(
         np.array(rows),

@@ -25,7 +25,7 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.motion import Expected
+from mixpose.tracking.motion import ExpectedVelocity
 from mixpose.tracking.track import DelayEvidence
 
 
@@ -45,7 +45,7 @@ class Offsets(NamedTuple):
         )
 
     def unknowns(
-        self, velocity: Floats, expected: Expected, free: Mask
+        self, velocity: Floats, expected: ExpectedVelocity, free: Mask
     ) -> tuple[Floats, LinearResiduals]:
         """How offsets change with all unknowns (K, q), and what is known of these before.
 
@@ -74,12 +74,12 @@ def fit_in_motion(
     `climb` takes a frame as of the common time, a start, how far off features may be, and at which
     blur it ends, in σ_ε: narrower ones choose a sensor where the velocity is not known.
     """
-    motion = frame.expected(T_start, is_there=False).at(T_start)
+    motion = frame.expected_velocity(T_start, seen=False).at(T_start)
     T, moved, count, timing = T_start, np.inf, int(frame.free.sum()), frame.rules.timing
     errors = frame.rules.judgement.noise.errors
     for _ in range(6):
         seen = frame.in_motion(motion)
-        expected, matches, wide = frame.expected(T), None, 1.0
+        expected, matches, wide = frame.expected_velocity(T), None, 1.0
         if moved > timing.linear:
             beside, by_velocity = _beside(seen, T, expected)
             if moved == np.inf:  # after the first climb the velocity is known
@@ -87,7 +87,7 @@ def fit_in_motion(
             fit = climb(seen, T, beside, wide)
             T = frame.oriented(fit.T_world_object)
             matches = fit.matches if T is fit.T_world_object else None
-            expected = frame.expected(T)
+            expected = frame.expected_velocity(T)
         met = offsets_of(seen, matches or matches_at(seen, T), expected, wide)
         design, known = met.unknowns(motion.velocity, expected, frame.free)
         variance = errors.typical**2
@@ -111,7 +111,7 @@ def fit_in_motion(
 
 def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> ScoredPose:
     """A judged pose, as sure as its velocity and acceleration let it be."""
-    free, expected = frame.free, frame.expected(judged.T_world_object)
+    free, expected = frame.free, frame.expected_velocity(judged.T_world_object)
     met, inner = offsets_of(frame, judged.used, expected), np.ix_(free, free)
     covariance, alone = judged.covariance.copy(), (met.rows.T @ met.rows)[inner]
     # the variance by which the covariance goes
@@ -144,13 +144,13 @@ def matches_at(frame: Frame, T_world_object: Floats) -> Matches:
 
 
 def offsets_of(
-    frame: Frame, matches: Matches, expected: Expected | None = None, wide: float = 1.0
+    frame: Frame, matches: Matches, expected: ExpectedVelocity | None = None, wide: float = 1.0
 ) -> Offsets:
     """Met features, as they pull: little, where farther off than noise and velocity explain.
 
     Nor do they pull more than at a blur as `wide`, in σ_ε.
     """
-    views = [view for view in frame.still or frame.views if view.name in matches.names]
+    views = [view for view in frame.static_views or frame.views if view.name in matches.names]
     met = matches.shares > 0
     late, blurs = _seconds(views, matches.places, met), np.ones(len(views))
     if expected is not None:
@@ -171,12 +171,17 @@ def offsets_of(
     )
 
 
-def _beside(frame: Frame, T_world_object: Floats, expected: Expected) -> tuple[float, float]:
+def _beside(
+    frame: Frame, T_world_object: Floats, expected: ExpectedVelocity
+) -> tuple[float, float]:
     """How far features may be off at a pose in σ_ε, whatever meets them.
 
     By velocity and delays, and by velocity alone.
     """
-    at, views = frame.finest.projection.project(T_world_object[None]), frame.still or frame.views
+    at, views = (
+        frame.finest.projection.project(T_world_object[None]),
+        frame.static_views or frame.views,
+    )
     seen, J = at.weights[:, 0] > 0, at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
     late = _seconds(views, at.y[:, 0], seen)
     both = _off(views, late, J, seen, expected)
@@ -193,7 +198,9 @@ def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:
     return np.where(seen, seconds, 0.0)
 
 
-def _off(views: Sequence[View], late: Floats, J: Floats, seen: Mask, expected: Expected) -> float:
+def _off(
+    views: Sequence[View], late: Floats, J: Floats, seen: Mask, expected: ExpectedVelocity
+) -> float:
     """How far features (L, N) that are seen `late` may be off by velocity and delays, in σ_ε."""
     delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
     speed = np.hypot(expected.velocity, expected.deviation)
@@ -208,7 +215,7 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     is_asked = frame.frame % frame.rules.timing.asked == 0 or frame.is_timed
     if len(used.names) < 2 or not frame.track.seconds_until(frame.time_s) or not is_asked:
         return before
-    expected, own = frame.expected(best.T_world_object), used.names
+    expected, own = frame.expected_velocity(best.T_world_object), used.names
     told = (view.name for view in frame.views if view.name in own and view.unsure is None)
     reference = before.reference or next(told, "")
     if not expected.gain.any() or reference not in own:

@@ -15,7 +15,7 @@ from mixpose.matching import Matches
 from mixpose.optimise import Ascent
 from mixpose.records import Floats
 from mixpose.sensors import Motion
-from mixpose.tracking.frame import Frame, Start, given
+from mixpose.tracking.frame import Frame, Start, spread_in_image
 from mixpose.tracking.in_motion import fit_in_motion, matches_at, with_motion_unknown
 from mixpose.tracking.ranges import AssociationLikelihood, are_associated
 
@@ -28,8 +28,8 @@ class MatchedLikelihood:
         # whether each feature's detection is known, so that one may be left out
         self.knows_detections = frame.options.objective == "matched"
         self._climbed: dict[frozenset[str], list[Fit]] = {}  # by sensors left out
-        if frame.together:
-            self._climbed[frozenset()] = [frame.together[1]]
+        if frame.joint_fit:
+            self._climbed[frozenset()] = [frame.joint_fit[1]]
 
     def fits(self, starts: Iterable[Start]) -> Iterator[tuple[Start, Fit]]:
         """Fits from starts, one after the other, as later ones may hang on those before."""
@@ -42,11 +42,11 @@ class MatchedLikelihood:
             frame = frame.without(start.left_out)
         if uncertainty is None:
             return Fit(T, matches=start.matches, noise=start.noise)
-        if frame.together and start is frame.together[0]:
-            return frame.together[1]
+        if frame.joint_fit and start is frame.joint_fit[0]:
+            return frame.joint_fit[1]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
-        spread = given(frame, T) if self.knows_detections and frame.body.spread else 0.0
+        spread = spread_in_image(frame, T) if self.knows_detections and frame.body.spread else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0, wide: float = 1.0) -> Fit:
             return fit_near(
@@ -75,8 +75,8 @@ class MatchedLikelihood:
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         frame, motion = _as_moving(self.frame, fit)
-        if frame.together and fit is frame.together[1] and start is frame.together[0]:
-            judged = frame.together[2]
+        if frame.joint_fit and fit is frame.joint_fit[1] and start is frame.joint_fit[0]:
+            judged = frame.joint_fit[2]
         else:
             (judged,) = judge_together(
                 [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
@@ -104,7 +104,7 @@ def _as_moving(frame: Frame, fit: Fit) -> tuple[Frame, Motion | None]:
     """The frame as of the common time, and how the body moves, where sensors see moments."""
     if not frame.is_timed:
         return frame, fit.motion
-    motion = fit.motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
+    motion = fit.motion or frame.expected_velocity(fit.T_world_object).at(fit.T_world_object)
     return frame.in_motion(motion), motion
 
 

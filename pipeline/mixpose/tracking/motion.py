@@ -66,7 +66,7 @@ class MotionRules:
     lost: float = constant(50.0, "squared deviations from what was foretold: it begins anew")
     longest_s: float = constant(0.5, "without a pose, after which nothing is foretold")
 
-    def surprised(self, misses: int) -> float:
+    def surprise_after(self, misses: int) -> float:
         """Chance that the body is somewhere else after so many frames without it."""
         return min(self.surprise * (1 + misses), 1.0)
 
@@ -138,7 +138,7 @@ class Distances(NamedTuple):
         )
 
 
-class Expected(NamedTuple):
+class ExpectedVelocity(NamedTuple):
     """A velocity that is expected of a pose; six numbers of each."""
 
     velocity: Floats  # twist per second
@@ -153,15 +153,15 @@ class Expected(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def at_rest(body: Body, rules: MotionRules) -> Expected:
+def at_rest(body: Body, rules: MotionRules) -> ExpectedVelocity:
     """Nothing is known of a velocity but how large it may be; not to be written to."""
     fastest, none = per_kind(body.radius, rules.fastest), np.zeros(6)
     fastest.flags.writeable = none.flags.writeable = False
-    return Expected(none, none, fastest, none, rules.quickest * fastest)
+    return ExpectedVelocity(none, none, fastest, none, rules.quickest * fastest)
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class MotionFilter:
     """How fast a body goes at its last pose, to which states are relative, and how sure that is.
 
     Each coordinate of the pose is followed with its first three derivatives, of which the last
@@ -176,14 +176,14 @@ class Course:
     rules: MotionRules
 
     @classmethod
-    def begun(cls, deviation: Floats, radius: float, rules: MotionRules) -> Course:
+    def begun(cls, deviation: Floats, radius: float, rules: MotionRules) -> MotionFilter:
         """A course of one pose with standard deviations (6,)."""
         count, fastest = rules.sudden[2], per_kind(radius, rules.fastest)
         spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(3))], axis=1)
         covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(4), (count, 6, 4, 4))
         return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), radius, rules)
 
-    def expected(self, moved: Floats | None, elapsed: float) -> Expected:
+    def expected(self, moved: Floats | None, elapsed: float) -> ExpectedVelocity:
         """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
         means, covariances = self._foretold(elapsed)
         rest = 0.0 if moved is None else (moved - means[..., 0])[..., None]
@@ -197,7 +197,7 @@ class Course:
         rates[3:] += cross(moved[3:, None], rates[3:]) / 2
         gain = (weights * gains).sum(axis=0)[:, 0]
         deviation, unsteady = np.sqrt(variances).T
-        return Expected(rates[:, 0], gain, deviation, rates[:, 1], unsteady)
+        return ExpectedVelocity(rates[:, 0], gain, deviation, rates[:, 1], unsteady)
 
     @cached_property
     def _weights(self) -> Floats:
@@ -216,14 +216,14 @@ class Course:
         grown = covariances[..., 0, 0] - self.covariances[..., 0, 0] + (twists - twist) ** 2
         return twist, np.maximum((weights * grown).sum(axis=0), 0.0)
 
-    def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> Course:
+    def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> MotionFilter:
         """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""
         means, covariances = self._foretold(elapsed)
         rest = moved - means[:, :, 0]
         variance = covariances[:, :, 0, 0] + deviation**2
         off = rest**2 / variance
         if off.min(axis=0).max() > self.rules.lost:
-            return Course.begun(deviation, self.radius, self.rules)
+            return MotionFilter.begun(deviation, self.radius, self.rules)
         gains = covariances[..., 0] / variance[..., None]
         means = means + gains * rest[..., None]
         covariances = covariances - gains[..., None] * covariances[..., None, 0, :]
@@ -234,7 +234,7 @@ class Course:
         # what is held tells no motion from another
         seen = np.where(deviation > 0, -0.5 * (np.log(variance) + off), 0.0)
         logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
-        return Course(means, covariances, logs - logs.max(axis=0), self.radius, self.rules)
+        return MotionFilter(means, covariances, logs - logs.max(axis=0), self.radius, self.rules)
 
     @lru_cache(maxsize=16)  # noqa: B019, as few courses are kept as that
     def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:

@@ -33,7 +33,7 @@ from mixpose.search import (
 )
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.ranges import are_associated
-from mixpose.tracking.track import worth_telling
+from mixpose.tracking.track import likely_branches
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -46,9 +46,11 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
     """
     likely = frame.predictions
     if len(likely) > 1 and not _are_ranges(frame):
-        likely = worth_telling(likely, frame.rules.acceptance.confidence)
+        likely = likely_branches(likely, frame.rules.acceptance.confidence)
     return frame.starts or [
-        Start(one.T_world_object, one.uncertainty, one) for one in (*likely, frame.beside) if one
+        Start(one.T_world_object, one.uncertainty, one)
+        for one in (*likely, frame.companion_prediction)
+        if one
     ]
 
 
@@ -67,9 +69,9 @@ def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     track, rules = frame.track, frame.rules
     if ranked and (odds := ranked[0].elsewhere) is not None:
         return odds > rules.acceptance.log_doubt
-    is_new = track.believed < rules.proposals.believed
+    is_new = track.ok_count < rules.proposals.believed
     is_far = bool(ranked) and _is_far(frame, ranked[0], is_new=is_new)
-    if frame.first_is(frame.trusted, ranked) and not is_far:
+    if frame.is_best_accepted(frame.criterion, ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
@@ -89,9 +91,9 @@ def _leaves_any(frame: Frame, pose: ScoredPose) -> bool:
     return bool((pose.matches.count > pose.matches.met + 0.5).any())
 
 
-def is_there(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
+def is_convincing(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     """Whether what is found convinces, or lies where it was expected and casts no doubt."""
-    return frame.first_is(frame.trusted, ranked) or not is_doubtful(frame, ranked)
+    return frame.is_best_accepted(frame.criterion, ranked) or not is_doubtful(frame, ranked)
 
 
 def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
@@ -191,7 +193,7 @@ def starts_at(frame: Frame, candidates: Sequence[Candidate]) -> Iterable[Start]:
     """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
     for candidate in candidates:
         yield Start(candidate.T_world_object)
-        yield Start(candidate.T_world_object, frame.close)
+        yield Start(candidate.T_world_object, frame.close_uncertainty)
 
 
 def candidates_of(frame: Frame) -> list[Candidate]:
@@ -306,7 +308,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         if fewer[k] < least[few[k]]:
             moved = _moves_alike(frame, T) if alike[few[k]].is_step else None
             there, out = poses[1 + few[k]], best.left_out
-            yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)
+            yield frame.rival(best, there, frame.close_uncertainty, T_moved=moved, left_out=out)
 
 
 def _near_any(frame: Frame, poses: Floats) -> Floats:
@@ -345,7 +347,7 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         away = sights.mean(axis=0)
         if np.linalg.norm(away) < math.cos(frame.rules.look_alikes.aside):
             return
-        wide = frame.close * frame.rules.proposals.narrowing
+        wide = frame.close_uncertainty * frame.rules.proposals.narrowing
         tilted = other_tilt(body, some, T, away)
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 

@@ -195,7 +195,7 @@ class ExpectedTerm:
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
         frame, nothing = self.frame, np.zeros((len(poses), 6, 6))
-        surprise = frame.rules.motion.surprised(frame.track.misses)
+        surprise = frame.rules.motion.surprise_after(frame.track.misses)
         known = [Quadratic(np.full(len(poses), frame.elsewhere), nothing[..., 0], nothing, nothing)]
         for one in frame.predictions:
             if one.spread is None:  # a step or two tell no covariance
@@ -273,7 +273,7 @@ class AssociationLikelihood:
         # right poses meet all features, off by the noise but for what they are fitted to it
         spare = np.maximum(found.reached - count, 0.0)
         ahead = float((found.most - spare / 2 - found.log_odds)[0])
-        expected = float(frame.expectation(T[None])[0]) - frame.elsewhere
+        expected = float(frame.log_densities(T[None])[0]) - frame.elsewhere
         return replace(
             judge(frame.finest, T, frame.free, model),
             covariance=covariance,

@@ -38,10 +38,14 @@ def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> 
         return
     rules, seen = frame.rules.acceptance, judged.matches
     if apart := disagreeing(seen, rules, frame.rules.judgement.noise):
-        yield Start(judged.T_world_object, frame.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
+        yield Start(
+            judged.T_world_object,
+            frame.close_uncertainty,
+            left_out=dict.fromkeys(apart, OUT_OF_STEP),
+        )
     elif chance := by_chance(seen, rules):
         left_out = dict.fromkeys(chance, BY_CHANCE)
-        yield Start(judged.T_world_object, frame.close, left_out=left_out)
+        yield Start(judged.T_world_object, frame.close_uncertainty, left_out=left_out)
 
 
 def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
@@ -200,7 +204,7 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     """
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # what is off is told by the noise of frames before
-    if judged.proposer != predicted.__name__ or judged.left_out or not frame.track.believed:
+    if judged.proposer != predicted.__name__ or judged.left_out or not frame.track.ok_count:
         return
     variances = np.minimum(frame.variances, judged.variances)  # this frame's has what is off
     if judged.residual_ratio <= 1:
@@ -258,7 +262,7 @@ def _modes(
         apart = moved[modes] - moved[k]
         if np.vecdot(apart, apart).max(axis=1).min() > errors.outlying**2:
             modes.append(k)
-            start = Start(poses[k], frame.close, blur=errors.blur * float(noise.max()))
+            start = Start(poses[k], frame.close_uncertainty, blur=errors.blur * float(noise.max()))
             T, found = met_at(frame, fit := likelihood.fit(start))
             if not _is_out_of_step(found, frame.variances, errors).any():
                 yield Start(T, matches=found, noise=fit.noise if found is fit.matches else None)

@@ -48,7 +48,7 @@ def _before(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
 
 def _expected(data: Frame, T_world_object: Floats) -> Branch | None:
     """The prediction that puts features next to where a pose has them; None where none is near."""
-    away = [float(off.mean()) for off in data.away_from(T_world_object)]
+    away = [float(off.mean()) for off in data.feature_distances(T_world_object)]
     nearest = int(np.argmin(away))
     return data.predictions[nearest] if away[nearest] <= data.body.radius else None
 

@@ -30,14 +30,14 @@ from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
-from mixpose.tracking.confusion import taken_for
+from mixpose.tracking.confusion import confusions_of
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.identity import Rivals, identify
 from mixpose.tracking.mirrors import is_flat
 from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
-from mixpose.tracking.track import Branch, Companion, Track, worth_telling
+from mixpose.tracking.track import Branch, Companion, Track, likely_branches
 from mixpose.tracking.tracker import Tracker, followed
 
 Box: TypeAlias = tuple[int, int, int, int]
@@ -79,16 +79,16 @@ class Scene:
             apart[group[0]] = before.after(places, motion)
         told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
         frames = {k: _seen_by(one.frame, found[finders[k]].frame) for k, one in found.items()}
-        alike = taken_for(frames, told)
+        alike = confusions_of(frames, told)
         after, estimates = list[Track](), list[Estimate]()
         for k, tracked in enumerate(self.bodies):
             data, verdict = frames[k], found[finders[k]].verdict
-            odds = data.track.alike
+            odds = data.track.confused
             if k in alike:
                 against = [one.since(odds) for one in alike[k]]
                 odds = dict(sorted(against, key=itemgetter(1)))
                 verdict, told[k] = verdict.doubted(against), told[k].doubted(against)
-            after.append(replace(followed(data, verdict), distances=apart.get(k), alike=odds))
+            after.append(replace(followed(data, verdict), distances=apart.get(k), confused=odds))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, told), estimates
 
@@ -122,7 +122,7 @@ def _seen_by(data: Frame, finder: Frame) -> Frame:
     """The frame of a body, with what is left for an identical one that found its pose."""
     if data is finder:
         return data
-    return data.seen_otherwise(views=finder.views, still=finder.still)
+    return data.changed(views=finder.views, static_views=finder.static_views)
 
 
 def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
@@ -221,7 +221,7 @@ class WindowedScene:
         """Whether the last frame was sure of all bodies, and a flat one is no mirror image."""
         return all(
             not (track.misses or track.doubted)
-            and (track.believed >= tracked.rules.proposals.whole or not is_flat(tracked))
+            and (track.ok_count >= tracked.rules.proposals.whole or not is_flat(tracked))
             for tracked, track in zip(self.scene.bodies, tracks, strict=True)
         )
 
@@ -234,7 +234,7 @@ class WindowedScene:
         windows: dict[str, Box] = {}
         for k, tracked in enumerate(self.scene.bodies):
             predictions = tracked.predictions(tracks[k], frame, time_s)
-            likely = worth_telling(predictions, tracked.rules.acceptance.confidence)
+            likely = likely_branches(predictions, tracked.rules.acceptance.confidence)
             for name, box in self._expectations[k].windows(likely).items():
                 a, b, c, d = windows.get(name, box)
                 windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])

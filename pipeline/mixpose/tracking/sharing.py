@@ -26,7 +26,7 @@ from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import MatchedLikelihood, case_of, likelihood_of
-from mixpose.tracking.proposers import is_there, predicted
+from mixpose.tracking.proposers import is_convincing, predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
 from mixpose.tracking.tracker import Tracker, judged_again, weighed_at
@@ -127,10 +127,12 @@ class Sharing:
             frames = [data[k] for k in group]
             evidence = np.array([one.evidence for one in some])
             there = np.reshape([one.T_world_object for one in some], (-1, 4, 4))
-            likely = np.array([evidence + one.expectation(there) for one in frames])
+            likely = np.array([evidence + one.log_densities(there) for one in frames])
             for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
                 poses = some[j].T_world_object, some[j].rival
-                found[group[i]] = tuple([Start(T, frames[i].close) for T in poses if T is not None])
+                found[group[i]] = tuple(
+                    [Start(T, frames[i].close_uncertainty) for T in poses if T is not None]
+                )
         return found
 
     def _all_from(self, starts: Mapping[int, Starts]) -> None:
@@ -143,7 +145,7 @@ class Sharing:
             self.claimed = before + [
                 k
                 for k, one in self.found.items()
-                if k not in before and is_there(one.frame, one.ranked)
+                if k not in before and is_convincing(one.frame, one.ranked)
             ]
             claims = self._claims()
             changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
@@ -225,7 +227,7 @@ class Sharing:
 
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
-        data = self._frame(k, left, track, beside=self._companion(k))
+        data = self._frame(k, left, track, companion_prediction=self._companion(k))
         coasting = self.bodies[k].rules.motion.coasting
         # bodies that are there are not held up: others in turn, what nobody saw yet the seldomer
         # the longer that lasts
@@ -242,7 +244,7 @@ class Sharing:
         around = predicted(data, [])
         near = tuple(one for one in around if not track.misses or self._is_near(data, one))
         found = self._from(k, data, near, left)
-        if is_there(found.frame, found.ranked):
+        if is_convincing(found.frame, found.ranked):
             return found
         return _as_rivals(found, self._from(k, data, self._shown_of(k), left))
 
@@ -266,16 +268,18 @@ class Sharing:
         claims = self._nobody.taken(met).without_merged(met, places, self.rules)
         are_fitted = -2 in claims.owners
         for k, one in self.found.items():
-            beside, changed = one.frame.beside, one.left ^ (left := claims.left(k))
+            beside, changed = one.frame.companion_prediction, one.left ^ (left := claims.left(k))
             is_changed = bool(changed.any())
             if k in places and one.verdict.status == "ok":
                 # what is gone from around a body makes clutter a little less likely
                 is_changed = is_changed and self._are_near(k, changed, places[k])
-            elif beside is None and one.frame.is_found_at_once:
+            elif beside is None and one.frame.has_triangulated_start:
                 # bodies that were found at once tell where each other is
                 beside = self._companion(k)
-            if is_changed or beside is not one.frame.beside:
-                data = self._frame(k, left, beside=beside, searches=one.frame.searches)
+            if is_changed or beside is not one.frame.companion_prediction:
+                data = self._frame(
+                    k, left, companion_prediction=beside, searches=one.frame.searches
+                )
                 data = weighed_at(data, one.ranked[0]) if one.ranked else data
                 self.found[k] = Explanation(
                     data, left, judged_again(data, one.ranked, fitted=are_fitted)
@@ -366,7 +370,9 @@ def climbed_together(
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
     begun = {
-        k: replace(one, drawn=matched_objective(one.views, one.body, one.sigmas, shared=shared))
+        k: replace(
+            one, precomputed=matched_objective(one.views, one.body, one.sigmas, shared=shared)
+        )
         for k, one in frames.items()
     }
     some = {
@@ -379,7 +385,7 @@ def climbed_together(
     first, poses = begun[min(some)], [one.starts[0].T_world_object for one in some.values()]
     climbs = fit_together([one.finest for one in some.values()], poses, first.free, first.rules.fit)
     found = {k: end for k, end in zip(some, climbs, strict=True) if end is not None}
-    begun |= {k: replace(begun[k], drawn=objective) for k, (objective, _) in found.items()}
+    begun |= {k: replace(begun[k], precomputed=objective) for k, (objective, _) in found.items()}
     return begun, {k: ascent for k, (_, ascent) in found.items()}
 
 
@@ -399,6 +405,6 @@ def begun_together(frames: Mapping[int, Frame], ends: Mapping[int, Ascent]) -> d
     first = frames[min(fits)]
     poses = judge_together(cases, first.free, first.rules.judgement)
     return {
-        k: replace(frames[k], together=(starts[k], fit, pose))
+        k: replace(frames[k], joint_fit=(starts[k], fit, pose))
         for (k, fit), pose in zip(fits.items(), poses, strict=True)
     }

@@ -55,13 +55,13 @@ def with_second(verdict: Verdict, data: Frame, rest: SeenTogether) -> Verdict:
             kept = [*((one, weight / 2) for one, weight in verdict.kept), (apart, 0.5)]
             return contradicted(data, replace(verdict, kept=kept))
         verdict = replace(verdict, tried=_most_tried(data, others))
-    accepted, known = data.rules.acceptance, data.other_at(best.T_world_object)
+    accepted, known = data.rules.acceptance, data.log_odds_other_at(best.T_world_object)
     # how likely it is there: frames that show little of it tell against it, and none for ever
     second, odds = _where_it_was(data, best, rest), -math.inf
     if second is not None:
-        odds = min(data.track.twice + second.log_evidence, -accepted.log_doubt)
-    is_there = second is not None and is_sure(second, data.free, accepted)
-    if not is_there and _is_due(data, best, rest.views):
+        odds = min(data.track.log_odds_twice + second.log_evidence, -accepted.log_doubt)
+    is_convincing = second is not None and is_sure(second, data.free, accepted)
+    if not is_convincing and _is_due(data, best, rest.views):
         tried = {**verdict.tried, **_most_tried(data, rest.views)}
         verdict, found = replace(verdict, tried=tried), _second_pose(data, best, rest)
         if found is not None:
@@ -100,7 +100,7 @@ def _decided_beside(second: ScoredPose, data: Frame, rest: SeenTogether, is_imag
     """
     mistaken = {name: told for name, told in data.track.mistaken.items() if name != MIRRORED}
     track = replace(data.track, mistaken=mistaken)
-    seen = data.seen_otherwise(views=rest.views, still=(), starts=(), track=track)
+    seen = data.changed(views=rest.views, static_views=(), starts=(), track=track)
     told = decided(seen, [second])
     return told.without(IN_A_MIRROR) if is_image else told
 
@@ -123,7 +123,7 @@ def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
     """What a pose leaves of a frame; views without single detections leave nothing."""
     numbers = dict(zip(pose.matches.names, pose.matches.detections, strict=True))
     rest = []
-    for view in data.still or data.views:
+    for view in data.static_views or data.views:
         points = view.observation.points
         is_left = np.ones(0 if points is None else len(points), dtype=np.bool_)
         # what a sensor that is left out meets, it meets by chance
@@ -218,7 +218,7 @@ def _second_pose(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPos
     Where sensors agree about that one, they do about this one.
     """
     agree = min(int(np.count_nonzero(best.used.met)), 2)
-    alone = data.alone(views=rest.views, still=(), starts=())
+    alone = data.alone(views=rest.views, static_views=(), starts=())
     for pose in _poses(alone, rest):
         least = data.rules.acceptance.log_doubt
         is_likely = _more_missed(best, pose, data) > least or mirrored(data, best, pose)[0] > -least
@@ -261,7 +261,7 @@ def _sure_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
 
     Where they see nothing of the best one, nobody knows which of the two is out of step.
     """
-    alone = data.alone(views=views, still=(), starts=()).seen_otherwise(options=data.options)
+    alone = data.alone(views=views, static_views=(), starts=()).changed(options=data.options)
     together = SeenTogether(views, data.rules.judgement, data.rules.search)
     for pose in _poses(alone, together):
         if is_sure(pose, data.free, data.rules.acceptance):
@@ -271,17 +271,17 @@ def _sure_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
 
 def _where_it_was(data: Frame, best: ScoredPose, rest: SeenTogether) -> ScoredPose | None:
     """The second pose of the frame before, in this one."""
-    if data.track.twice == -math.inf or not rest.views:
+    if data.track.log_odds_twice == -math.inf or not rest.views:
         return None
     if (start := next(_elsewhere(data, best), None)) is None:
         return None
-    likelihood = likelihood_of(data.seen_otherwise(views=rest.views, still=(), starts=()))
+    likelihood = likelihood_of(data.changed(views=rest.views, static_views=(), starts=()))
     return likelihood.judge(likelihood.fit(start), start)
 
 
 def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
     """Where else than at the best pose the body is expected, be it right beside it."""
-    own = data.before(best.T_world_object)
+    own = data.predecessor(best.T_world_object)
     for branch in data.predictions:
         if branch is not own:
             yield Start(branch.T_world_object, branch.uncertainty)
@@ -296,5 +296,5 @@ def _poses(alone: Frame, rest: SeenTogether) -> Iterator[ScoredPose]:
     else:
         found = candidates_of(alone)
     for one in found[: alone.rules.proposals.seconds]:
-        start = Start(one.T_world_object, alone.close)
+        start = Start(one.T_world_object, alone.close_uncertainty)
         yield likelihood.judge(likelihood.fit(start), start)
