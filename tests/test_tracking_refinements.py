@@ -29,7 +29,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.refinements import (
-    _carry,
+    _has_leverage,
     _paired,
     agreed,
     all_near,
@@ -286,7 +286,7 @@ def test_others_are_asked_where_spots_that_are_off_can_carry_them(
         noise = np.sqrt(data.variances)[:, None, None]
         J, offsets = used.J / noise[..., None], used.offsets / noise
         met = J[used.shares > 0]
-        assert _carry(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
+        assert _has_leverage(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
 
 
 def test_a_sensor_that_meets_one_of_eight_beside_others_may_meet_it_by_chance(

@@ -59,7 +59,7 @@ MUTANTS = (
     Mutant(
         "tracking-one-more-than-count-is-no-surprise",
         "tracking/sharing.py",
-        "lacking = {id(one.body) for k, one in enumerate(self.bodies) if k not in self.claimed}",
+        "lacking = {kind for k, kind in enumerate(kinds) if k not in self.claimed}",
         "lacking = {id(one.body) for one in self.bodies if one.instance is not None}",
         "an unknown thing is followed in place of one of two equal bodies that leaves",
         ("test_tracking_twin.py",),
@@ -123,8 +123,8 @@ MUTANTS = (
     Mutant(
         "tracking-a-second-pose-however-far-off",
         "tracking/twin.py",
-        "told_by = odds, _more_missed(best, second, data), farther, elsewhere",
-        "told_by = odds, _more_missed(best, second, data), elsewhere",
+        "reasons = odds, _more_missed(best, second, data), farther, elsewhere",
+        "reasons = odds, _more_missed(best, second, data), elsewhere",
         "an unknown tool with three markers alike is taken for a second body",
         ("test_tracking_twin.py",),
     ),

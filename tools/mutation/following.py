@@ -196,7 +196,7 @@ _GATING = (
     Mutant(
         "tracking-windows-for-ever",
         "tracking/scene.py",
-        "in_turn = any(one.is_in_turn(frame, self.scene.rules.thorough) for one in tracks)",
+        "in_turn = any(track.is_in_turn(frame, self.scene.rules.thorough) for track in tracks)",
         "in_turn = False",
         "what enters the view elsewhere is never seen",
         ("test_runner_windows.py",),
@@ -336,8 +336,8 @@ _SHARING = (
     Mutant(
         "tracking-merged-spots-stay-with-one-body",
         "tracking/claims.py",
-        "owners[loose[near]] = -2",
-        "owners[loose[near]] = k",
+        "owners[loose[is_near]] = -2",
+        "owners[loose[is_near]] = k",
         "a spot that is two bodies' pulls at one of them",
         ("test_several_bodies_scene.py",),
     ),

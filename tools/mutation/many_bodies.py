@@ -149,7 +149,7 @@ MUTANTS = (
     Mutant(
         "tracking-those-away-are-sought-in-every-frame",
         "tracking/sharing.py",
-        "if not self.looked or is_due:",
+        "if not self.points_searched or is_due:",
         "if True:",
         "bodies that are there wait for those that are not",
         (_SCENE,),

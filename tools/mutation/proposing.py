@@ -101,7 +101,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "more = best.log_evidence - told",
+        "more = best.log_evidence - evidence",
         "more = 0.0",
         "another body that looks alike to one camera is ok after a frame or two",
         (_STARTS,),
@@ -173,7 +173,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers.py",
-        "yield frame.rival(best, there, frame.close_uncertainty, T_moved=moved, left_out=out)",
+        "yield frame.rival(best, T_alike, frame.close_uncertainty, T_moved=moved, left_out=out)",
         "yield Start(poses[0], frame.close_uncertainty, T_moved=moved)",
         "a chessboard is followed a square off",
         (_STARTS,),
@@ -181,8 +181,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-along-the-world",
         "tracking/proposers.py",
-        "(T @ one.T_body_other for one in alike)",
-        "(one.T_body_other @ T for one in alike)",
+        "(T @ part.T_body_other for part in alike)",
+        "(part.T_body_other @ T for part in alike)",
         "a chessboard that is turned is followed a square off",
         (_STARTS,),
     ),
@@ -197,8 +197,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers.py",
-        "for one in (*likely, frame.companion_prediction)",
-        "for one in (*likely[:1], frame.companion_prediction)",
+        "for branch in (*likely, frame.companion_prediction)",
+        "for branch in (*likely[:1], frame.companion_prediction)",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),
@@ -272,7 +272,8 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            near = max([_evidence(there, one) for one in starts]) - own",
+        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
+        "body_evidence",
         "            near = -math.inf",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
@@ -280,7 +281,8 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            near = max([_evidence(there, one) for one in starts]) - own",
+        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
+        "body_evidence",
         "            near = 9.0",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),
@@ -296,7 +298,8 @@ _REFLECTION = (
     Mutant(
         "tracking-a-body-given-mirrored-passes",
         "tracking/doubt.py",
-        "    return next((odds for odds in found if odds > likely), near if asked else -math.inf)",
+        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
+        "-math.inf)",
         "    return -math.inf",
         "few markers of a body given mirrored are met by chance, and the pose is ok",
         ("test_tracking_reflection.py",),
@@ -304,16 +307,17 @@ _REFLECTION = (
     Mutant(
         "tracking-nothing-tells-against-a-mirrored-body",
         "tracking/doubt.py",
-        "if one.log_odds > 0 or one.name == MIRRORED",
-        "if one.log_odds > 0",
+        "if mistake.log_odds > 0 or mistake.name == MIRRORED",
+        "if mistake.log_odds > 0",
         "frames whose markers are hidden are ambiguous, though others showed the body itself",
         ("test_tracking_reflection.py",),
     ),
     Mutant(
         "tracking-few-markers-are-a-mirror-image",
         "tracking/doubt.py",
-        "    return next((odds for odds in found if odds > likely), near if asked else -math.inf)",
-        "    return next((9.0 for odds in found), -math.inf)",
+        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
+        "-math.inf)",
+        "    return next((9.0 for odds in log_odds), -math.inf)",
         "a body whose markers are hidden beside false points is never sure",
         ("test_tracking_reflection.py",),
     ),

@@ -34,8 +34,8 @@ MUTANTS = (
     Mutant(
         "tracking-sensors-are-not-asked-each-alone",
         "tracking/twin.py",
-        "if (apart := _sure_by(data, others)) is not None:",
-        "if (apart := None) is not None:",
+        "if (contrary := _sure_by(data, others)) is not None:",
+        "if (contrary := None) is not None:",
         "of two cameras one shows an old frame, and is ok",
         (_RIVALS,),
     ),
@@ -106,7 +106,7 @@ MUTANTS = (
     Mutant(
         "tracking-contradictions-of-second-poses-are-forgotten",
         "tracking/doubt.py",
-        "mistaken = {**mistaken, CONTRADICTION: _as_likely_as_not(data)}",
+        "mistaken = {**mistaken, CONTRADICTION: _even_odds(data)}",
         "mistaken = {**mistaken}",
         "the same, where the other camera was asked alone",
         (_RIVALS,),
@@ -162,7 +162,7 @@ MUTANTS = (
     Mutant(
         "tracking-second-poses-may-be-off",
         "tracking/twin.py",
-        "return (spots[1] - spots[0]) * _of_one_cut(data)",
+        "return (spots[1] - spots[0]) * _log_cut(data)",
         "return 0.0",
         "what differs from the body by a marker makes frames ambiguous, or is it once that is cut",
         ("test_tracking_twin.py",),
@@ -170,8 +170,8 @@ MUTANTS = (
     Mutant(
         "tracking-what-told-two-poses-apart-is-forgotten",
         "tracking/twin.py",
-        "is_told = is_image or elsewhere < accepted.log_doubt",
-        "is_told = is_image",
+        "is_decided = is_image or elsewhere < accepted.log_doubt",
+        "is_decided = is_image",
         "the same, where two of the body's markers are hidden later",
         ("test_tracking_twin.py",),
     ),

@@ -84,7 +84,7 @@ MUTANTS = (
     Mutant(
         "tracking-tilts-are-images-of-one-another",
         "tracking/doubt.py",
-        "        if _meet_the_same(one, other):\n            continue\n",
+        "        if _are_alike(first, second):\n            continue\n",
         "",
         "of two tilts of a small flat body the right one is dropped, and the wrong one is ok",
         (_TWIN, _TILTS),
@@ -100,15 +100,15 @@ MUTANTS = (
     Mutant(
         "tracking-far-off-is-met",
         "tracking/proposers.py",
-        "return close < rules.acceptance.convincing or not (",
-        "return close < 0 or not (",
+        "return share < rules.acceptance.convincing or not (",
+        "return share < 0 or not (",
         "a ring is believed a seventh of a turn off, where it meets half of its points by chance",
         (_PROPOSERS,),
     ),
     Mutant(
         "tracking-cameras-side-by-side-tell-tilts",
         "tracking/proposers.py",
-        "if np.linalg.norm(away) < math.cos(frame.rules.look_alikes.aside):",
+        "if np.linalg.norm(axis) < math.cos(frame.rules.look_alikes.aside):",
         "if len(views) > 1:",
         "two cameras beside one another follow a flat body that is tilted the other way",
         (_PROPOSERS,),
