@@ -229,7 +229,7 @@ def test_a_course_goes_on_by_its_derivatives_and_spreads_by_what_jerk_may_do() -
     course = replace(
         course, means=course.means + state, covariances=np.zeros_like(course.covariances)
     )
-    means, covariances = course._foretold(seconds)
+    means, covariances = course._predicted(seconds)
     t = seconds
     taylor = [
         1 + 2 * t + 3 * t**2 / 2 + 4 * t**3 / 6,

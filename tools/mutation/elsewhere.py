@@ -27,7 +27,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-met-however-far-off",
         "tracking/ranges.py",
-        "ahead = float((found.most - spare / 2 - found.log_odds)[0])",
+        "ahead = float((sums.most - residual_degrees / 2 - sums.log_odds)[0])",
         "ahead = 0.0",
         "a body that is elsewhere is not looked for where it hardly meets anything",
         (_RANGES,),

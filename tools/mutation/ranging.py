@@ -18,7 +18,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-any-clutter",
         "tracking/ranges.py",
-        "false = np.maximum(found - probability * expected, 1 - probability)",
+        "false = np.maximum(M - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
         (_RANGES,),
@@ -138,8 +138,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-few-are-too-few",
         "tracking/ranges.py",
-        "spare = np.maximum(found.reached - count, 0.0)",
-        "spare = found.reached - count",
+        "residual_degrees = np.maximum(sums.reached - count, 0.0)",
+        "residual_degrees = sums.reached - count",
         "fewer ranges than directions are searched again in every frame",
         (_MAXIMA,),
     ),

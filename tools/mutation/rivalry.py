@@ -18,7 +18,7 @@ MUTANTS = (
     Mutant(
         "tracking-a-row-too-many-is-chance",
         "tracking/rivals.py",
-        "max(_of_more_than_told(data, rival, best), 0.0)",
+        "max(_of_more_features(data, rival, best), 0.0)",
         "0.0",
         "of a board with a row more than told the row that is met closer is ok",
         (_RIVALS,),

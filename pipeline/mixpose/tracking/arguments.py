@@ -41,9 +41,11 @@ def require_valid(views: Sequence[View], model: Body) -> None:
         raise ValueError(f"view {min(doubled)!r}: given twice; allowed: a name of its own for each")
     for view in views:
         where, sensor = f"view {view.name!r}", view.sensor
-        found, allowed = view.observation.dimension, sensor.dimension
-        if found != allowed:
-            raise ValueError(f"{where}: features of {found} coordinates; its sensor has {allowed}")
+        dimension, allowed = view.observation.dimension, sensor.dimension
+        if dimension != allowed:
+            raise ValueError(
+                f"{where}: features of {dimension} coordinates; its sensor has {allowed}"
+            )
         for name, shape in (("camera_matrix", (3, 3)), ("position", (3,))):
             if hasattr(sensor, name):
                 _require(getattr(sensor, name), shape, f"{where}, {name} of its sensor")
@@ -55,5 +57,5 @@ def _require(values: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise a ValueError unless an array is finite and of a shape."""
     array = np.asarray(values, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        found = f"shape {array.shape}" if array.shape != shape else "NaN or infinity"
-        raise ValueError(f"{what}: found {found}; allowed: finite numbers of shape {shape}")
+        actual = f"shape {array.shape}" if array.shape != shape else "NaN or infinity"
+        raise ValueError(f"{what}: found {actual}; allowed: finite numbers of shape {shape}")

@@ -118,7 +118,7 @@ def _are_alike(a: ScoredPose, b: ScoredPose) -> bool:
     if a.matches.names != b.matches.names:
         return False
     pairs = zip(a.matches.detections, b.matches.detections, strict=True)
-    shared = sum(np.isin(own[own >= 0], other).sum() for own, other in pairs)
+    shared = sum(np.isin(first[first >= 0], second).sum() for first, second in pairs)
     return bool(shared >= 0.5 * np.count_nonzero(a.matches.detections >= 0))
 
 

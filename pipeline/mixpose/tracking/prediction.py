@@ -1,4 +1,4 @@
-"""Poses of a little later than the last frame, for what shows or steers something."""
+"""Predict poses shortly after the last frame, for programs that show or steer something."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mixpose.tracking.motion import MotionFilter, MotionRules
 
 @dataclass(frozen=True)
 class PosePredictor:
-    """A body as its poses so far let it go on: the state of a prediction.
+    """The state of predicting the poses of a body.
 
-    Each coordinate is followed by `mixpose.tracking.motion.Course`, whose filters take the
+    Each coordinate is followed by `mixpose.tracking.motion.MotionFilter`, whose filters take the
     velocity, and how steady it is, from the poses and their covariances.
     """
 
@@ -28,7 +28,7 @@ class PosePredictor:
     motion_filter: MotionFilter | None = None
 
     def after(self, estimate: Estimate) -> PosePredictor:
-        """The state after one more estimate of the body; a lost one changes nothing.
+        """Return the state after one more estimate of the body; a lost one changes nothing.
 
         Raises
         ------
@@ -53,15 +53,15 @@ class PosePredictor:
         return replace(self, T_world_object=T, time_s=time_s, motion_filter=course)
 
     def ahead(self, estimate: Estimate, seconds: float) -> Estimate:
-        """The estimate that this is the state after, some seconds later.
+        """Return the estimate that led to this state, moved some seconds ahead.
 
-        The covariance is that of the estimate, and what the velocity and its changes add to it in
-        that time.  Directions that are not estimated stay as they are.  Hypotheses are of the
-        frame alone and left out; a lost frame stays lost.
+        The covariance is that of the estimate plus the effect of the velocity and its changes in
+        that time.  Directions that are not estimated stay.  Hypotheses belong to the frame alone
+        and are left out; a lost frame stays lost.
         """
         T, covariance, course = estimate.T_world_object, estimate.covariance, self.motion_filter
         later = None if estimate.time_s is None else estimate.time_s + seconds
-        # features were measured then, and not there
+        # points were measured at the frame's own time
         estimate = replace(estimate, time_s=later, hypotheses=(), points={})
         if T is None or covariance is None or course is None:
             return estimate

@@ -149,7 +149,7 @@ def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     errors, count = data.rules.judgement.noise.errors, int(np.count_nonzero(data.free))
     noise = dict(zip(best.used.names, best.variances.tolist()))
     pairs = zip(second.used.names, second.variances.tolist(), strict=True)
-    known = np.array([noise.get(name, own) for name, own in pairs])
+    known = np.array([noise.get(name, variance) for name, variance in pairs])
     likely, likeliest = (
         log_likelihood(errors.blur * np.sqrt(variances), second.used, count, errors)
         for variances in (known, second.variances)
