@@ -25,7 +25,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.proposers import predicted, within
 from mixpose.tracking.ranges import AssociationLikelihood, sum_associations
-from mixpose.tracking.rivals import odds_beside
+from mixpose.tracking.rivals import log_odds_against
 
 Floats = NDArray[np.float64]
 SIGMA = 0.02
@@ -128,7 +128,7 @@ def test_what_frames_tell_of_two_maxima_adds_up() -> None:
     assert len(data.predictions) > 1
     assert len(rivals) > 1
     for one in rivals:
-        assert odds_beside(data, one, best) == ahead(one, best)
+        assert log_odds_against(data, one, best) == ahead(one, best)
 
 
 def test_starts_that_lead_to_one_maximum_are_one_and_far_behind_ones_none() -> None:

@@ -123,8 +123,8 @@ MUTANTS = (
     Mutant(
         "tracking-a-second-pose-however-far-off",
         "tracking/twin.py",
-        "reasons = odds, _more_missed(best, second, data), farther, elsewhere",
-        "reasons = odds, _more_missed(best, second, data), elsewhere",
+        "reasons = odds, _by_misses(best, second, data), farther, elsewhere",
+        "reasons = odds, _by_misses(best, second, data), elsewhere",
         "an unknown tool with three markers alike is taken for a second body",
         ("test_tracking_twin.py",),
     ),

@@ -277,8 +277,8 @@ _SIZES = (
     Mutant(
         "tracking-sizes-alike-whatever-radii-are-told",
         "tracking/sizes.py",
-        "all_scales = _scales(at.J[:, 0], T_world_object, body) * _by_radius(body.node_radii)",
-        "all_scales = _scales(at.J[:, 0], T_world_object, body)",
+        "all_scales = _scales(images.J[:, 0], T_world_object, body) * _by_radius(body.node_radii)",
+        "all_scales = _scales(images.J[:, 0], T_world_object, body)",
         "the small ones among larger spheres seem cut",
         ("test_tracking_sizes.py",),
     ),

@@ -85,7 +85,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-three-markers-of-eight-are-the-body",
         "tracking/doubt.py",
-        "    yield Alternative(FEW, of_other_things(data, best))",
+        "    yield Alternative(FEW, log_odds_other(data, best))",
         "    yield from ()",
         "three markers of another body pass for this one where it was not expected",
         ("test_tracking_doubt.py",),

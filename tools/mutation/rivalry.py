@@ -18,7 +18,7 @@ MUTANTS = (
     Mutant(
         "tracking-a-row-too-many-is-chance",
         "tracking/rivals.py",
-        "max(_of_more_features(data, rival, best), 0.0)",
+        "max(_gain_by_more_features(data, rival, best), 0.0)",
         "0.0",
         "of a board with a row more than told the row that is met closer is ok",
         (_RIVALS,),
@@ -34,7 +34,7 @@ MUTANTS = (
     Mutant(
         "tracking-sensors-are-not-asked-each-alone",
         "tracking/twin.py",
-        "if (contrary := _sure_by(data, others)) is not None:",
+        "if (contrary := _sure_pose_by(data, others)) is not None:",
         "if (contrary := None) is not None:",
         "of two cameras one shows an old frame, and is ok",
         (_RIVALS,),
@@ -65,7 +65,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-covariance-of-the-middle",
-        "tracking/telling.py",
+        "tracking/reporting.py",
         "covariance = covariance_at(covariance, T[:3, :3] @ origin)",
         "covariance_at(covariance, T[:3, :3] @ origin)",
         "a tip that is far from the markers seems to be known as well as they are",

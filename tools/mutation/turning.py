@@ -59,7 +59,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-covariance-of-the-curvature-alone",
-        "tracking/telling.py",
+        "tracking/reporting.py",
         "covariance = with_likely_turns(covariance, *arguments)",
         "with_likely_turns(covariance, *arguments)",
         "ellipsoids of poses hold only what the curvature allows",
@@ -67,7 +67,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-origins-go-straight",
-        "tracking/telling.py",
+        "tracking/reporting.py",
         "return with_wide_turn(covariance, T, data.body.means - origin)",
         "return covariance",
         "the origin of a body that may turn about a line of features is said to be exact",

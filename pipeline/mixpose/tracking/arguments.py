@@ -41,11 +41,9 @@ def require_valid(views: Sequence[View], model: Body) -> None:
         raise ValueError(f"view {min(doubled)!r}: given twice; allowed: a name of its own for each")
     for view in views:
         where, sensor = f"view {view.name!r}", view.sensor
-        dimension, allowed = view.observation.dimension, sensor.dimension
-        if dimension != allowed:
-            raise ValueError(
-                f"{where}: features of {dimension} coordinates; its sensor has {allowed}"
-            )
+        seen, allowed = view.observation.dimension, sensor.dimension
+        if seen != allowed:
+            raise ValueError(f"{where}: features of {seen} coordinates; its sensor has {allowed}")
         for name, shape in (("camera_matrix", (3, 3)), ("position", (3,))):
             if hasattr(sensor, name):
                 _require(getattr(sensor, name), shape, f"{where}, {name} of its sensor")

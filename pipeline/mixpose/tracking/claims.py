@@ -59,12 +59,12 @@ class Claims:
 
     def features(self, body: Body, T_world_object: Floats) -> Floats:
         """Return the places (n, 3) of a body's features in all sensors at a pose."""
-        at = project_body(tuple(view.sensor for view in self.views), body).project(
+        images = project_body(tuple(view.sensor for view in self.views), body).project(
             T_world_object[None]
         )
-        rows, features = np.nonzero(at.seen[:, 0])
+        rows, features = np.nonzero(images.seen[:, 0])
         sigmas = np.array([view.observation.sigma for view in self.views])
-        return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])
+        return places_of(rows, images.y[rows, 0, features] / sigmas[rows, None])
 
     def expected(self, places: Mapping[int, Floats], gate: float) -> Claims:
         """Give each detection to the body of the nearest feature, within `gate` σ_ε."""

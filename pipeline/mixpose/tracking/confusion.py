@@ -61,7 +61,7 @@ def confusions_of(
     confusions = {k: [*instead(k, k)] for k in bests}
     for k, j in permutations(frames, 2):
         if k in bests and j not in sure and frames[k].body is not frames[j].body:
-            confusions[k] += _as_lost(instead(k, j), frames[k], frames[j])
+            confusions[k] += _despite_loss(instead(k, j), frames[k], frames[j])
     for steps in _exchanges(bests, frames, sure, instead):
         against = [instead(*step)[-1] for step in steps]
         log_odds, alone = sum(c.log_odds for c in against), sum(c.alone for c in against)
@@ -70,7 +70,7 @@ def confusions_of(
         for k, j, what in reasons:
             if j in sure:
                 changed = Confusion(what, log_odds, alone, before)
-                confusions[k] += _as_lost([changed], frames[k], frames[j])
+                confusions[k] += _despite_loss([changed], frames[k], frames[j])
     return confusions
 
 
@@ -113,7 +113,7 @@ def _exchanges(
 def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
     """Yield parts of another body, or other parts of its own, that a pose may have met instead."""
     met = met_features(data, best)
-    parts = list(_in_place_of(data, best, met, other))
+    parts = list(_alike_parts(data, best, met, other))
     if not parts:
         return
     T = best.T_world_object
@@ -137,7 +137,7 @@ def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Con
         yield Confusion(part.reason, ahead if is_all else min(ahead, alone), alone)
 
 
-def _in_place_of(
+def _alike_parts(
     data: Frame, best: ScoredPose, met: frozenset[int], other: Frame
 ) -> Iterator[tuple[LookAlike, Floats]]:
     """Yield parts of a body that lie like the features met at a pose, with its pose (4, 4) there.
@@ -149,7 +149,7 @@ def _in_place_of(
         return
     sizes, centre = [1.0], np.zeros(3)
     factor = data.body.radius / other.body.radius
-    if abs(factor - 1) > 1e-9 and (camera_centre := _centre_of_one(data, best)) is not None:
+    if abs(factor - 1) > 1e-9 and (camera_centre := _centre_of_only_camera(data, best)) is not None:
         sizes, centre = [1.0, factor], camera_centre
     for size in sizes:
         body = other.body if size == 1 else of_size(other.body, size)
@@ -162,17 +162,14 @@ def _in_place_of(
 
 
 def _is_open(data: Frame, part: LookAlike, other: Frame) -> bool:
-    """Test whether a marker that another body lacks may be met by chance, for a body in doubt.
-
-    That is one that is new, was away, or doubtful so far.
-    """
+    """Test whether a marker that another body lacks may be met by chance, for a body in doubt."""
     track, rules = data.track, data.rules
     is_new = track.ok_count < rules.proposals.believed or track.misses or track.doubted
     is_doubted = track.confused.get(part.reason, -math.inf) > rules.acceptance.log_doubt
     return other.body is not data.body and bool(is_new or is_doubted)
 
 
-def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
+def _centre_of_only_camera(data: Frame, best: ScoredPose) -> Floats | None:
     """Return the centre of projection (3,) of the camera, if a single one meets a pose."""
     meets = [name for name, met in zip(best.used.names, best.used.met.tolist()) if met]
     if len(meets) != 1:
@@ -183,7 +180,7 @@ def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
     return rays.origins[0] if rays and rays.central and len(rays) else None
 
 
-def _as_lost(against: Sequence[Confusion], first: Frame, second: Frame) -> list[Confusion]:
+def _despite_loss(against: Sequence[Confusion], first: Frame, second: Frame) -> list[Confusion]:
     """Return confusions of two bodies that may be each other, at least even if both were lost."""
     least = math.log(0.5) if first.was_lost and second.was_lost else -math.inf
     return [c._replace(log_odds=max(c.log_odds, min(least, c.alone))) for c in against]

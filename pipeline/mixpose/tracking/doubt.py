@@ -38,9 +38,9 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
-from mixpose.tracking.rivals import odds_beside
+from mixpose.tracking.rivals import log_odds_against
 
 TWICE = (
     "the body seems to be there twice: a mirror image, one more (`count`), or another like it, "
@@ -48,16 +48,16 @@ TWICE = (
 )
 FEW = "few markers are met, which other things may have alike"
 UNSURE = "no frame by itself is sure of the body"
-CONTRADICTION = "one sensor or another"  # by which name it is remembered
+CONTRADICTION = "one sensor or another"  # its name in `Track.mistaken`
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
 
 
-def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
+def decide_frame(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     """Decide about a frame by its poses, the most evident first, with reasons of doubt."""
-    arguments = data.free, data.rules.acceptance, partial(odds_beside, data)
+    arguments = data.free, data.rules.acceptance, partial(log_odds_against, data)
     verdict = decide(ranked, *arguments)
-    if len(verdict.kept) > 1 and (images := _in_mirrors(data, verdict)):
+    if len(verdict.kept) > 1 and (images := _mirror_images(data, verdict)):
         verdict = decide([pose for pose in ranked if pose not in images], *arguments)
     best = verdict.best
     if best is None:
@@ -74,14 +74,11 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     # a sure pose may have rivals for a reason that can be reported
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
-    rules, sensors = (
-        data.rules,
-        {view.name: view.sensor for view in data.static_views or data.views},
-    )
-    tracked = _of_contradiction(data, best), of_reflection(data, best)
+    rules, views = data.rules, data.static_views or data.views
+    tracked = _contradiction_mistake(data, best), reflection_mistake(data, best)
     names = {mistake.name for mistake in tracked}
     before = {name: odds for name, odds in data.track.mistaken.items() if name not in names}
-    known = rules.judgement.noise, sensors, before
+    known = rules.judgement.noise, {view.name: view.sensor for view in views}, before
     mistakes = [*possible_mistakes(best, data.body, data.free, *known), *tracked]
     # a single frame may mislead as rarely as a session is mistaken
     most = _largest_log_odds(data)
@@ -99,8 +96,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
 def _contrast(a: ScoredPose, b: ScoredPose) -> str:
     """Return why two likely poses that meet different detections exclude each other; else empty.
 
-    A body that is there twice is seen twice by some sensor; if each sees it once, a sensor has
-    moved.
+    A body that is there twice is seen twice by some sensor; else a sensor has moved.
     """
     if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
         return ""
@@ -122,13 +118,13 @@ def _are_alike(a: ScoredPose, b: ScoredPose) -> bool:
     return bool(shared >= 0.5 * np.count_nonzero(a.matches.detections >= 0))
 
 
-def _in_mirrors(data: Frame, verdict: Verdict) -> list[ScoredPose]:
+def _mirror_images(data: Frame, verdict: Verdict) -> list[ScoredPose]:
     """Return poses that are mirror images of others."""
     images = list[ScoredPose]()
     for (first, _), (second, _) in combinations(verdict.kept, 2):
         if _are_alike(first, second):
             continue
-        odds, is_first = mirrored(data, first, second)
+        odds, is_first = mirror_odds(data, first, second)
         if odds > -data.rules.acceptance.log_doubt:
             images.append(second if is_first else first)
     return images
@@ -142,8 +138,8 @@ def _alternatives(
     if data.options.mirrors and is_flat(data):
         known = data.log_odds_other_at(best.T_world_object)  # None unless both were seen
         yield Alternative(IN_A_MIRROR, 0.0 if known is None else known)
-    yield Alternative(FEW, of_other_things(data, best))
-    yield Alternative(UNSURE, _of_lasting_chance(best, evidence))
+    yield Alternative(FEW, log_odds_other(data, best))
+    yield Alternative(UNSURE, _log_odds_of_chance(best, evidence))
     # in a scene with mirrors a frame may show either side
     of_image = 0.5 if data.options.mirrors else rules.mistaken
     likely = [of_image if mistake.name == MIRRORED else rules.mistaken for mistake in mistakes]
@@ -155,7 +151,7 @@ def _alternatives(
         yield Alternative(OPEN)
 
 
-def _of_lasting_chance(best: ScoredPose, evidence: float) -> float:
+def _log_odds_of_chance(best: ScoredPose, evidence: float) -> float:
     """Return log odds of clutter that looks like the body in all frames before the first ok one.
 
     `evidence` for the body is that of a frame by itself, or of all that go on from each other.
@@ -189,7 +185,7 @@ def _gained(data: Frame, best: ScoredPose) -> float:
     return max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
 
 
-def of_other_things(data: Frame, judged: ScoredPose) -> float:
+def log_odds_other(data: Frame, judged: ScoredPose) -> float:
     """Return log odds of another thing that has exactly the met features alike.
 
     Three markers are alike if three distances between them are, and so for each further one.  One
@@ -211,7 +207,7 @@ def _largest_log_odds(data: Frame) -> float:
     return 2 * _even_odds(data)
 
 
-def _of_contradiction(data: Frame, judged: ScoredPose) -> Mistake:
+def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """Return the mistake that some sensor is elsewhere or out of step, at even odds.
 
     It begins with a frame in which one sensor alone meets the body and another sees as much
@@ -238,7 +234,7 @@ def _even_odds(data: Frame) -> float:
     return -math.log(data.rules.acceptance.mistaken)
 
 
-def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
+def reflection_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """Return the mistake that the session describes the body's mirror image, with its evidence.
 
     A body is mirrored in all frames or in none, so that the first ones count against it too.  A
@@ -248,13 +244,13 @@ def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
     before = track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
     is_early = track.ok_count < data.rules.proposals.believed
     is_asked = before > 0 or (lasts and is_early and before > -_largest_log_odds(data))
-    odds = _reflected(data, judged, is_asked, before)
-    if odds == -math.inf:  # what is known of it holds
+    odds = _log_odds_reflected(data, judged, is_asked, before)
+    if odds == -math.inf:  # earlier evidence stays
         return Mistake(MIRRORED, MIRRORED, before, -math.inf)
     return Mistake(MIRRORED, MIRRORED, before + odds, 0.0)
 
 
-def _reflected(data: Frame, judged: ScoredPose, is_asked: bool, before: float) -> float:
+def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before: float) -> float:
     """Return log odds of the mirror image by this frame; minus infinity where it is impossible.
 
     An unlikely mirror image is only sought where it `is_asked` for.
@@ -267,12 +263,12 @@ def _reflected(data: Frame, judged: ScoredPose, is_asked: bool, before: float) -
     accepted, met, near = rules.acceptance, seen.met_by, -math.inf
     body_evidence = judged.log_evidence
     likely = accepted.log_doubt - math.log(accepted.mistaken) - before
-    # then the mirror image may meet more detections than the body
+    # missed features beside unmatched detections: a mirror image may meet more than the body
     if is_asked or sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
-        mirror_frame = _of_mirror_image(data, sharp if sharp.sum() >= 3 else met > 0)
-        # no rival meets less than a quarter of what the body meets; values grow as the square
+        mirror_frame = _reflected_frame(data, sharp if sharp.sum() >= 3 else met > 0)
+        # rivals meet at least a quarter of the body's features; values grow as the square
         value = float(data.finest.weights[:, 0] @ seen.explained)
         if is_asked or mirror_frame.finest.value(T) > value / 16:
             # fitted, which may end at clutter; and as it stands, if asked for
@@ -288,7 +284,7 @@ def _reflected(data: Frame, judged: ScoredPose, is_asked: bool, before: float) -
     body_evidence = _evidence(alone, Start(T, left_out=judged.left_out))
     if body_evidence == -math.inf:  # e.g. rolling shutters: without its motion it meets nothing
         return near if is_asked else -math.inf
-    mirror = _of_mirror_image(alone, met >= 0)
+    mirror = _reflected_frame(alone, met >= 0)
     least = body_evidence - rules.search.outdone
     rivals = [rival for rival in candidates_of(mirror) if rival.evidence > least]
     log_odds = (_evidence(mirror, start) - body_evidence for start in starts_at(mirror, rivals))
@@ -315,6 +311,6 @@ def _evidence(data: Frame, start: Start) -> float:
     return likelihood.judge(likelihood.fit(start), start).log_evidence
 
 
-def _of_mirror_image(data: Frame, chosen: Mask) -> Frame:
+def _reflected_frame(data: Frame, chosen: Mask) -> Frame:
     """Return the frame for the body reflected in the plane nearest to some features (N,)."""
     return data.with_body(mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist())))

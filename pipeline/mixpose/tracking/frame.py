@@ -209,8 +209,8 @@ class Frame(Setup):
     def oriented(self, T_world_object: Floats) -> Floats:
         """Return the pose nearest to the reference among those that look the same.
 
-        Without a reference, and where these orientations differ a little, the pose itself: it is
-        the one met most closely.
+        Without a reference, and where these orientations differ a little: the pose itself, as the
+        best met.
         """
         if self.T_reference is None and self.body.asymmetry:
             return T_world_object
@@ -249,10 +249,7 @@ class Frame(Setup):
         return distances
 
     def log_odds_other_at(self, T_world_object: Floats) -> float | None:
-        """Return log odds that another thing is at a pose, by the branch before it.
-
-        None where no other thing was ever seen.
-        """
+        """Return log odds that another thing is at a pose, by its branch; None if none was seen."""
         if all(branch.log_odds_other is None for branch in self.predictions):
             return None
         predecessor = self.predecessor(T_world_object)
@@ -281,7 +278,7 @@ class Frame(Setup):
         frame = self.changed(body=body)
         if self.precomputed is not None:  # its densities may contain detections of other bodies
             return frame
-        # the densities are the same
+        # another body has the same densities
         projection = project_body(self.finest.projection.sensors, body)
         return replace(frame, precomputed=replace(self.finest, projection=projection))
 
@@ -319,7 +316,7 @@ class Frame(Setup):
         )
 
     def expected_velocity(self, T_world_object: Floats, *, seen: bool = True) -> ExpectedVelocity:
-        """Return the velocity expected at a pose, if it was `seen` there with what that says."""
+        """Return the velocity expected at a pose; if that was `seen`, by its displacement too."""
         elapsed, rules = self.track.seconds_until(self.time_s), self.rules.motion
         # nothing seen before: at rest, within what hands can do
         resting = at_rest(self.body, rules)
@@ -337,7 +334,7 @@ class Frame(Setup):
         return branch.motion_filter.expected(moved if seen else None, elapsed)
 
 
-def _moved(
+def _twist_since(
     parent: Branch, expected: Branch, T_world_object: Floats, frame: Frame, alike: Sequence[Floats]
 ) -> tuple[Floats, bool]:
     """Return the twist (6,) to a pose from the one before, and whether that was a look-alike.
@@ -360,10 +357,10 @@ def _moved(
 def spread_in_image(frame: Frame, T_world_object: Floats) -> float:
     """Return the largest deviation of features in view by the body's spread, in σ_ε."""
     projection = frame.finest.projection
-    at = projection.project(T_world_object[None])
+    images = projection.project(T_world_object[None])
     # J has two rows for every sensor; this is a variance per coordinate
-    shares = (2 / projection.dimensions)[:, None] * at.seen[:, 0]
-    variances = shares * in_image(frame.body.node_spreads(T_world_object), at.J[:, 0])
+    shares = (2 / projection.dimensions)[:, None] * images.seen[:, 0]
+    variances = shares * in_image(frame.body.node_spreads(T_world_object), images.J[:, 0])
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 
@@ -389,7 +386,7 @@ def follow(
         if parent is not None and alike is not None:
             ahead = zip(track.branches, frame.predictions, strict=True)
             expected = next(after for before, after in ahead if before is parent)
-            moved, is_other = _moved(parent, expected, T, frame, alike)
+            moved, is_other = _twist_since(parent, expected, T, frame, alike)
             parent = replace(parent, velocity=None, motion_filter=None) if is_other else parent
             if branch.spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)

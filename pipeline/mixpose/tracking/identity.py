@@ -91,7 +91,7 @@ def identify(
     bests = {k: best for k in group if (best := explained[k].verdict.best) is not None}
     finders = sorted(bests, key=lambda k: tuple(np.round(bests[k].T_world_object[:3, 3], 6)))
     poses, frames = [bests[k] for k in finders], [explained[k].frame for k in group]
-    # by body (rows) and pose; the last column: a body in view has no pose now and then
+    # by body (rows) and pose; the last column is for no pose, as when a body in view is missed
     rules, rows = frames[0].rules, list[list[float]]()
     transforms = np.reshape([pose.T_world_object for pose in poses], (-1, 4, 4))
     for frame in frames:

@@ -56,8 +56,7 @@ class Offsets(NamedTuple):
         delay_motions = [rows * (self.sensor == k)[:, None] for k in sensors]
         by_delay = self.by_delay(velocity, sensors)
         design = np.hstack([rows, rows * self.late[:, None], by_delay, *delay_motions])
-        # prior in standard deviations: the velocity minus that expected at the pose after its step,
-        # and the delays
+        # in deviations: the velocity minus that expected at the pose after its step, and delays
         prior = np.eye(design.shape[1])[count:]
         prior[:count, :count] = -np.diag(expected.gain[free])
         prior /= np.concatenate([sigmas, delays, np.outer(delays, sigmas).ravel()])[:, None]
@@ -155,7 +154,7 @@ def offsets_of(
     late, blurs = _seconds(views, matches.places, met), np.ones(len(views))
     if expected is not None:
         model = frame.rules.judgement.noise
-        feature_sigma = _off(views, late, matches.J, met, expected)
+        feature_sigma = _largest_motion(views, late, matches.J, met, expected)
         known = model.memory * frame.track.residuals.of(matches.names)
         _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose found at another velocity is off by as much in all sensors
@@ -176,17 +175,16 @@ def _feature_sigmas(
     frame: Frame, T_world_object: Floats, expected: ExpectedVelocity
 ) -> tuple[float, float]:
     """Return how far features may be off in σ_ε by velocity and delays, and by velocity alone."""
-    at, views = (
-        frame.finest.projection.project(T_world_object[None]),
-        frame.static_views or frame.views,
-    )
-    seen, J = at.weights[:, 0] > 0, at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
-    late = _seconds(views, at.y[:, 0], seen)
-    both = _off(views, late, J, seen, expected)
+    images = frame.finest.projection.project(T_world_object[None])
+    views = frame.static_views or frame.views
+    seen = images.weights[:, 0] > 0
+    J = images.J[:, 0] / np.array(frame.sigmas)[:, None, None, None]
+    late = _seconds(views, images.y[:, 0], seen)
+    both = _largest_motion(views, late, J, seen, expected)
     if all(view.unsure is None for view in views):
         return both, both
     certain = [replace(view, unsure=None) for view in views]
-    return both, _off(certain, late, J, seen, expected)
+    return both, _largest_motion(certain, late, J, seen, expected)
 
 
 def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:
@@ -196,7 +194,7 @@ def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:
     return np.where(seen, seconds, 0.0)
 
 
-def _off(
+def _largest_motion(
     views: Sequence[View], late: Floats, J: Floats, seen: Mask, expected: ExpectedVelocity
 ) -> float:
     """Return how far features (L, N) seen at moments `late` may be off, in σ_ε."""

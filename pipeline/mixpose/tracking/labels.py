@@ -50,8 +50,7 @@ def labelled(
     Returns
     -------
     Estimate
-        With `SensorReport.labels` and `points`.  A detection that two features share measures
-        neither of them.
+        With `SensorReport.labels` and `points`; detections shared by two features measure none.
     """
     offsets, T = estimate.offsets, estimate.T_world_object
     if T is None or not offsets:

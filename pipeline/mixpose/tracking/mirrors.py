@@ -40,7 +40,7 @@ def is_flat(data: Setup) -> bool:
     return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
-def mirrored(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float, bool]:
+def mirror_odds(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float, bool]:
     """Return log odds of a mirror between two poses, and whether `first` is the body.
 
     A second body is as likely as a mirror, before the poses are compared.
@@ -48,7 +48,7 @@ def mirrored(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float,
     a, b, images, body = first.T_world_object, second.T_world_object, [], data.body
     x, rules = transform(a, body.means), data.rules.look_alikes
     cameras = [view.sensor for view in data.views if view.sensor.dimension == 2]
-    for E in _onto_itself(body, rules.alike):
+    for E in _improper_symmetries(body, rules.alike):
         y = transform(b @ E @ inverse(a), x)
         gap = (x - y).mean(axis=0)
         if ((x - y) @ gap).min() <= 0:  # no body reaches through a mirror, unlike other tilts
@@ -65,7 +65,7 @@ def mirrored(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float,
 
 
 @lru_cache(maxsize=64)
-def _onto_itself(body: Body, alike: float) -> tuple[Floats, ...]:
+def _improper_symmetries(body: Body, alike: float) -> tuple[Floats, ...]:
     """Return improper motions (4, 4) that map the body onto itself; none for most bodies.
 
     Features of its mirror image may be off its own by a share `alike` of its radius.
@@ -81,16 +81,13 @@ def _onto_itself(body: Body, alike: float) -> tuple[Floats, ...]:
 
 
 def _log_odds(pose: ScoredPose, image: ScoredPose, E: Floats, body: Body, off: float) -> float:
-    """Return log odds of a mirror between two poses, for a motion E (4, 4) of the body onto itself.
-
-    The mirror is `off` a plane, in radii and radians.
-    """
+    """Return log odds of a mirror by two poses; E (4, 4) maps the body onto itself."""
     steps = _STEP * np.diag(np.repeat([body.radius, 1.0], 3))
     a, b = pose.T_world_object[None], image.T_world_object[None]
     resting = np.repeat(a, 6, axis=0), np.repeat(b, 6, axis=0)
     first = np.concatenate([a, perturb(a, steps), resting[0]])
     second = np.concatenate([b, resting[1], perturb(b, steps)])
-    seen, apart = _improper(first, second, E, body.means.mean(axis=0))
+    seen, apart = _turn_and_shift(first, second, E, body.means.mean(axis=0))
     J = (seen[1:] - seen[0]).T / np.tile(steps.diagonal(), 2)
     C = J[:, :6] @ pose.covariance @ J[:, :6].T + J[:, 6:] @ image.covariance @ J[:, 6:].T
     C += np.diag(np.square(off * np.array([1.0, body.radius, body.radius])))
@@ -99,7 +96,7 @@ def _log_odds(pose: ScoredPose, image: ScoredPose, E: Floats, body: Body, off: f
     return log_density + math.log(2 * math.pi * math.pi * apart**2)
 
 
-def _improper(a: Floats, b: Floats, E: Floats, centre: Floats) -> tuple[Floats, float]:
+def _turn_and_shift(a: Floats, b: Floats, E: Floats, centre: Floats) -> tuple[Floats, float]:
     """Return the turn and the shift (K, 3) from poses a to b (K, 4, 4), beside a reflection.
 
     Also return the distance between the two places of the body.

@@ -165,8 +165,8 @@ class MotionFilter:
     """The motion of a body, relative to its last pose, by a bank of Kalman filters.
 
     Each coordinate of the pose has its first three derivatives, of which the last takes a random
-    walk.  Filters from very steady to very sudden motion run side by side, weighted by how well
-    they predicted the last poses.
+    walk.  Filters from very steady to very sudden motion run side by side, weighted by their
+    predictions.
     """
 
     means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F filters

@@ -106,7 +106,7 @@ def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
         return True
     if pose.gained < rules.proposals.fallen * frame.track.gained:
         return True
-    # much is met far off; or anything at an unexpected pose
+    # much is met far off; or at an unexpected pose anything
     share = _close(frame, pose)
     is_all = share * pose.coverage >= 1
     return share < rules.acceptance.convincing or not (
@@ -173,8 +173,7 @@ def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> li
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    # of many features those far from one another
-    sparse_body = sparse(frame.body, 8 * frame.rules.search.sample)
+    sparse_body = sparse(frame.body, 8 * frame.rules.search.sample)  # some features, far apart
     descent = Descent(frame.views, sparse_body, frame.free, frame.rules.search)
     poses = np.concatenate([T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, kept), *stages])
@@ -240,7 +239,7 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
         for start in _as_evident(frame, ranked[0]):
             yield start
             if ranked[0].log_evidence > most + behind:
-                break  # the remaining starts are rivals of a pose that is none
+                break  # the remaining starts are rivals of the pose before
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
     if ranked and frame.T_reference is None and frame.body.asymmetry:
@@ -315,14 +314,14 @@ def _near_any(frame: Frame, poses: Floats) -> Floats:
 
     The root of the sum of squares over sensors, like the objective's value.
     """
-    at = frame.finest.projection.project(poses)
-    near = at.seen.copy()
+    images = frame.finest.projection.project(poses)
+    near = images.seen.copy()
     for k, (view, variance) in enumerate(zip(frame.views, frame.finest.variances[:, 0])):
         points, m = view.observation.points, view.sensor.dimension
         if points is not None:
             reach = DRAWING.reach * np.sqrt(variance)
-            distances, _ = cKDTree(points).query(at.y[k, ..., :m], distance_upper_bound=reach)
-            near[k] &= np.isfinite(distances)
+            away, _ = cKDTree(points).query(images.y[k, ..., :m], distance_upper_bound=reach)
+            near[k] &= np.isfinite(away)
     return np.asarray(np.linalg.norm(near.sum(axis=2), axis=0))
 
 

@@ -7,9 +7,8 @@ sensor, every association λ gives each feature at most one detection and the re
     L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
 
 c being the expected number of false detections and W the room they have.  It has many maxima, also
-within the prior of the track.  The evidence of single frames for each adds up: all maxima that a
-further frame may make likely are followed, and what the best leaves unexplained counts for a better
-one that no search has found yet.
+within the prior of the track.  Their evidence adds up over frames: all maxima that a further frame
+may make likely are followed.  What the best leaves unexplained counts for one not found so far.
 """
 
 from __future__ import annotations
@@ -85,10 +84,10 @@ def sum_associations(
     detected = np.zeros(is_range.shape)  # padded to one width
     detected[is_range] = np.concatenate(ranges)
     sigma = np.array([[view.observation.sigma] for view in views])
-    at = project_body(tuple(view.sensor for view in views), body).project(poses)
-    J, offsets = at.J[..., 0, :], detected[:, None, None] - at.y[..., :1]
+    images = project_body(tuple(view.sensor for view in views), body).project(poses)
+    J, offsets = images.J[..., 0, :], detected[:, None, None] - images.y[..., :1]
     probability, M = detection.probability, counts[:, None]
-    expected = at.seen.sum(axis=2)
+    expected = images.seen.sum(axis=2)
     false = np.maximum(M - probability * expected, 1 - probability)
     room = np.maximum(2 * detection.room * body.radius, 20 * sigma)
     missed = expected * np.log(1 - probability) + M * np.log(false / M) + M - false
@@ -98,8 +97,8 @@ def sum_associations(
     reached = np.minimum(expected, M)
     peak = np.log(ratio / (np.sqrt(2 * np.pi) * noise * sigma))
     odds *= ratio[..., None, None]
-    odds *= at.seen[..., None] & is_range[:, None, None]
-    total, shares = _summed(odds.reshape(-1, *odds.shape[2:]))
+    odds *= images.seen[..., None] & is_range[:, None, None]
+    total, shares = _sum_and_shares(odds.reshape(-1, *odds.shape[2:]))
     shares = shares.reshape(odds.shape)
     weights = shares / error**2
     pulls = weights * offsets
@@ -124,11 +123,10 @@ def _squares(weights: Floats, J: Floats) -> Floats:
     return np.asarray(rows.swapaxes(1, 2) @ weighed)
 
 
-def _summed(odds: Floats) -> tuple[Floats, Floats]:
+def _sum_and_shares(odds: Floats) -> tuple[Floats, Floats]:
     """Return the sum over associations (H,) and probabilities of pairs, of odds (H, n, M).
 
-    Forward over detections, `taken` holds the odds that each subset of features is taken so far;
-    then backward.
+    Over detections, `taken` has the odds that each subset of features is taken; then backward.
     """
     count, n, M = odds.shape
     subsets = np.arange(2**n)
@@ -167,7 +165,7 @@ class AssociationTerm:
         frame, free = self.frame, self.frame.free
         error = self.noise * min(frame.sigmas)
         arm = float(np.linalg.norm(frame.body.means, axis=1).max())
-        # steps that move ranges by a hundredth of their error: half of the digits are left
+        # steps that move ranges by a hundredth of their error keep half of the digits
         scale = 0.01 * np.repeat([error, error / max(arm, error)], 3)[free]
         steps = scale[:, None] * np.eye(6)[free]
         twists = np.vstack([np.zeros(6), steps, -steps])
@@ -176,9 +174,9 @@ class AssociationTerm:
         here, ahead, behind = np.split(gradients, [1, 1 + len(steps)], axis=1)
         H = np.zeros((len(poses), 6, 6))
         H[:, free] = (behind - ahead) / (2 * scale[:, None])
-        at = slice(None, None, len(twists))
+        pose_rows = slice(None, None, len(twists))
         H = (H + H.swapaxes(1, 2)) / 2
-        return Quadratic(sums.log_odds[at], here[:, 0], sums.information[at], H)
+        return Quadratic(sums.log_odds[pose_rows], here[:, 0], sums.information[pose_rows], H)
 
     def _sum(self, poses: Floats) -> AssociationSum:
         frame = self.frame
@@ -322,7 +320,7 @@ class AssociationLikelihood:
         remaining = A - np.einsum("ljn,lnk,lnq->ljkq", pairs, J, J)[met]
         are_fixed = np.linalg.eigvalsh(remaining)[:, 0] > 0
         pulls, remaining = pulls[are_fixed], remaining[are_fixed]
-        twists = np.zeros((len(pulls) + 1, 6))  # the first stays
+        twists = np.zeros((len(pulls) + 1, 6))  # the first is the pose itself
         twists[1:, free] = -np.linalg.solve(remaining, pulls[..., None])[..., 0]
         posterior = self._posterior(self._noise, second=False)
         values = posterior.linearise(perturb(T[None], twists)).value

@@ -37,13 +37,10 @@ def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> 
         return
     rules, seen = frame.rules.acceptance, judged.matches
     if apart := disagreeing(seen, rules, frame.rules.judgement.noise):
-        yield Start(
-            judged.T_world_object,
-            frame.close_uncertainty,
-            left_out=dict.fromkeys(apart, OUT_OF_STEP),
-        )
-    elif chance := by_chance(seen, rules):
-        left_out = dict.fromkeys(chance, BY_CHANCE)
+        left_out = dict.fromkeys(apart, OUT_OF_STEP)
+    else:
+        left_out = dict.fromkeys(by_chance(seen, rules), BY_CHANCE)
+    if left_out:
         yield Start(judged.T_world_object, frame.close_uncertainty, left_out=left_out)
 
 
@@ -62,8 +59,8 @@ def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
 def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
     """Return sensors that see the body elsewhere than two or more others do.
 
-    They meet little of it beside as many unmatched detections, or have residuals larger than those
-    of the others by more than chance.
+    They meet little of it beside as many unmatched detections, or have residuals too large by
+    chance.
     """
     summed = seen.summed
     agreeing = seen.covered >= rules.agreeing
@@ -128,8 +125,8 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matc
         counts = (detections[:, None] == detections).sum(axis=1)
         met = np.flatnonzero((detections >= 0) & (counts == 1))
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
-        away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
-        squared = (away * away).sum(axis=2) / 2
+        gaps = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
+        squared = (gaps * gaps).sum(axis=2) / 2
         # centres of two touching disks are √2 times as far apart as the radius of their joint area
         squared[squared > np.maximum(reach, (seen.radii[k, met] / seen.sigmas[k]) ** 2)] = np.inf
         for _ in range(most):
@@ -139,7 +136,7 @@ def _paired(seen: Matches, reach: float, middle: float, most: int) -> tuple[Matc
             is_far |= bool(squared[i, j] > reach)
             pair = [lost[i], met[j]]
             shares[k, pair] = shares[k, met[j]] / 2
-            offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
+            offsets[k, pair] = (gaps[i, j] + offsets[k, met[j]]) / 2
             J[k, pair] = J[k, pair].mean(axis=0)
             merged[k], extra[k, pair] = merged[k] + 1, middle**2
             squared[i], squared[:, j] = np.inf, np.inf
@@ -199,8 +196,8 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     """Yield poses fixed by some of the met detections with which the other ones agree.
 
     Several detections that are cut, or another body's, may pull a fit so that all are a little off,
-    while most agree elsewhere.  Modes of the likelihood are sought by one least-squares step from
-    each of many sets of detections.
+    while most agree elsewhere.  Modes of the likelihood are sought by one least-squares step per
+    set.
     """
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # the noise of earlier frames tells which detections are off: the frame's own includes them

@@ -26,19 +26,19 @@ from mixpose.tracking.frame import Frame
 from mixpose.tracking.track import Branch
 
 
-def odds_beside(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
+def log_odds_against(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """Return log odds of a rival against the best pose of a frame, by the frames before too."""
     odds = ahead(rival, best)
     if best.spread is not None:  # single ranges
         return odds
-    before = _before(data, rival, best)
-    now = odds - before + max(_of_more_features(data, rival, best), 0.0)
+    before = _log_odds_before(data, rival, best)
+    now = odds - before + max(_gain_by_more_features(data, rival, best), 0.0)
     if now * before > 0:  # otherwise the two contradict each other
         return math.copysign(max(abs(now), abs(before)), now)
     return now + before
 
 
-def _before(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
+def _log_odds_before(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """Return log odds of a rival by the frames before, where both poses have a prediction."""
     if len(data.predictions) < 2:
         return 0.0
@@ -53,7 +53,7 @@ def _expected(data: Frame, T_world_object: Floats) -> Branch | None:
     return data.predictions[nearest] if distances[nearest] <= data.body.radius else None
 
 
-def _of_more_features(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
+def _gain_by_more_features(data: Frame, rival: ScoredPose, best: ScoredPose) -> float:
     """Return the gain in log odds of a rival if the body may have more features than known."""
     if (by_rival := _gained_alone(data, rival, best)) <= 0:
         return 0.0

@@ -6,8 +6,7 @@ have changed places, because they met or were lost together, are both in doubt i
 each other's pose among their hypotheses; later frames go on as assigned.  Bodies never seen so far
 get the remaining poses in the order of the world's x coordinate (then y, then z) of their origins.
 
-Images are read only where tracks expect the bodies; unless the frame is sure of them there, it is
-read as a whole.
+Images are seen in windows around predictions, and as a whole unless the frame is sure there.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track, likely_branches
-from mixpose.tracking.tracker import Tracker, followed
+from mixpose.tracking.tracker import Tracker, track_after
 
 Box: TypeAlias = tuple[int, int, int, int]
 
@@ -89,7 +88,7 @@ class Scene:
                 against = [confusion.since(odds) for confusion in confusions[k]]
                 odds = dict(sorted(against, key=itemgetter(1)))
                 verdict, reported[k] = verdict.doubted(against), reported[k].doubted(against)
-            after.append(replace(followed(data, verdict), distances=apart.get(k), confused=odds))
+            after.append(replace(track_after(data, verdict), distances=apart.get(k), confused=odds))
             estimates.append(tracked.estimate(data, after[k], reported[k], chosen[k].ranked))
         return self._with_companions(after, reported), estimates
 
@@ -167,15 +166,15 @@ class Expectation:
         if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
             return {}
         poses = np.array([branch.T_world_object for branch in predictions])
-        at = project_body(tuple(self.cameras.values()), self.body).project(poses)
+        images = project_body(tuple(self.cameras.values()), self.body).project(poses)
         uncertainty = np.array([branch.uncertainty for branch in predictions])
-        by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self.free) ** 2)
-        scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
+        by_pose = np.einsum("lpnij,pj->lpni", images.J**2, (uncertainty * self.free) ** 2)
+        scales = np.sqrt((images.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
         rims = np.maximum(scales * self._feature_reach, self.min_margin_px)
         margins = self.reach * np.sqrt(by_pose) + rims[..., None, None]
-        seen = at.seen[..., None]
-        lower = np.where(seen, at.y - margins, np.inf).min(axis=(1, 2)).tolist()
-        upper = np.where(seen, at.y + margins, -np.inf).max(axis=(1, 2)).tolist()
+        seen = images.seen[..., None]
+        lower = np.where(seen, images.y - margins, np.inf).min(axis=(1, 2)).tolist()
+        upper = np.where(seen, images.y + margins, -np.inf).max(axis=(1, 2)).tolist()
         return {
             name: (math.floor(u0), math.floor(v0), math.ceil(u1) + 1, math.ceil(v1) + 1)
             for name, (u0, v0), (u1, v1) in zip(self.cameras, lower, upper, strict=True)
@@ -228,9 +227,7 @@ class WindowedScene:
 
     @cached_property
     def _expectations(self) -> list[Expectation]:
-        return [
-            Expectation(tracked.body, self.cameras, tracked.free) for tracked in self.scene.bodies
-        ]
+        return [Expectation(each.body, self.cameras, each.free) for each in self.scene.bodies]
 
     def _windows(self, tracks: Sequence[Track], frame: int, time_s: float | None) -> dict[str, Box]:
         """Return the window of each image that contains all expected bodies."""

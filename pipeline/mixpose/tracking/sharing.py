@@ -23,13 +23,13 @@ from mixpose.optimise import Ascent
 from mixpose.records import Floats, Mask
 from mixpose.search import SeenTogether, search_copies
 from mixpose.tracking.claims import Claims, Met
-from mixpose.tracking.doubt import decided
+from mixpose.tracking.doubt import decide_frame
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import MatchedLikelihood, case_of, likelihood_of
 from mixpose.tracking.proposers import is_convincing, predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
-from mixpose.tracking.tracker import Tracker, judged_again, weighed_at
+from mixpose.tracking.tracker import Tracker, judge_again, weighed_at
 from mixpose.tracking.twin import with_second
 
 Starts: TypeAlias = tuple[Start, ...]
@@ -48,7 +48,7 @@ class Explanation:
     @cached_property
     def alone(self) -> Verdict:
         """Return the decision without `leftover`."""
-        return self.precomputed or decided(self.frame, self.ranked)
+        return self.precomputed or decide_frame(self.frame, self.ranked)
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -87,7 +87,7 @@ class Sharing:
             self._fit_unclaimed([k for k in missing if self._is_forgotten(k) == is_forgotten])
         self._judge_again()
         leftover = self._leftover()
-        # a second pose of an identical body may be a missing one of its kind
+        # a second pose may be a missing body of the same kind, and casts no doubt then
         kinds = [id(tracker.body) for tracker in self.bodies]
         lacking = {kind for k, kind in enumerate(kinds) if k not in self.claimed}
         clear = {k: self.explained[k] for k in self.claimed if kinds[k] not in lacking}
@@ -169,17 +169,17 @@ class Sharing:
         """
         available = {k: claims.available(k) for k in starts}
         frames = {k: self._frame(k, available[k], starts=starts[k]) for k in starts}
-        seen_by_all, ends = list[int](), dict[int, Ascent]()
+        whole, ends = list[int](), dict[int, Ascent]()
         if len(starts) > 1 and self._shared:
-            whole = len(self._shared.totals)
-            seen_by_all = [
-                k for k, data in frames.items() if len(data.views) == whole and not data.is_timed
+            count = len(self._shared.totals)
+            whole = [
+                k for k, data in frames.items() if len(data.views) == count and not data.is_timed
             ]
-            apart = [k for k in seen_by_all if not self._are_near(k, ~available[k], places[k])]
+            apart = [k for k in whole if not self._are_near(k, ~available[k], places[k])]
             climbed, ends = climb_together({k: frames[k] for k in apart}, self._shared)
             frames |= climbed
         near = [k for k, data in frames.items() if k in ends or self._is_near(data, starts[k][0])]
-        frames |= fit_jointly({k: frames[k] for k in seen_by_all if k in near}, ends)
+        frames |= fit_jointly({k: frames[k] for k in whole if k in near}, ends)
         explained = dict[int, Explanation]()
         for k, data in frames.items():
             ranked = self.bodies[k].explain(data, quickly=True) if k in near else []
@@ -285,7 +285,7 @@ class Sharing:
                 data = self._frame(k, available, companion_prediction=companion)
                 data = replace(data, searches=old.frame.searches)
                 data = weighed_at(data, old.ranked[0]) if old.ranked else data
-                ranked = judged_again(data, old.ranked, fitted=are_fitted)
+                ranked = judge_again(data, old.ranked, fitted=are_fitted)
                 self.explained[k] = Explanation(data, available, ranked)
 
     def _companion_prediction(self, k: int) -> Branch | None:
@@ -319,9 +319,9 @@ class Sharing:
 
     def _leftover(self) -> SeenTogether:
         """Return the detections that no body claims."""
-        unclaimed, rules = self._claims().available(-1), self.bodies[0].rules
-        views = self._no_claims.views_with(unclaimed)
+        views = self._no_claims.views_with(self._claims().available(-1))
         seen = [view for view in views if not view.observation.is_empty]
+        rules = self.bodies[0].rules
         return SeenTogether(seen, rules.judgement, rules.search)
 
     def _met(self, k: int) -> Met:
@@ -371,8 +371,7 @@ def climb_together(
 ) -> tuple[dict[int, Frame], dict[int, Ascent]]:
     """Climb from the first starts of several bodies at once where these are near.
 
-    Return frames with `precomputed` objectives, and the ascents.  `shared` has all detections;
-    those of other bodies are out of reach.
+    Return frames with `precomputed` objectives, and the ascents.  `shared` has all detections.
     """
     drawn = dict(frames)
     for k, data in frames.items():

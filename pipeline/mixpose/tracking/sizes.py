@@ -1,7 +1,7 @@
 """Sizes of markers in images, and so which spots are cut, merged or something else.
 
 A marker of radius R in an image whose scale is s (pixels per length at the feature, of a disk along
-its plane) has a spot of radius sR. Hiding a part leaves r² of the area (sR)², and moves the
+its plane) has a spot of radius sR.  Hiding a part leaves r² of the area (sR)², and moves the
 centroid by the lost moment over the whole disk's area: by sR (1 − r²/s²R²) if the lost part lies at
 the rim, and as far if only a part at the rim is left.  A larger spot is merged, with the roles
 exchanged.
@@ -113,16 +113,16 @@ def weighed_by_size(
     """Return views with larger deviations of spots whose size does not fit their feature."""
     if not (sizes.count and rules.cut and views):
         return list(views)
-    at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
+    images = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
     seen_otherwise, scatter = list(views), sizes.scatter(rules)
-    all_scales = _scales(at.J[:, 0], T_world_object, body) * _by_radius(body.node_radii)
+    all_scales = _scales(images.J[:, 0], T_world_object, body) * _by_radius(body.node_radii)
     centres = sizes.centres([view.name for view in views], rules)
     for k, (view, centre) in enumerate(zip(views, centres, strict=True)):
         pattern = view.observation.pattern
-        if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
+        (seen,) = images.seen[k, 0].nonzero()
+        if not (isinstance(pattern, PointPattern) and pattern.has_radii and seen.size):
             continue
-        (seen,) = at.seen[k, 0].nonzero()
-        scales = all_scales[k, seen[_nearest(pattern.points, at.y[k, 0, seen])]]
+        scales = all_scales[k, seen[_nearest(pattern.points, images.y[k, 0, seen])]]
         off, whole = np.log(pattern.radii / scales) - centre, scales * np.exp(centre)
         smaller = np.exp(-2 * np.hypot(off, scatter))
         # per coordinate, of two

@@ -21,7 +21,7 @@ from mixpose.rigid import from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.arguments import require_valid, start_pose
-from mixpose.tracking.doubt import decided, of_other_things
+from mixpose.tracking.doubt import decide_frame, log_odds_other
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, likelihood_of
@@ -35,11 +35,11 @@ from mixpose.tracking.proposers import (
     searched,
 )
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
+from mixpose.tracking.reporting import offsets_of, reported_covariance, residuals_of
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
-from mixpose.tracking.telling import offsets_of, reported_covariance, residuals_of
 from mixpose.tracking.track import Branch, Track, predict
-from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, left_by, with_second
+from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, leftover_of, with_second
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +135,10 @@ class Tracker(Setup):
         """
         data = self.data(track, frame, time_s, views)
         ranked = self.explain(data)
-        verdict = decided(data, ranked)
+        verdict = decide_frame(data, ranked)
         if verdict.best is not None and is_ok_but_for_mirrors(verdict):
-            verdict = with_second(verdict, data, left_by(verdict.best, data))
-        after = followed(data, verdict)
+            verdict = with_second(verdict, data, leftover_of(verdict.best, data))
+        after = track_after(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
@@ -185,7 +185,7 @@ class Tracker(Setup):
             if start.T_moved is None and any(fit is known for known in fits):
                 return None  # judged already by the same prior
             fits.append(fit)
-            judged = _judged(likelihood, fit, start, proposer)
+            judged = _judge(likelihood, fit, start, proposer)
             insert(ranked, judged, data.body, data.free, data.rules.acceptance)
             return judged
 
@@ -202,7 +202,7 @@ class Tracker(Setup):
         weighed = weighed_at(data, ranked[0]) if ranked else data
         if weighed is data:
             return ranked
-        again = judged_again(weighed, ranked, fitted=True)
+        again = judge_again(weighed, ranked, fitted=True)
         # poses of refinements are not sought again: they stay unless the new ones are better
         is_better = again[0].log_evidence > ranked[0].log_evidence
         return again if is_better or not data.track.sizes.count else ranked
@@ -211,7 +211,7 @@ class Tracker(Setup):
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
     ) -> Estimate:
         """Return the estimate of a frame; reports are those of the first pose, believed or not."""
-        body, best, at = self.body, verdict.best, self._T_body_origin
+        body, best, T_origin = self.body, verdict.best, self._T_body_origin
         shown = best or next(iter(ranked), None)
         used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
@@ -225,13 +225,13 @@ class Tracker(Setup):
             time_s=data.time_s,
             object=body.name,
             status=verdict.status,
-            T_world_object=best.T_world_object @ at if best else None,
+            T_world_object=best.T_world_object @ T_origin if best else None,
             covariance=reported_covariance(data, best, self.origin) if best else None,
             score=shown.score if shown else 0.0,
             confidence=verdict.confidence,
             sensors=reports,
             hypotheses=tuple(
-                [Hypothesis(pose.T_world_object @ at, weight) for pose, weight in rivals]
+                [Hypothesis(pose.T_world_object @ T_origin, weight) for pose, weight in rivals]
             ),
             instance=self.instance,
             proposer=origin,
@@ -270,8 +270,8 @@ def estimate_pose(
 def weighed_at(data: Frame, pose: ScoredPose) -> Frame:
     """Return the frame with spots weighed by size at a pose; itself if no other spot is cut then.
 
-    By the scale of the predicted pose other spots may look as if they were cut.  Before the first
-    ok frame the pose itself shows how large markers are.
+    By the scale of the predicted pose other spots may look cut.  Before the first ok frame the pose
+    itself shows how large markers are.
     """
     sizes, rules, T = data.track.sizes, data.rules.sizes, pose.T_world_object
     if not data.unweighed or (sizes.count and not np.count_nonzero(pose.matches.extra)):
@@ -291,7 +291,7 @@ def _moving_at(data: Frame, T_world_object: Floats) -> Frame:
     return data.in_motion(data.expected_velocity(T_world_object).at(T_world_object))
 
 
-def _judged(
+def _judge(
     likelihood: Likelihood,
     fit: Fit,
     start: Start,
@@ -307,12 +307,12 @@ def _judged(
     )
 
 
-def judged_again(
+def judge_again(
     data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> list[ScoredPose]:
     """Judge poses again by a frame with other detections, the most evident first.
 
-    They are `fitted` again too, but for those far behind the first.
+    With `fitted` they are fitted too, but for those far behind the first.
     """
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
     behind = data.rules.look_alikes.behind
@@ -320,12 +320,12 @@ def judged_again(
         is_near = pose.log_evidence > poses[0].log_evidence - behind
         wide = data.close_uncertainty if fitted and is_near else None
         start = Start(pose.T_world_object, wide, left_out=pose.left_out, T_moved=pose.T_moved)
-        judged = _judged(likelihood, likelihood.fit(start), start, pose.proposer, pose.blurs)
+        judged = _judge(likelihood, likelihood.fit(start), start, pose.proposer, pose.blurs)
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
 
 
-def followed(data: Frame, verdict: Verdict) -> Track:
+def track_after(data: Frame, verdict: Verdict) -> Track:
     """Return the track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
     # a pose that is likelier clutter is reported, and not followed
@@ -354,7 +354,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         delays=delays_after(data, best) if is_ok or late else track.delays,
         sensors_agreed=track.sensors_agreed or agreeing,
         is_identified=is_ok
-        or (track.is_identified and of_other_things(data, best) < data.rules.acceptance.log_doubt),
+        or (track.is_identified and log_odds_other(data, best) < data.rules.acceptance.log_doubt),
         ok_count=track.ok_count + is_ok,
         elsewhere=_elsewhere_after(data, best),
         gained=best.gained if is_ok else track.gained,

@@ -25,10 +25,10 @@ from mixpose.judgement import (
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
 from mixpose.search import Candidate, Copy, SeenTogether
-from mixpose.tracking.doubt import TWICE, contradicted, decided
+from mixpose.tracking.doubt import TWICE, contradicted, decide_frame
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of
 
 SECOND_POSE = "second_pose"
@@ -43,20 +43,20 @@ def is_ok_but_for_mirrors(verdict: Verdict) -> bool:
 def with_second(verdict: Verdict, data: Frame, leftover: SeenTogether) -> Verdict:
     """Return the verdict, in doubt if the leftover detections show the body a second time.
 
-    Then either pose may be the body, whichever was followed, unless one is the other's mirror
-    image; the other one goes on as the other.
+    Either pose may be the body then, unless one is the other's mirror image; the other goes on as
+    such.
     """
     best = verdict.best
     if best is None or not is_ok_but_for_mirrors(verdict):
         return verdict
     if others := _may_be_elsewhere(data, best, leftover):
-        if (contrary := _sure_by(data, others)) is not None:
+        if (contrary := _sure_pose_by(data, others)) is not None:
             kept = [*((pose, weight / 2) for pose, weight in verdict.kept), (contrary, 0.5)]
             return contradicted(data, replace(verdict, kept=kept))
         verdict = replace(verdict, tried=_most_tried(data, others))
     accepted, known = data.rules.acceptance, data.log_odds_other_at(best.T_world_object)
     # log odds of the second pose: frames that show little of it lower them, within bounds
-    second, odds = _where_it_was(data, best, leftover), -math.inf
+    second, odds = _previous_second(data, best, leftover), -math.inf
     if second is not None:
         odds = min(data.track.log_odds_twice + second.log_evidence, -accepted.log_doubt)
     is_convincing = second is not None and is_sure(second, data.free, accepted)
@@ -68,11 +68,11 @@ def with_second(verdict: Verdict, data: Frame, leftover: SeenTogether) -> Verdic
     if second is None or odds <= accepted.log_doubt:
         against = [] if known is None else [Alternative(TWICE, known)]
         return replace(verdict, second=Second(None, odds, 0.0)).doubted(against)
-    farther, elsewhere = (ask(best, second, data) for ask in (_farther_off, _by_features_elsewhere))
-    reasons = odds, _more_missed(best, second, data), farther, elsewhere
+    farther, elsewhere = (ask(best, second, data) for ask in (_by_offsets, _by_features))
+    reasons = odds, _by_misses(best, second, data), farther, elsewhere
     log_odds = sum(min(reason, 0.0) for reason in reasons)
     log_odds, in_mirror = _by_mirror(log_odds, best, second, data)
-    # only the frame that says most counts
+    # of all frames only the one that tells most counts
     if known is not None and abs(known) > abs(log_odds):
         log_odds = known
     is_image, share = in_mirror < accepted.log_doubt, float(expit(log_odds))
@@ -100,7 +100,7 @@ def _decide_for(second: ScoredPose, data: Frame, leftover: SeenTogether, is_imag
     mistaken = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
     track = replace(data.track, mistaken=mistaken)
     seen = data.changed(views=leftover.views, static_views=(), starts=(), track=track)
-    verdict = decided(seen, [second])
+    verdict = decide_frame(seen, [second])
     return verdict.without(IN_A_MIRROR) if is_image else verdict
 
 
@@ -108,14 +108,14 @@ def _by_mirror(
     log_odds: float, best: ScoredPose, second: ScoredPose, data: Frame
 ) -> tuple[float, float]:
     """Return log odds that the second pose is the body, and that neither is in a mirror."""
-    odds, is_first = mirrored(data, best, second)
+    odds, is_first = mirror_odds(data, best, second)
     in_none = -float(np.logaddexp(0.0, odds))
     if is_first:
         return log_odds + in_none, in_none
     return float(np.log(np.expm1(np.logaddexp(0.0, log_odds) - in_none))), in_none
 
 
-def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
+def leftover_of(pose: ScoredPose, data: Frame) -> SeenTogether:
     """Return the detections that a pose leaves; views without single detections leave none."""
     numbers = dict(zip(pose.matches.names, pose.matches.detections, strict=True))
     views = []
@@ -130,7 +130,7 @@ def left_by(pose: ScoredPose, data: Frame) -> SeenTogether:
     return SeenTogether(views, data.rules.judgement, data.rules.search)
 
 
-def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+def _by_misses(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     """Return log odds for the second pose by the features that either pose misses.
 
     If one is the body, the other is its image or another body, of all but the features that the
@@ -138,10 +138,10 @@ def _more_missed(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     """
     met = [dict(zip(pose.used.names, pose.used.met.tolist())) for pose in (best, second)]
     more: float = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
-    return -more * _log_odds_of_one(data)
+    return -more * _log_odds_of_match(data)
 
 
-def _farther_off(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+def _by_offsets(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     """Return log odds for the second pose by its offsets, with the noise at the first.
 
     Not below those of two spots cut unseen, as spots are cut together.
@@ -162,7 +162,7 @@ def _log_cut(data: Frame) -> float:
     return math.log(sum(data.rules.judgement.noise.errors.chances))
 
 
-def _by_features_elsewhere(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
+def _by_features(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
     """Return log odds for the second pose by features that are elsewhere at either pose.
 
     Two or more sensors have such a feature in view, none meets it closely, and some far off.
@@ -200,10 +200,10 @@ def _is_due(data: Frame, best: ScoredPose, views: Sequence[View]) -> bool:
 
 def _most_missed(data: Frame) -> float:
     """Return how many more features a second pose may miss and still cast doubt on the best."""
-    return -data.rules.acceptance.log_doubt / _log_odds_of_one(data)
+    return -data.rules.acceptance.log_doubt / _log_odds_of_match(data)
 
 
-def _log_odds_of_one(data: Frame) -> float:
+def _log_odds_of_match(data: Frame) -> float:
     """Return log odds that a feature in view is met."""
     return float(logit(data.rules.judgement.detection.probability))
 
@@ -215,9 +215,11 @@ def _second_pose(data: Frame, best: ScoredPose, leftover: SeenTogether) -> Score
     """
     agree = min(int(np.count_nonzero(best.used.met)), 2)
     alone = data.alone(views=leftover.views, static_views=(), starts=())
-    for pose in _poses(alone, leftover):
+    for pose in _candidate_poses(alone, leftover):
         least = data.rules.acceptance.log_doubt
-        is_likely = _more_missed(best, pose, data) > least or mirrored(data, best, pose)[0] > -least
+        is_likely = (
+            _by_misses(best, pose, data) > least or mirror_odds(data, best, pose)[0] > -least
+        )
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
         if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
@@ -252,30 +254,30 @@ def _most_tried(data: Frame, views: Sequence[View]) -> dict[str, int]:
     return {view.name: max(view.observation.cells, tried.get(view.name, 0)) for view in views}
 
 
-def _sure_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
+def _sure_pose_by(data: Frame, views: Sequence[View]) -> ScoredPose | None:
     """Return a pose that is sure by some views alone; else None.
 
     These see nothing of the best pose, so that either sensor may be out of step.
     """
     alone = data.alone(views=views, static_views=(), starts=()).changed(options=data.options)
     together = SeenTogether(views, data.rules.judgement, data.rules.search)
-    for pose in _poses(alone, together):
+    for pose in _candidate_poses(alone, together):
         if is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
     return None
 
 
-def _where_it_was(data: Frame, best: ScoredPose, leftover: SeenTogether) -> ScoredPose | None:
+def _previous_second(data: Frame, best: ScoredPose, leftover: SeenTogether) -> ScoredPose | None:
     """Judge the second pose of the frame before in this frame."""
     if data.track.log_odds_twice == -math.inf or not leftover.views:
         return None
-    if (start := next(_elsewhere(data, best), None)) is None:
+    if (start := next(_other_starts(data, best), None)) is None:
         return None
     likelihood = likelihood_of(data.changed(views=leftover.views, static_views=(), starts=()))
     return likelihood.judge(likelihood.fit(start), start)
 
 
-def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
+def _other_starts(data: Frame, best: ScoredPose) -> Iterator[Start]:
     """Yield the predictions other than that of the best pose, even right beside it."""
     predecessor = data.predecessor(best.T_world_object)
     for branch in data.predictions:
@@ -283,7 +285,7 @@ def _elsewhere(data: Frame, best: ScoredPose) -> Iterator[Start]:
             yield Start(branch.T_world_object, branch.uncertainty)
 
 
-def _poses(alone: Frame, leftover: SeenTogether) -> Iterator[ScoredPose]:
+def _candidate_poses(alone: Frame, leftover: SeenTogether) -> Iterator[ScoredPose]:
     """Yield candidates of a search, fitted and judged, that may be a second pose."""
     likelihood = likelihood_of(alone)
     candidates: Sequence[Copy | Candidate]

@@ -45,10 +45,10 @@ def offsets_of(used: Matches, variances: Floats) -> dict[str, Offsets]:
         i = np.flatnonzero(used.weights[k])
         y, by_shift = sigma * used.offsets[k, i, :m], used.J[k, i, :m, :3]
         detections, places = used.detections[k, i], used.places[k, i, :m]
-        alike = (detections[:, None] == detections) & (detections >= 0)[:, None]
-        shared = alike.sum(axis=1) > 1
+        is_same = (detections[:, None] == detections) & (detections >= 0)[:, None]
+        shared = is_same.sum(axis=1) > 1
         # two features that share a detection have the offset of their middle
-        middle = alike @ places / np.maximum(alike.sum(axis=1), 1)[:, None]
+        middle = is_same @ places / np.maximum(is_same.sum(axis=1), 1)[:, None]
         observed = np.where(shared[:, None], middle, places) + y
         met = used.shares[k, i] > 0
         weights = variances[k] / (variances[k] + used.extra[k, i])
