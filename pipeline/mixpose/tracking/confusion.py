@@ -48,7 +48,7 @@ def confusions_of(
     """Return other explanations of all that bodies meet, by body, for those that meet something.
 
     Another body that is not surely elsewhere; the body itself turned another way, if its markers
-    repeat themselves; or a body that is elsewhere, if this one may have its place in turn.
+    repeat themselves; or a body that seems to be elsewhere, if this one may be there instead.
     """
     bests = {k: v.best for k, v in verdicts.items() if v.best and v.best.log_evidence > 0}
     sure = [k for k, verdict in verdicts.items() if verdict.status == "ok"]

@@ -209,8 +209,7 @@ class Frame(Setup):
     def oriented(self, T_world_object: Floats) -> Floats:
         """Return the pose nearest to the reference among those that look the same.
 
-        Without a reference, and where these orientations differ a little: the pose itself, as the
-        best met.
+        Without a reference, and if these differ a little: the pose itself, which is met best.
         """
         if self.T_reference is None and self.body.asymmetry:
             return T_world_object

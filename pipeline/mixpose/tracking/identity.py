@@ -71,7 +71,7 @@ class Assignment:
         return np.asarray(odds)
 
     def _likely_distances(self, now: Floats) -> Floats:
-        """Return log densities (n, n, n) of body i as far from k as j is now; 0 if unknown."""
+        """Return log densities (n, n, n) of body i as far from k as j is now; 0 without a pose."""
         n, before = self.degrees, self.before
         squared = np.maximum(before.squares / before.numbers, 1e-12) * (1 + before.missed) ** 2
         off = (now - before.last[:, None]) ** 2 / squared[:, None]

@@ -81,7 +81,10 @@ def _improper_symmetries(body: Body, alike: float) -> tuple[Floats, ...]:
 
 
 def _log_odds(pose: ScoredPose, image: ScoredPose, E: Floats, body: Body, off: float) -> float:
-    """Return log odds of a mirror by two poses; E (4, 4) maps the body onto itself."""
+    """Return log odds of a mirror by two poses; E (4, 4) maps the body onto itself.
+
+    The mirror is `off` a plane, in radii and radians.
+    """
     steps = _STEP * np.diag(np.repeat([body.radius, 1.0], 3))
     a, b = pose.T_world_object[None], image.T_world_object[None]
     resting = np.repeat(a, 6, axis=0), np.repeat(b, 6, axis=0)

@@ -164,9 +164,8 @@ def at_rest(body: Body, rules: MotionRules) -> ExpectedVelocity:
 class MotionFilter:
     """The motion of a body, relative to its last pose, by a bank of Kalman filters.
 
-    Each coordinate of the pose has its first three derivatives, of which the last takes a random
-    walk.  Filters from very steady to very sudden motion run side by side, weighted by their
-    predictions.
+    Each coordinate of the pose has three derivatives, of which the last takes a random walk.
+    Filters from very steady to very sudden motion run side by side, weighted by their predictions.
     """
 
     means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F filters
@@ -206,10 +205,7 @@ class MotionFilter:
         return np.asarray((weights / weights.sum(axis=0)).repeat(3, axis=1))
 
     def ahead(self, elapsed: float) -> tuple[Floats, Floats]:
-        """Return the twist (6,) to the predicted pose in some seconds, and its variance.
-
-        The variance is what is to be added to that of the last pose.
-        """
+        """Return the twist (6,) to the predicted pose in some seconds, and the added variance."""
         (means, covariances), weights = self._predicted(elapsed), self._weights
         twists = means[..., 0] - self.means[..., 0]
         twist = (weights * twists).sum(axis=0)

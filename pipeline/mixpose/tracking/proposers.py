@@ -40,7 +40,7 @@ Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
 
 
 def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
-    """Yield the predictions of the track and of a companion; always applies.
+    """Return the predictions of the track and of a companion; always applies.
 
     Where several bodies are fitted together, their common starts instead.
     """

@@ -32,7 +32,7 @@ BY_CHANCE = "it meets little of the body, as by chance"
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """Yield the pose without sensors that disagree with others or meet little by chance."""
+    """Yield the pose without sensors that disagree with others or meet the body by chance."""
     if len(frame.views) < 2 or judged.left_out:
         return
     rules, seen = frame.rules.acceptance, judged.matches
@@ -59,7 +59,7 @@ def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
 def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
     """Return sensors that see the body elsewhere than two or more others do.
 
-    They meet little of it beside as many unmatched detections, or have residuals too large by
+    They meet little of it beside as many unmatched detections, or residuals are too large for
     chance.
     """
     summed = seen.summed
@@ -97,7 +97,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
 def _with_pairs(
     frame: Frame, T_world_object: Floats, paired: Matches, widest: float
 ) -> Floats | None:
-    """Return the pose (4, 4) after two least-squares steps, the first at blur `widest` or less."""
+    """Return the pose (4, 4) after two least-squares steps, the first at least at blur `widest`."""
     T, seen = T_world_object, paired
     narrow = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
     for least in (widest, 0.0):  # the first ends within 0.01 σ_ε of the optimum
@@ -196,8 +196,7 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
     """Yield poses fixed by some of the met detections with which the other ones agree.
 
     Several detections that are cut, or another body's, may pull a fit so that all are a little off,
-    while most agree elsewhere.  Modes of the likelihood are sought by one least-squares step per
-    set.
+    while most agree elsewhere.  Modes are sought by one least-squares step from each of many sets.
     """
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # the noise of earlier frames tells which detections are off: the frame's own includes them
@@ -272,7 +271,7 @@ def _is_out_of_step(seen: Matches, variances: Floats, errors: ErrorRules) -> Mas
 
 
 def _some_sets(count: int, size: int, most: int, seed: int) -> Indices | None:
-    """Return sets (S, few) of numbers below a count: all, or some at random; None for too few."""
+    """Return sets (S, size) of numbers below a count: all, or some at random; None for too few."""
     if count <= size:
         return None
     if math.comb(count, size) <= most:

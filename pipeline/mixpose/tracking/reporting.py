@@ -15,7 +15,7 @@ from mixpose.tracking.frame import Frame
 
 
 def reported_covariance(data: Frame, pose: ScoredPose, origin: Floats) -> Floats:
-    """Return the covariance (6, 6) of a pose at a point (3,) of the body, with likely turns."""
+    """Return the covariance (6, 6) of a pose at a point (3,) of the body, with all likely turns."""
     T, covariance = pose.T_world_object, pose.covariance
     if pose.spread is None and is_pointlike(data.body):
         sensors = tuple([view.sensor for view in data.views if view.name not in pose.left_out])

@@ -340,7 +340,7 @@ class Sharing:
         return SharedDensities(seen) if seen and are_single else None
 
     def _is_forgotten(self, k: int) -> bool:
-        """Test whether a body was last seen too long ago to say where it is, or never."""
+        """Test whether a body was last seen too long ago to believe a velocity, or never."""
         track, rules = self.tracks[k], self.bodies[k].rules.motion
         seconds = track.seconds_until(self.time_s) or 0.0
         is_long = track.misses > rules.coasting or seconds > rules.longest_s

@@ -24,7 +24,7 @@ class StaticClutter:
     places: Mapping[str, tuple[Floats, Indices]] = field(default_factory=dict)
 
     def learnt(self, views: Sequence[View], frames: int) -> StaticClutter:
-        """Return the clutter after one more frame without the body; rare places are forgotten."""
+        """Return the clutter after one more frame; places missed as often as seen are dropped."""
         places = dict(self.places)
         for view in views:
             if (points := view.observation.points) is None:

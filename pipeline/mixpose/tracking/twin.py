@@ -43,8 +43,8 @@ def is_ok_but_for_mirrors(verdict: Verdict) -> bool:
 def with_second(verdict: Verdict, data: Frame, leftover: SeenTogether) -> Verdict:
     """Return the verdict, in doubt if the leftover detections show the body a second time.
 
-    Either pose may be the body then, unless one is the other's mirror image; the other goes on as
-    such.
+    Either may be the body then, unless one is a mirror image; both are followed, one as another
+    thing.
     """
     best = verdict.best
     if best is None or not is_ok_but_for_mirrors(verdict):
@@ -131,13 +131,13 @@ def leftover_of(pose: ScoredPose, data: Frame) -> SeenTogether:
 
 
 def _by_misses(best: ScoredPose, second: ScoredPose, data: Frame) -> float:
-    """Return log odds for the second pose by the features that either pose misses.
+    """Return log odds for the second pose by how many fewer features it meets.
 
     If one is the body, the other is its image or another body, of all but the features that the
     body is missed at.  A sensor without leftover detections misses all of the second.
     """
     met = [dict(zip(pose.used.names, pose.used.met.tolist())) for pose in (best, second)]
-    more: float = sum(own - met[1].get(name, 0.0) for name, own in met[0].items())
+    more: float = sum(count - met[1].get(name, 0.0) for name, count in met[0].items())
     return -more * _log_odds_of_match(data)
 
 
@@ -217,9 +217,8 @@ def _second_pose(data: Frame, best: ScoredPose, leftover: SeenTogether) -> Score
     alone = data.alone(views=leftover.views, static_views=(), starts=())
     for pose in _candidate_poses(alone, leftover):
         least = data.rules.acceptance.log_doubt
-        is_likely = (
-            _by_misses(best, pose, data) > least or mirror_odds(data, best, pose)[0] > -least
-        )
+        is_likely = _by_misses(best, pose, data) > least
+        is_likely = is_likely or mirror_odds(data, best, pose)[0] > -least
         is_seen = bool(np.count_nonzero(pose.matches.met) >= agree)
         if is_likely and is_seen and is_sure(pose, data.free, data.rules.acceptance):
             return replace(pose, proposer=SECOND_POSE)
