@@ -165,7 +165,7 @@ def test_an_ellipsoid_holds_where_a_pose_is_if_one_detection_is_false() -> None:
     detection, rules = data.rules.judgement.detection, data.rules.acceptance
     found = sum_associations(data.views, data.body, T[None], likelihood._noise, detection)
     curved = likelihood._posterior(likelihood._noise, second=True).linearise(T[None])
-    information = likelihood._definite(curved) + np.diag(1 / data.anywhere[1] ** 2)
+    information = likelihood._definite(curved) + np.diag(1 / data.flat_prior[1] ** 2)
     twists, likely = likelihood._alternatives(T, found, information)
     some = twists[likely > 1 - rules.confidence]
     limit = chdtri(6, 1 - rules.confidence)

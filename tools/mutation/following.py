@@ -325,8 +325,8 @@ _NOISE = (
     Mutant(
         "tracking-merged-spots-pull-by-all-that-they-are-off",
         "tracking/refinements.py",
-        "seen.shares * weights",
-        "seen.shares",
+        "matches.shares * weights",
+        "matches.shares",
         "a spot of two features that is cut bends the pose",
         ("test_tracking_refinements.py",),
     ),

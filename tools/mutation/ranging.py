@@ -42,7 +42,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-open-directions-unbounded",
         "tracking/ranges.py",
-        "information += np.diag(1 / frame.anywhere[1][free] ** 2)",
+        "information += np.diag(1 / frame.flat_prior[1][free] ** 2)",
         "information += 0",
         "directions that ranges leave open have no bound",
         (_RANGES,),

@@ -146,8 +146,8 @@ MUTANTS = (
     Mutant(
         "tracking-near-spots-are-not-fitted",
         "tracking/refinements.py",
-        "return replace(seen, shares=shares, offsets=offsets) if is_more",
-        "return replace(seen, shares=shares) if is_more",
+        "return replace(matches, shares=shares, offsets=offsets) if is_more",
+        "return replace(matches, shares=shares) if is_more",
         "what is nearly met is taken for met exactly",
         ("test_tracking_refinements.py",),
     ),

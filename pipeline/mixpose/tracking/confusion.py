@@ -130,7 +130,8 @@ def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Con
             rival = other.rival(best, T_other, other.close_uncertainty, left_out=best.left_out)
             fitted = likelihood.density(likelihood.fit(rival), rival, best.matches)
             ahead = max(ahead, fitted - own_density)
-        known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
+        known = other.prior(T_other)[0] - other.flat_prior[0]
+        known = known - data.prior(T)[0] + data.flat_prior[0]
         alone = ahead - known
         # for a part of the met features only, the prediction of the other body tells nothing
         is_all = len(part.features) == len(met)

@@ -182,7 +182,7 @@ def _lasting_evidence(data: Frame, best: ScoredPose) -> tuple[float, Shape | Non
 
 def _gained(data: Frame, best: ScoredPose) -> float:
     """Return how much likelier the frames before make a pose, in nats."""
-    return max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
+    return max(data.prior(best.T_world_object)[0] - data.flat_prior[0], 0.0)
 
 
 def log_odds_other(data: Frame, judged: ScoredPose) -> float:
@@ -191,12 +191,12 @@ def log_odds_other(data: Frame, judged: ScoredPose) -> float:
     Three markers are alike if three distances between them are, and so for each further one.  One
     sensor of several may meet a marker by chance.  Another thing is not where the body is expected.
     """
-    seen, rules = judged.matches, data.rules
-    if 1 in seen.dimensions.tolist():  # single ranges show no markers in space
+    matches, rules = judged.matches, data.rules
+    if 1 in matches.dimensions.tolist():  # single ranges show no markers in space
         return -math.inf
-    met = np.minimum(seen.met_by / max(len(data.views) / 2, 1), 1).sum()
-    in_view = np.count_nonzero(seen.weights, axis=0)
-    covered = np.minimum(in_view, 2)[seen.met_by == 0].sum()
+    met = np.minimum(matches.met_by / max(len(data.views) / 2, 1), 1).sum()
+    in_view = np.count_nonzero(matches.weights, axis=0)
+    covered = np.minimum(in_view, 2)[matches.met_by == 0].sum()
     odds = 3 * (met - 2) * math.log(rules.look_alikes.alike)
     odds -= covered * rules.judgement.detection.log_missed
     return float(odds - (_gained(data, judged) if data.track.is_identified else 0.0))
@@ -255,21 +255,21 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
 
     An unlikely mirror image is only sought where it `is_asked` for.
     """
-    rules, seen, T = data.rules, judged.matches, judged.T_world_object
+    rules, matches, T = data.rules, judged.matches, judged.T_world_object
     # a body that a turn maps onto its mirror image looks the same as that in every camera
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return -math.inf
-    accepted, met, near = rules.acceptance, seen.met_by, -math.inf
+    accepted, met, near = rules.acceptance, matches.met_by, -math.inf
     body_evidence = judged.log_evidence
     likely = accepted.log_doubt - math.log(accepted.mistaken) - before
     # missed features beside unmatched detections: a mirror image may meet more than the body
-    if is_asked or sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
+    if is_asked or sum(np.minimum(matches.missed, matches.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         mirror_frame = _reflected_frame(data, sharp if sharp.sum() >= 3 else met > 0)
         # rivals meet at least a quarter of the body's features; values grow as the square
-        value = float(data.finest.weights[:, 0] @ seen.explained)
+        value = float(data.finest.weights[:, 0] @ matches.explained)
         if is_asked or mirror_frame.finest.value(T) > value / 16:
             # fitted, which may end at clutter; and as it stands, if asked for
             rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
@@ -293,12 +293,12 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     """Test whether few features are met in the first frames, others missed or these far off."""
-    rules, seen, track = data.rules, judged.matches, data.track
+    rules, matches, track = data.rules, judged.matches, data.track
     are_few = judged.measurements - 6 <= rules.look_alikes.by_chance
-    if not are_few or track.ok_count >= rules.proposals.believed or (seen.dimensions != 2).any():
+    if not are_few or track.ok_count >= rules.proposals.believed or (matches.dimensions != 2).any():
         return False
-    is_missed, noise = (seen.missed > 0.5).any(), rules.judgement.noise
-    return bool(is_missed) or is_far_off(seen, _noise_before(data, judged), rules.acceptance, noise)
+    is_missed, before = (matches.missed > 0.5).any(), _noise_before(data, judged)
+    return bool(is_missed) or is_far_off(matches, before, rules.acceptance, rules.judgement.noise)
 
 
 def _noise_before(data: Frame, judged: ScoredPose) -> Floats:

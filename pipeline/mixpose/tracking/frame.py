@@ -133,7 +133,7 @@ class Frame(Setup):
         return self.start_uncertainty / self.rules.proposals.narrowing**2
 
     @cached_property
-    def anywhere(self) -> Prior:
+    def flat_prior(self) -> Prior:
         """Return the prior of a pose of which nothing is known."""
         return flat_prior(self.body, self.free, self.rules.judgement.detection)
 
@@ -160,7 +160,7 @@ class Frame(Setup):
 
     def _prior(self, T_world_object: Floats, branches: Sequence[Branch], misses: int) -> Prior:
         """Return the prior of a pose as a mixture of predictions and of a pose anywhere."""
-        anywhere, rules = self.anywhere, self.rules.motion
+        anywhere, rules = self.flat_prior, self.rules.motion
         if not branches:
             return anywhere
         surprise = rules.surprise_after(misses)
@@ -204,7 +204,7 @@ class Frame(Setup):
     def elsewhere(self) -> float:
         """Return the log density of a pose where its own track does not expect the body."""
         surprise = self.rules.motion.surprise_after(self.track.misses)
-        return self.anywhere[0] + (math.log(surprise) if self.predictions else 0.0)
+        return self.flat_prior[0] + (math.log(surprise) if self.predictions else 0.0)
 
     def oriented(self, T_world_object: Floats) -> Floats:
         """Return the pose nearest to the reference among those that look the same.
@@ -233,7 +233,7 @@ class Frame(Setup):
         doubt = max(self.track.confused.values(), default=-math.inf)
         if doubt > self.rules.acceptance.log_doubt:
             return np.zeros(len(poses))
-        return self.log_densities(poses) - self.anywhere[0]
+        return self.log_densities(poses) - self.flat_prior[0]
 
     def feature_distances(self, T_world_object: Floats) -> list[Floats]:
         """Return how far the features (N,) of each prediction are from those at a pose.

@@ -289,7 +289,7 @@ class AssociationLikelihood:
         inner, known = np.ix_(free, free), frame.track.residuals.of(RANGES)
         # a direction that the ranges leave open is as uncertain as without any
         information = self._definite(self._posterior(self._noise, second=True).linearise(T[None]))
-        information += np.diag(1 / frame.anywhere[1][free] ** 2)
+        information += np.diag(1 / frame.flat_prior[1][free] ** 2)
         C = np.linalg.inv(information)
         volume = 0.5 * float(np.linalg.slogdet(2 * np.pi * C)[1])
         degrees = rules.ranges.stated_degrees + float(known[1, 0])

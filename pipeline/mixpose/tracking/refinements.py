@@ -35,45 +35,45 @@ def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> 
     """Yield the pose without sensors that disagree with others or meet the body by chance."""
     if len(frame.views) < 2 or judged.left_out:
         return
-    rules, seen = frame.rules.acceptance, judged.matches
-    if apart := disagreeing(seen, rules, frame.rules.judgement.noise):
+    rules, matches = frame.rules.acceptance, judged.matches
+    if apart := disagreeing(matches, rules, frame.rules.judgement.noise):
         left_out = dict.fromkeys(apart, OUT_OF_STEP)
     else:
-        left_out = dict.fromkeys(by_chance(seen, rules), BY_CHANCE)
+        left_out = dict.fromkeys(by_chance(matches, rules), BY_CHANCE)
     if left_out:
         yield Start(judged.T_world_object, frame.close_uncertainty, left_out=left_out)
 
 
-def by_chance(seen: Matches, rules: AcceptanceRules) -> list[str]:
+def by_chance(matches: Matches, rules: AcceptanceRules) -> list[str]:
     """Return sensors that meet little of a body that another one meets, with unmatched detections.
 
     They may be covered or out of step; a pose that others leave open bends to their detections.
     """
-    coverage = seen.covered
-    spare = seen.summed(seen.count) > seen.summed(seen.met)
+    coverage = matches.covered
+    spare = matches.summed(matches.count) > matches.summed(matches.met)
     little = (coverage > 0) & (coverage < rules.agreeing) & spare
-    names = [seen.names[k] for k in np.flatnonzero(little[seen.owner])]
+    names = [matches.names[k] for k in np.flatnonzero(little[matches.owner])]
     return names if np.count_nonzero(coverage >= rules.agreeing) else []
 
 
-def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
+def disagreeing(matches: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
     """Return sensors that see the body elsewhere than two or more others do.
 
     They meet little of it beside as many unmatched detections, or residuals are too large for
     chance.
     """
-    summed = seen.summed
-    agreeing = seen.covered >= rules.agreeing
-    apart = ~agreeing & (summed(seen.expected) > 0)
-    apart &= summed(seen.unmatched_nearby) >= rules.agreeing * summed(seen.missed)
-    squares, degrees = summed(seen.squares) * agreeing, summed(seen.measurements) * agreeing
+    summed = matches.summed
+    agreeing = matches.covered >= rules.agreeing
+    apart = ~agreeing & (summed(matches.expected) > 0)
+    apart &= summed(matches.unmatched_nearby) >= rules.agreeing * summed(matches.missed)
+    squares, degrees = summed(matches.squares) * agreeing, summed(matches.measurements) * agreeing
     if np.count_nonzero(agreeing) > 2:
         other_degrees = degrees.sum() - degrees
         variances = (squares.sum() - squares) / np.maximum(other_degrees, 1e-12)
         # NaN without degrees of freedom: nothing is larger
         limits = np.maximum(rules.disagreeing, fdtri(degrees, other_degrees, model.by_chance))
         apart |= squares > degrees * limits * np.maximum(variances, LEAST_VARIANCE)
-    names = [seen.names[k] for k in np.flatnonzero(apart[seen.owner])]
+    names = [matches.names[k] for k in np.flatnonzero(apart[matches.owner])]
     return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
 
 
@@ -98,15 +98,15 @@ def _with_pairs(
     frame: Frame, T_world_object: Floats, paired: Matches, widest: float
 ) -> Floats | None:
     """Return the pose (4, 4) after two least-squares steps, the first at least at blur `widest`."""
-    T, seen = T_world_object, paired
+    T, matches = T_world_object, paired
     narrow = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
     for least in (widest, 0.0):  # the first ends within 0.01 σ_ε of the optimum
         if T is not T_world_object:
-            T, seen = met_at(frame, Fit(T))
-        if not np.count_nonzero(seen.merged):
+            T, matches = met_at(frame, Fit(T))
+        if not np.count_nonzero(matches.merged):
             break
-        weights = welsch(seen.squared, np.maximum(narrow, least))
-        T = _by_least_squares(frame, T, replace(seen, shares=seen.shares * weights))
+        weights = welsch(matches.squared, np.maximum(narrow, least))
+        T = _by_least_squares(frame, T, replace(matches, shares=matches.shares * weights))
     return None if T is T_world_object else T
 
 
@@ -148,48 +148,48 @@ def all_near(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
 
     A fit that met most features to less than noise stays there, and leaves the others out.
     """
-    seen = judged.matches
-    if judged.left_out or seen.measurements.sum() <= np.count_nonzero(frame.free):
+    matches = judged.matches
+    if judged.left_out or matches.measurements.sum() <= np.count_nonzero(frame.free):
         return
-    if (near := _with_near(frame, seen)) is not seen:
+    if (near := _with_near(frame, matches)) is not matches:
         T = _by_least_squares(frame, judged.T_world_object, near)
         # again with the detections met there
         again = _with_near(frame, met_at(frame, Fit(T))[1])
         yield Start(_by_least_squares(frame, T, again))
 
 
-def _by_least_squares(frame: Frame, T_world_object: Floats, seen: Matches) -> Floats:
+def _by_least_squares(frame: Frame, T_world_object: Floats, matches: Matches) -> Floats:
     """Return the pose (4, 4) nearest in least squares to the matches at another pose."""
-    J, offsets = seen.rows()
+    J, offsets = matches.rows()
     residuals = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
     return perturb(T_world_object, least_squares(residuals, free=frame.free)[0])
 
 
-def _with_near(frame: Frame, seen: Matches) -> Matches:
+def _with_near(frame: Frame, matches: Matches) -> Matches:
     """Return matches extended by pairs of missed features and unmatched detections.
 
     Such a pair is within twice the reach of a match: with twice as many coordinates as free
     directions a match that least squares leave out is off twice as far.
     """
     reach = 2 * math.sqrt(2 * frame.rules.judgement.association.reach_squared)  # in σ_ε
-    lost = (seen.weights > 0) & (seen.shares == 0) & (seen.beside < reach)
+    lost = (matches.weights > 0) & (matches.shares == 0) & (matches.beside < reach)
     if not np.count_nonzero(lost):
-        return seen
-    shares, offsets = seen.shares.copy(), seen.offsets.copy()
+        return matches
+    shares, offsets = matches.shares.copy(), matches.offsets.copy()
     for k in np.flatnonzero(lost.any(axis=1)).tolist():
         if (points := frame.views[k].observation.points) is None:
             continue
-        unmatched = np.setdiff1d(np.arange(len(points)), seen.detections[k])
+        unmatched = np.setdiff1d(np.arange(len(points)), matches.detections[k])
         missed, m = np.flatnonzero(lost[k]), points.shape[1]
-        offsets_to = (points[unmatched] - seen.places[k, missed, None, :m]) / seen.sigmas[k]
+        offsets_to = (points[unmatched] - matches.places[k, missed, None, :m]) / matches.sigmas[k]
         distances = np.linalg.norm(offsets_to, axis=2)
         i, j = linear_sum_assignment(np.minimum(distances, reach))
         is_near = distances[i, j] < reach
         chosen = missed[i[is_near]]
-        shares[k, chosen] = seen.weights[k, chosen]
+        shares[k, chosen] = matches.weights[k, chosen]
         offsets[k, chosen, :m] = offsets_to[i[is_near], j[is_near]]
-    is_more = np.count_nonzero(shares) > np.count_nonzero(seen.shares)
-    return replace(seen, shares=shares, offsets=offsets) if is_more else seen
+    is_more = np.count_nonzero(shares) > np.count_nonzero(matches.shares)
+    return replace(matches, shares=shares, offsets=offsets) if is_more else matches
 
 
 def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
@@ -220,11 +220,12 @@ def agreed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable
             yield from _modes(frame, likelihood, T, _moved_to(used, seen), variances)
 
 
-def _moved_to(used: Matches, seen: Matches) -> Matches:
+def _moved_to(used: Matches, matches: Matches) -> Matches:
     """Return the matches seen at another pose as matches of the judged pose, with its sensors."""
-    shift = (seen.places - used.places) / used.sigmas[:, None, None]
-    shares = np.where(used.weights > 0, seen.shares, 0.0)
-    return replace(seen, shares=shares, places=used.places, offsets=seen.offsets + shift, J=used.J)
+    shift = (matches.places - used.places) / used.sigmas[:, None, None]
+    shares = np.where(used.weights > 0, matches.shares, 0.0)
+    offsets = matches.offsets + shift
+    return replace(matches, shares=shares, places=used.places, offsets=offsets, J=used.J)
 
 
 def _modes(
@@ -264,10 +265,10 @@ def _modes(
                 yield Start(T, matches=matches, noise=fit.noise if matches is fit.matches else None)
 
 
-def _is_out_of_step(seen: Matches, variances: Floats, errors: ErrorRules) -> Mask:
+def _is_out_of_step(matches: Matches, variances: Floats, errors: ErrorRules) -> Mask:
     """Test for each sensor (..., L) whether most matches are off: other poses do not help there."""
-    off = errors.are_off(seen, variances[:, None] + seen.extra).sum(axis=-1)
-    return np.asarray(2 * off > np.count_nonzero(seen.shares, axis=-1))
+    off = errors.are_off(matches, variances[:, None] + matches.extra).sum(axis=-1)
+    return np.asarray(2 * off > np.count_nonzero(matches.shares, axis=-1))
 
 
 def _some_sets(count: int, size: int, most: int, seed: int) -> Indices | None:

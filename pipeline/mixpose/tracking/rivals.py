@@ -84,8 +84,8 @@ def _gained_alone(data: Frame, pose: ScoredPose, other: ScoredPose) -> float:
     return _odds(data, pose, used) - _odds(data, pose, common)
 
 
-def _odds(data: Frame, pose: ScoredPose, seen: Matches) -> float:
+def _odds(data: Frame, pose: ScoredPose, matches: Matches) -> float:
     """Return log odds of met and missed features at a pose, against clutter."""
     size, detection = np.array(2 * data.body.radius), data.rules.judgement.detection
-    gained, missed, _ = odds_of(seen, pose.variances, size, detection, None, data.body.surfaces)
+    gained, missed, _ = odds_of(matches, pose.variances, size, detection, None, data.body.surfaces)
     return float(gained + missed)
