@@ -51,7 +51,7 @@ def test_a_row_switches_off_the_kind_of_look_alike_that_it_names(
     wide = [
         one
         for one in starts
-        if one.uncertainty is not None and (one.uncertainty > data.close).any()
+        if one.uncertainty is not None and (one.uncertainty > data.close_uncertainty).any()
     ]
     assert (len(wide), len(starts) - len(wide)) == (tilts, turns)
     assert ("mirrored" in tracker.rules.look_alikes.kinds) == (name != "no mirror image")

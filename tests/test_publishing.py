@@ -24,7 +24,7 @@ from mixpose.records import Estimate, Hypothesis, MeasuredPoint, Moment
 from mixpose.rigid import perturb, twist_between
 from mixpose.session import load_session
 from mixpose.simulation.motion import plan_motion
-from mixpose.tracking import Foreseen
+from mixpose.tracking import PosePredictor
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 SESSION = SYNTHETIC / "two_cameras" / "session.toml"
@@ -157,7 +157,7 @@ def test_poses_ahead_are_published_and_those_of_the_frames_written(
 
 
 def test_pose_ahead_of_a_frame_without_a_time_is_refused() -> None:
-    known = Foreseen(load_session(SESSION).body)
+    known = PosePredictor(load_session(SESSION).body)
     with pytest.raises(SessionError, match=r"^--predict: frame 7 has no time; add fps to"):
         known.after(replace(ESTIMATE, time_s=None))
 
@@ -177,7 +177,7 @@ def test_poses_ahead_err_by_what_their_covariance_says(
         motion = plan_motion(
             np.eye(4), np.zeros(3), translation=100, rotation_deg=30, period_s=2.0, seed=seed
         )
-        rng, known = np.random.default_rng(seed), Foreseen(body)
+        rng, known = np.random.default_rng(seed), PosePredictor(body)
         phases, times = np.random.default_rng(seed + 100).random(6), np.arange(2 * fps) / fps
         shakes, moments = tremor / noise * deviations, (times, times + ahead_s)
         truth, later = (
@@ -205,7 +205,7 @@ def test_poses_ahead_err_by_what_their_covariance_says(
 
 def test_lost_frames_stay_lost_and_hypotheses_are_not_foretold() -> None:
     body = load_session(SESSION).body
-    known = Foreseen(body).after(ESTIMATE)
+    known = PosePredictor(body).after(ESTIMATE)
     lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)
     assert known.after(lost) == known
     assert known.ahead(lost, 0.02).T_world_object is None
@@ -219,7 +219,7 @@ def test_lost_frames_stay_lost_and_hypotheses_are_not_foretold() -> None:
 def test_direction_that_is_not_estimated_is_not_foretold_to_move() -> None:
     body = load_session(SESSION).body
     covariance = np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
-    known = Foreseen(body)
+    known = PosePredictor(body)
     for k in range(5):
         T = perturb(POSE, np.array([k, 0, 0, 0, 0, 0.01 * k]))
         estimate = Estimate(k, 0.1 * k, "tool", "ok", T, covariance, 1.0, {})

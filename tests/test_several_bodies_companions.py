@@ -14,7 +14,7 @@ from mixpose.density import Observation
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.tracking import Companion, Rules, Scene, Track
-from mixpose.tracking.track import either
+from mixpose.tracking.track import mixed_prior
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 
@@ -99,13 +99,13 @@ def test_what_was_beside_is_a_mean_and_a_spread_that_narrows_with_the_frames() -
 
 def test_what_lets_expect_a_pose_is_shared_between_its_own_track_and_another_body() -> None:
     own, near = (-20.0, np.ones(6)), (-8.0, np.full(6, 0.1))
-    fresh = either(own, near, 0, Rules().motion)
+    fresh = mixed_prior(own, near, 0, Rules().motion)
     assert fresh[0] == pytest.approx(-8.0 + np.log(0.5), abs=1e-4)
     assert (fresh[1] == 0.1).all()
     # after a hundred frames without the body half of what was left is left of 0.98^100
-    faded = either(own, near, 100, Rules().motion)
+    faded = mixed_prior(own, near, 100, Rules().motion)
     assert faded[0] == pytest.approx(-8.0 + np.log(0.5 * 0.98**100), abs=1e-4)
-    gone = either(own, near, 2000, Rules().motion)
+    gone = mixed_prior(own, near, 2000, Rules().motion)
     assert gone[0] == pytest.approx(-20.0, abs=1e-6)
 
 

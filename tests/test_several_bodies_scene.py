@@ -92,7 +92,7 @@ def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> No
     small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
     scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
     sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, scene.rules)
-    found = sharing.explained()
+    found = sharing.explain_all()
     hidden = found[0].ranked[:1]
     assert found[1].verdict.status == "ok"
     assert not hidden or hidden[0].log_evidence < 0.0
@@ -114,7 +114,7 @@ def test_identical_bodies_that_are_looked_for_again_are_where_they_were_nearest(
     scene, poses = scene_of(one, one), [at(-120, 10), at(120, -20)]
     tracks, _ = scene.advance(scene.begin(), 0, None, views_of([one] * 2, poses, 4))
     views = views_of([one] * 2, poses, 5)
-    found = Sharing(scene.bodies, tracks, 1, None, views, scene.rules)._found_at_once()
+    found = Sharing(scene.bodies, tracks, 1, None, views, scene.rules)._triangulated_starts()
     # 0.2 px are 0.24 mm at this distance, 240 mm from each other
     for k, T in enumerate(poses):
         assert np.linalg.norm(found[k][0].T_world_object[:3, 3] - T[:3, 3]) < 2.0
@@ -275,7 +275,7 @@ def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -
     three = body("twin", twin.means[:3])
     views = views_of([three], [at(16.0)], 8)
     (track,), _ = scene.advance(tracks, 8, None, views)
-    assert track.known
+    assert track.is_identified
 
 
 def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
@@ -298,19 +298,19 @@ def spots(*points: list[float]) -> Claims:
 def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
     claims = spots([0.0, 0.0], [50.0, 0.0])
     first, second = (np.array([0, 1]), np.array([0.16, 0.0])), (np.array([0]), np.array([0.01]))
-    assert claims.taken({0: first, 1: second}).owners.tolist() == [1, 0]
-    assert claims.taken({1: second, 0: first}).owners.tolist() == [1, 0]
+    assert claims.claimed_by({0: first, 1: second}).owners.tolist() == [1, 0]
+    assert claims.claimed_by({1: second, 0: first}).owners.tolist() == [1, 0]
 
 
 def test_a_spot_between_two_bodies_is_neither_ones_and_one_that_is_met_closely_is() -> None:
     claims, rules = spots([0.0, 0.0], [50.0, 0.0], [99.0, 0.0]), SceneRules()
     loosely, closely = (np.array([0, 2]), np.array([2.25, 2.25])), (np.array([1]), np.array([0.01]))
     places = {0: np.array([[-1.5, 0.0, 0.0], [97.5, 0.0, 0.0]]), 1: np.array([[1.5, 0.0, 0.0]])}
-    taken = claims.taken({0: loosely, 1: closely})
+    taken = claims.claimed_by({0: loosely, 1: closely})
     left = taken.without_merged({0: loosely, 1: closely}, places, rules)
     # what lies beside no other body's feature is off for another reason
     assert left.owners.tolist() == [-2, 1, 0]
-    assert left.left(0).tolist() == [False, False, True]
+    assert left.available(0).tolist() == [False, False, True]
 
 
 def test_a_spot_that_two_bodies_share_pulls_neither_of_them() -> None:

@@ -59,7 +59,7 @@ def test_a_body_is_where_it_was_expected_though_a_third_of_it_is_hidden(
         views = [view for view in views_of(shown, poses, frame) if view.name == name]
         assert views[0].observation.cells == 2 * (12 - hidden) + 1
         if frame == 5:  # what is not where it was expected would be looked for everywhere
-            monkeypatch.setattr(Sharing, "_on_the_rest", noted)
+            monkeypatch.setattr(Sharing, "_fit_unclaimed", noted)
         tracks, told = scene.advance(tracks, frame, frame / 10, views)
     assert waiting == [[], []]
     assert [one.status for one in told] == ["ok", "ok"]

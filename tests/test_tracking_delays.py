@@ -115,7 +115,7 @@ def test_what_frames_tell_of_delays_leaves_out_what_pose_and_velocity_explain() 
     best = tracker.explain(frame)[0]
     found, before = delays_after(frame, best), track.delays
     assert found.names == ("side",)
-    met, expected = offsets_of(frame, best.used), frame.expected(best.T_world_object)
+    met, expected = offsets_of(frame, best.used), frame.expected_velocity(best.T_world_object)
     # a feature that nothing meets says nothing, not even how many there are
     shares = best.used.shares.copy()
     shares[1, 0] = 0.0

@@ -12,20 +12,20 @@ from matches import Seen, scored
 from mixpose.fit import EstimatorOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.doubt import FEW, decided, of_other_things
+from mixpose.tracking.doubt import FEW, decide_frame, log_odds_other
 
 
 def odds(cameras: list[PinholeCamera], *met: int, known: bool = False, in_view: int = 8) -> float:
     """Of another thing, where each camera meets so many of the features, from the first on."""
     views = [view_of(str(k), cameras[k], np.ones((1, 2))) for k in range(len(met))]
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = replace(tracker.begin(), known=known)
+    track = replace(tracker.begin(), is_identified=known)
     numbers = np.arange(in_view)
     seen = [
         Seen(np.zeros((in_view, 2, 6)), str(k), shares=np.where(numbers < each, 1.0, 0.0))
         for k, each in enumerate(met)
     ]
-    return of_other_things(tracker.data(track, 0, None, views), scored(TRUTH, *seen))
+    return log_odds_other(tracker.data(track, 0, None, views), scored(TRUTH, *seen))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_frame_is_ok_from_the_confidence_that_the_session_asks_for(
     pose = replace(scored(TRUTH, *seen), log_evidence=np.log(100.0))
     for confidence, expected in ((0.9, "ok"), (0.99, "ok"), (0.991, "ambiguous")):
         tracker = Tracker.create(EIGHT, EstimatorOptions(confidence=confidence), TRUTH)
-        verdict = decided(tracker.data(tracker.begin(), 0, None, views), [pose])
+        verdict = decide_frame(tracker.data(tracker.begin(), 0, None, views), [pose])
         assert verdict.status == expected
         assert verdict.confidence == pytest.approx(100 / 101, abs=1e-5)
 
@@ -88,7 +88,7 @@ def test_a_pose_that_meets_few_markers_of_many_is_ambiguous(
     tracker = Tracker.create(EIGHT, EstimatorOptions())
     views = [view_of(str(k), pinhole_cameras[k], np.ones((4, 2))) for k in range(2)]
     pose = replace(scored(TRUTH, *seen), log_evidence=30.0)
-    verdict = decided(tracker.data(tracker.begin(), 0, None, views), [pose])
+    verdict = decide_frame(tracker.data(tracker.begin(), 0, None, views), [pose])
     assert verdict.doubt == expected
     assert verdict.status == ("ambiguous" if expected else "ok")
 

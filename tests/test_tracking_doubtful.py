@@ -28,7 +28,7 @@ def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
 
 def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = replace(tracker.begin(), met_before={"0": 5}, believed=3, frame=0)
+    track = replace(tracker.begin(), met_before={"0": 5}, ok_count=3, frame=0)
 
     def doubted(
         track: Track, met: int, log_evidence: float = 20.0, ratio: float = 0.5, count: int = 8
@@ -57,7 +57,7 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     )
     assert is_doubtful(data, [judged])
     for other in (
-        replace(track, believed=2),
+        replace(track, ok_count=2),
         replace(track, misses=1),
         replace(track, doubted=True),
         replace(track, branches=2 * track.branches),
@@ -71,7 +71,7 @@ def test_in_the_first_frames_what_is_met_farther_off_than_chance_makes_it_is_loo
     convincing = scored(TRUTH, of_eight("0", 8.0))
 
     def doubted(believed: int, ratio: float, **other: Any) -> bool:
-        track = replace(tracker.begin(), believed=believed)
+        track = replace(tracker.begin(), ok_count=believed)
         judged = replace(convincing, residual_ratio=ratio, **other)
         return is_doubtful(tracker.data(track, 1, None, []), [judged])
 

@@ -69,7 +69,8 @@ def test_a_proposer_of_ones_own_is_a_function_that_yields_starts(
     views = detect(pinhole_cameras, EIGHT, elsewhere, noise=0.1, false=3, hidden=1)
 
     def told(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-        return [] if ranked else [Start(perturb(elsewhere, np.full(6, 0.01)), frame.close)]
+        near = perturb(elsewhere, np.full(6, 0.01))
+        return [] if ranked else [Start(near, frame.close_uncertainty)]
 
     tracker = replace(Tracker.create(EIGHT, EstimatorOptions()), proposers=(told,))
     estimate = first_frame(tracker, views)
@@ -247,7 +248,7 @@ def test_what_is_met_far_off_in_part_is_looked_for_elsewhere(
     doubtful = []
     for turned in (0, 2):
         turn = from_rotation_vector([0.0, 0.0, turned * 2 * np.pi / 7], np.zeros(3))
-        start = Start(TRUTH @ turn, data.close)
+        start = Start(TRUTH @ turn, data.close_uncertainty)
         judged = likelihood.judge(likelihood.fit(start), start)
         assert judged.coverage > 0.9
         assert data.is_expected(judged.T_world_object)
@@ -270,7 +271,7 @@ def test_what_nobody_expected_and_misses_features_is_looked_for_elsewhere(
     # features that are hidden are the same in all frames: no more are missed than before
     views = detect(pinhole_cameras, EIGHT, T, noise=0.1, seed=9, hidden=hidden)
     data = tracker.data(track, 6, None, views)
-    likelihood, start = likelihood_of(data), Start(T, data.close)
+    likelihood, start = likelihood_of(data), Start(T, data.close_uncertainty)
     judged = likelihood.judge(likelihood.fit(start), start)
     assert rotation_angle_deg(judged.T_world_object, T) < 1.0
     assert (judged.coverage < 1) == (hidden > 0)

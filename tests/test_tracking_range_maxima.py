@@ -25,7 +25,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.proposers import predicted, within
 from mixpose.tracking.ranges import AssociationLikelihood, sum_associations
-from mixpose.tracking.rivals import odds_beside
+from mixpose.tracking.rivals import log_odds_against
 
 Floats = NDArray[np.float64]
 SIGMA = 0.02
@@ -128,7 +128,7 @@ def test_what_frames_tell_of_two_maxima_adds_up() -> None:
     assert len(data.predictions) > 1
     assert len(rivals) > 1
     for one in rivals:
-        assert odds_beside(data, one, best) == ahead(one, best)
+        assert log_odds_against(data, one, best) == ahead(one, best)
 
 
 def test_starts_that_lead_to_one_maximum_are_one_and_far_behind_ones_none() -> None:
@@ -165,8 +165,8 @@ def test_an_ellipsoid_holds_where_a_pose_is_if_one_detection_is_false() -> None:
     detection, rules = data.rules.judgement.detection, data.rules.acceptance
     found = sum_associations(data.views, data.body, T[None], likelihood._noise, detection)
     curved = likelihood._posterior(likelihood._noise, second=True).linearise(T[None])
-    information = likelihood._definite(curved) + np.diag(1 / data.anywhere[1] ** 2)
-    twists, likely = likelihood._beside(T, found, information)
+    information = likelihood._definite(curved) + np.diag(1 / data.flat_prior[1] ** 2)
+    twists, likely = likelihood._alternatives(T, found, information)
     some = twists[likely > 1 - rules.confidence]
     limit = chdtri(6, 1 - rules.confidence)
     # if it is right they are far outside
@@ -188,7 +188,7 @@ def test_a_pose_is_expected_as_much_as_the_prediction_is_believed() -> None:
     first = data.predictions[0]
     T = first.T_world_object[None]
     whole, little = (
-        replace(data, predictions=[replace(first, weight=weight)]).expectation(T)[0]
+        replace(data, predictions=[replace(first, weight=weight)]).log_densities(T)[0]
         for weight in (1.0, 1e-2)
     )
     # of the rest, that it is anywhere, there is next to nothing so near
@@ -201,7 +201,7 @@ def test_beside_a_camera_poses_that_are_hardly_likely_are_no_starts() -> None:
     camera = PinholeCamera(K, np.zeros(5), (640, 480), np.eye(4))
     seen = View("camera", camera, Observation(PointPattern(np.zeros((1, 2)), np.ones(1)), 1.0))
     assert len(predicted(data, [])) == len(data.predictions)
-    beside = data.seen_otherwise(views=[*data.views, seen])
+    beside = data.changed(views=[*data.views, seen])
     assert 0 < len(predicted(beside, [])) < len(data.predictions)
     assert list(within(beside, [])) == []
 

@@ -29,7 +29,7 @@ from mixpose.tracking.frame import Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.ranges import (
     AssociationTerm,
-    _summed,
+    _sum_and_shares,
     are_associated,
     noise_ratio,
     sum_associations,
@@ -100,12 +100,12 @@ def sum_by_hand(odds: Floats, used: frozenset[int] = frozenset()) -> float:
 
 def test_the_sum_over_associations_is_that_of_all_of_them() -> None:
     odds = 5 * np.random.default_rng(0).random((2, 3, 4))
-    total, shares = _summed(odds)
+    total, shares = _sum_and_shares(odds)
     assert total == pytest.approx([sum_by_hand(one) for one in odds], rel=1e-12)
     # how probable a pair is: the derivative of the logarithm by that of its odds
     more = odds.copy()
     more[:, 1, 2] *= 1 + 1e-6
-    slope = np.log(_summed(more)[0] / total) / 1e-6
+    slope = np.log(_sum_and_shares(more)[0] / total) / 1e-6
     assert shares[:, 1, 2] == pytest.approx(slope, rel=1e-4)
 
 

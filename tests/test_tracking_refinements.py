@@ -29,7 +29,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.refinements import (
-    _carry,
+    _has_leverage,
     _paired,
     agreed,
     all_near,
@@ -286,7 +286,7 @@ def test_others_are_asked_where_spots_that_are_off_can_carry_them(
         noise = np.sqrt(data.variances)[:, None, None]
         J, offsets = used.J / noise[..., None], used.offsets / noise
         met = J[used.shares > 0]
-        assert _carry(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
+        assert _has_leverage(met, J[off], offsets[off], data.rules.fit) == (body is EIGHT)
 
 
 def test_a_sensor_that_meets_one_of_eight_beside_others_may_meet_it_by_chance(
@@ -298,7 +298,7 @@ def test_a_sensor_that_meets_one_of_eight_beside_others_may_meet_it_by_chance(
     spots = np.concatenate([aside + np.array([40.0, 25.0]), aside[:1] + np.array([2.0, 2.0])])
     views = [view_of("0", pinhole_cameras[0], spots), view_of("1", pinhole_cameras[1], seen)]
     data = tracker.data(track, 6, 6 / 30, views)
-    likelihood, here = likelihood_of(data), Start(TRUTH, data.close)
+    likelihood, here = likelihood_of(data), Start(TRUTH, data.close_uncertainty)
     judged = likelihood.judge(likelihood.fit(here), here)
     assert judged.matches.met[0] == 1.0
     (without,) = without_sensor(data, likelihood, judged)
@@ -323,7 +323,7 @@ def test_what_a_prediction_meets_as_the_pose_does_shows_no_other_mode(
         y[2] += [1.0 * (k == 0), 0.0]
         views.append(view_of(str(k), camera, y))
     data = tracker.data(track, 6, 6 / 30, views)
-    likelihood, here = likelihood_of(data), Start(moved, data.close)
+    likelihood, here = likelihood_of(data), Start(moved, data.close_uncertainty)
     judged = likelihood.judge(likelihood.fit(here), here)
     noise = data.variances[:, None]
     assert data.rules.judgement.noise.errors.are_off(judged.used, noise)[0, 2]

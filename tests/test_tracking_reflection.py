@@ -14,7 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.doubt import of_reflection
+from mixpose.tracking.doubt import reflection_mistake
 from mixpose.tracking.mirrors import MIRRORED as MIRROR_IMAGE
 
 Floats = NDArray[np.float64]
@@ -174,5 +174,5 @@ def test_of_a_pose_that_meets_nothing_as_sensors_stand_no_odds_of_a_mirror_are_a
     data = tracker.data(tracker.begin(), 0, None, views)
     best = tracker.explain(data)[0]
     away = replace(best, T_world_object=perturb(TRUTH, np.array([40.0, 0, 0, 0, 0, 0])))
-    assert of_reflection(data, best).log_odds != -np.inf
-    assert not np.isnan(of_reflection(data, away).log_odds)
+    assert reflection_mistake(data, best).log_odds != -np.inf
+    assert not np.isnan(reflection_mistake(data, away).log_odds)

@@ -17,7 +17,7 @@ from mixpose.records import Estimate
 from mixpose.rigid import covariance_at, from_parts, from_rotation_vector, inverse
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker
-from mixpose.tracking.rivals import odds_beside
+from mixpose.tracking.rivals import log_odds_against
 from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
@@ -78,7 +78,7 @@ def test_of_all_frames_that_tell_two_poses_apart_the_one_counts_that_tells_most(
         replace(scored(T, *SEEN), log_evidence=evidence)
         for T, evidence in ((TRUTH, 50.0), (aside, 50.0 + before + now))
     )
-    odds = odds_beside(data, rival, best)
+    odds = log_odds_against(data, rival, best)
     assert odds == pytest.approx(before if expected is None else expected, abs=1e-3)
 
 

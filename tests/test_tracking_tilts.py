@@ -12,7 +12,7 @@ from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, twist_between
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.tracker import judged_again
+from mixpose.tracking.tracker import judge_again
 
 CAMERA = PinholeCamera(
     np.array([[900.0, 0, 400], [0, 900.0, 300], [0, 0, 1]]), resolution=(800, 600)
@@ -78,7 +78,7 @@ def test_a_tilt_that_moved_with_another_is_as_likely_when_it_is_judged_again() -
         views = detect([CAMERA], plate(0), T, noise=0.15, seed=frame)
         data = tracker.data(track, frame, frame / 30, views)
         ranked = tracker.explain(data)
-        again = judged_again(data, ranked)
+        again = judge_again(data, ranked)
         for one, other in zip(ranked, again, strict=True):
             if one.T_moved is not None:
                 asked += 1

@@ -25,7 +25,7 @@ from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker, predict
 from mixpose.tracking.frame import follow
-from mixpose.tracking.motion import Course, MotionRules, RandomWalk
+from mixpose.tracking.motion import MotionFilter, MotionRules, RandomWalk
 from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
@@ -224,12 +224,12 @@ def test_a_start_may_be_as_far_off_as_is_said() -> None:
 
 def test_a_course_goes_on_by_its_derivatives_and_spreads_by_what_jerk_may_do() -> None:
     """Place, velocity, acceleration and jerk by Taylor; a random walk of the jerk, integrated."""
-    course, seconds = Course.begun(np.ones(6), EIGHT.radius, RULES), 0.3
+    course, seconds = MotionFilter.begun(np.ones(6), EIGHT.radius, RULES), 0.3
     state = np.array([1.0, 2.0, 3.0, 4.0])
     course = replace(
         course, means=course.means + state, covariances=np.zeros_like(course.covariances)
     )
-    means, covariances = course._foretold(seconds)
+    means, covariances = course._predicted(seconds)
     t = seconds
     taylor = [
         1 + 2 * t + 3 * t**2 / 2 + 4 * t**3 / 6,
@@ -252,7 +252,7 @@ def test_the_velocity_of_steady_motion_is_known_better_than_by_two_poses() -> No
     squared = []
     for seed in range(10):
         off = deviation * np.random.default_rng(seed).standard_normal((80, 6))
-        course = Course.begun(deviation, EIGHT.radius, RULES)
+        course = MotionFilter.begun(deviation, EIGHT.radius, RULES)
         for step in velocity * seconds + np.diff(off, axis=0):
             course = course.followed(step, deviation, seconds)
         told = course.expected(None, 0.0)
@@ -282,7 +282,7 @@ def test_directions_that_are_held_tell_no_motion_from_another() -> None:
     """Held ones never move, so that the steadiest filter foretells them best."""
     free, held = np.repeat([0.1, 0.002], 3), np.array([0.1, 0.1, 0.1, 0.0, 0.0, 0.0])
     step = np.array([5.0, -3.0, 2.0, 0.0, 0.0, 0.0])
-    courses = [Course.begun(each, EIGHT.radius, RULES) for each in (free, held)]
+    courses = [MotionFilter.begun(each, EIGHT.radius, RULES) for each in (free, held)]
     for k in range(12):
         moved = step * np.cos(k)
         courses = [

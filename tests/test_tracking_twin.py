@@ -15,10 +15,10 @@ from mixpose.judgement import ScoredPose
 from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector
 from mixpose.tracking import TWICE, Scene, Tracker
-from mixpose.tracking.doubt import decided
+from mixpose.tracking.doubt import decide_frame
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, mirrored
+from mixpose.tracking.mirrors import IN_A_MIRROR, mirror_odds
 
 FLAT = body("flat", TOOL * [1.0, 1.0, 0.0])
 SOLID = body("solid", TOOL)
@@ -229,7 +229,7 @@ def frame_of(tracked: Body, T: Floats, T_other: Floats) -> tuple[Frame, ScoredPo
     tracker = Tracker.create(tracked, OPTIONS)
     data = tracker.data(tracker.begin(), 0, None, views_of([tracked] * 2, [T, T_other], 0))
     likelihood = likelihood_of(data)
-    starts = [Start(each, data.close) for each in (T, T_other)]
+    starts = [Start(each, data.close_uncertainty) for each in (T, T_other)]
     one, other = (likelihood.judge(likelihood.fit(start), start) for start in starts)
     return data, one, other
 
@@ -243,11 +243,11 @@ def test_two_poses_are_mirrored_only_about_a_plane_between_them() -> None:
         (THERE, False),
     ):
         data, one, other = frame_of(FLAT, T, there)
-        odds, is_first = mirrored(data, one, other)
+        odds, is_first = mirror_odds(data, one, other)
         # a turn within 2π that is known to 3e-3, and two shifts within 300 mm to 0.5 mm
         assert (odds > 12.0) == is_mirrored
         assert (odds < 0.0) != is_mirrored
-        back, is_other = mirrored(data, other, one)
+        back, is_other = mirror_odds(data, other, one)
         assert back == pytest.approx(odds, rel=1e-3)
         assert not is_mirrored or (is_first and not is_other)
 
@@ -257,30 +257,30 @@ def test_no_body_reaches_through_a_mirror() -> None:
     T, tilted = at(0.0), at(0.0)
     tilted[:3, :3] = np.diag([1.0, 1.0, -1.0]) @ T[:3, :3] @ np.diag([1.0, 1.0, -1.0])
     data, one, other = frame_of(FLAT, T, tilted)
-    assert mirrored(data, one, other)[0] == -np.inf
+    assert mirror_odds(data, one, other)[0] == -np.inf
     # and what is not flat has no mirror image that looks like it
     data, one, other = frame_of(SOLID, T, in_mirror(T))
-    assert mirrored(data, one, other)[0] == -np.inf
+    assert mirror_odds(data, one, other)[0] == -np.inf
 
 
 def test_what_two_poses_explain_alike_is_in_no_mirror() -> None:
     """A mirror image is seen beside the body; of two tilts of a small body the one is no image."""
     T = at(-60.0)
     data, one, other = frame_of(FLAT, T, in_mirror(T))
-    assert [each for each, _ in decided(data, [one, other]).kept] == [one]
+    assert [each for each, _ in decide_frame(data, [one, other]).kept] == [one]
     # of the features in two cameras half are met by the same detections, then all
     for alike in (1, 2):
         by = other.matches.detections.copy()
         by[:alike] = one.matches.detections[:alike]
         same = replace(other, matches=replace(other.matches, detections=by))
-        assert {id(each) for each, _ in decided(data, [one, same]).kept} == {id(one), id(same)}
+        assert {id(each) for each, _ in decide_frame(data, [one, same]).kept} == {id(one), id(same)}
 
 
 def test_a_solid_body_that_looks_the_same_in_a_mirror_is_told_from_its_image() -> None:
     roof = np.array([[50, 0, 0], [-50, 0, 0], [0, 40, 30], [0, -40, 30], [0, 70, -10.0]])
     T = at(-60.0, turn=0.3)
     data, one, other = frame_of(body("roof", roof), T, in_mirror(T, (-1.0, 1.0, 1.0)))
-    odds, is_first = mirrored(data, one, other)
+    odds, is_first = mirror_odds(data, one, other)
     assert odds > 12.0
     assert is_first
 

@@ -27,7 +27,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-met-however-far-off",
         "tracking/ranges.py",
-        "ahead = float((found.most - spare / 2 - found.log_odds)[0])",
+        "ahead = float((sums.most - residual_degrees / 2 - sums.log_odds)[0])",
         "ahead = 0.0",
         "a body that is elsewhere is not looked for where it hardly meets anything",
         (_RANGES,),
@@ -59,7 +59,7 @@ MUTANTS = (
     Mutant(
         "tracking-one-more-than-count-is-no-surprise",
         "tracking/sharing.py",
-        "lacking = {id(one.body) for k, one in enumerate(self.bodies) if k not in self.claimed}",
+        "lacking = {kind for k, kind in enumerate(kinds) if k not in self.claimed}",
         "lacking = {id(one.body) for one in self.bodies if one.instance is not None}",
         "an unknown thing is followed in place of one of two equal bodies that leaves",
         ("test_tracking_twin.py",),
@@ -123,8 +123,8 @@ MUTANTS = (
     Mutant(
         "tracking-a-second-pose-however-far-off",
         "tracking/twin.py",
-        "told_by = odds, _more_missed(best, second, data), farther, elsewhere",
-        "told_by = odds, _more_missed(best, second, data), elsewhere",
+        "reasons = odds, _by_misses(best, second, data), farther, elsewhere",
+        "reasons = odds, _by_misses(best, second, data), elsewhere",
         "an unknown tool with three markers alike is taken for a second body",
         ("test_tracking_twin.py",),
     ),

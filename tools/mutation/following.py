@@ -92,7 +92,7 @@ _PREDICTION = (
     Mutant(
         "tracking-prediction-of-one-symmetric-pose",
         "tracking/frame.py",
-        "T = nearest_alike(T_world_object, self.body, one.T_world_object)",
+        "T = nearest_alike(T_world_object, self.body, branch.T_world_object)",
         "T = T_world_object",
         "a pose that looks as predicted counts as unexpected",
         (_TRACK,),
@@ -132,9 +132,10 @@ _PREDICTION = (
     Mutant(
         "tracking-fast-bodies-expected-at-rest",
         "tracking/frame.py",
-        "return branch.course.expected(moved if is_there else None, elapsed)",
-        "expected = branch.course.expected(moved if is_there else None, elapsed)\n"
-        "        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected",
+        "return branch.motion_filter.expected(moved if seen else None, elapsed)",
+        "expected = branch.motion_filter.expected(moved if seen else None, elapsed)\n"
+        "        return resting if (np.abs(expected.velocity) > resting.deviation).any() "
+        "else expected",
         "late cameras contradict each other where a body moves faster than most",
         (_TWIN,),
     ),
@@ -149,8 +150,8 @@ _PREDICTION = (
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "np.linalg.norm(away, axis=1).argmin()",
-        "np.linalg.norm(away, axis=1).argmax()",
+        "np.linalg.norm(twists, axis=1).argmin()",
+        "np.linalg.norm(twists, axis=1).argmax()",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),
@@ -195,7 +196,7 @@ _GATING = (
     Mutant(
         "tracking-windows-for-ever",
         "tracking/scene.py",
-        "in_turn = any(one.is_in_turn(frame, self.scene.rules.thorough) for one in tracks)",
+        "in_turn = any(track.is_in_turn(frame, self.scene.rules.thorough) for track in tracks)",
         "in_turn = False",
         "what enters the view elsewhere is never seen",
         ("test_runner_windows.py",),
@@ -235,16 +236,16 @@ _GATING = (
     Mutant(
         "tracking-windows-of-the-last-branch",
         "tracking/scene.py",
-        "np.where(seen, at.y - margins, np.inf).min(axis=(1, 2))",
-        "np.where(seen, at.y - margins, np.inf)[:, -1].min(axis=1)",
+        "np.where(seen, images.y - margins, np.inf).min(axis=(1, 2))",
+        "np.where(seen, images.y - margins, np.inf)[:, -1].min(axis=1)",
         "of two possible poses one is not looked at",
         (_WINDOWS,),
     ),
     Mutant(
         "tracking-windows-begin-at-hidden-features",
         "tracking/scene.py",
-        "lower = np.where(seen, at.y - margins, np.inf)",
-        "lower = np.where(True, at.y - margins, np.inf)",
+        "lower = np.where(seen, images.y - margins, np.inf)",
+        "lower = np.where(True, images.y - margins, np.inf)",
         "windows reach to features that no camera sees",
         (_WINDOWS,),
     ),
@@ -324,8 +325,8 @@ _NOISE = (
     Mutant(
         "tracking-merged-spots-pull-by-all-that-they-are-off",
         "tracking/refinements.py",
-        "seen.shares * weights",
-        "seen.shares",
+        "matches.shares * weights",
+        "matches.shares",
         "a spot of two features that is cut bends the pose",
         ("test_tracking_refinements.py",),
     ),
@@ -335,8 +336,8 @@ _SHARING = (
     Mutant(
         "tracking-merged-spots-stay-with-one-body",
         "tracking/claims.py",
-        "owners[loose[near]] = -2",
-        "owners[loose[near]] = k",
+        "owners[loose[is_near]] = -2",
+        "owners[loose[is_near]] = k",
         "a spot that is two bodies' pulls at one of them",
         ("test_several_bodies_scene.py",),
     ),

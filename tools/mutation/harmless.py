@@ -235,8 +235,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "tracking/proposers.py",
-        "(few,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()",
-        "(few,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
+        "(chosen,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()",
+        "(chosen,) = (most * (1 - near[1:] * max(near[0], 1e-12)) < least).nonzero()",
         "only speed: more poses are looked up, as counts are at least 1",
     ),
     Harmless(

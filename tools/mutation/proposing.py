@@ -61,15 +61,15 @@ _PROPOSALS = (
     Mutant(
         "tracking-another-sensor-left-out",
         "tracking/refinements.py",
-        "names = [seen.names[k] for k in np.flatnonzero(apart[seen.owner])]",
-        "names = [seen.names[k - 1] for k in np.flatnonzero(apart[seen.owner])]",
+        "names = [matches.names[k] for k in np.flatnonzero(apart[matches.owner])]",
+        "names = [matches.names[k - 1] for k in np.flatnonzero(apart[matches.owner])]",
         "of three cameras a sound one is left out",
         (_STARTS,),
     ),
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
         "tracking/refinements.py",
-        "if apart := disagreeing(seen, rules, frame.rules.judgement.noise):",
+        "if apart := disagreeing(matches, rules, frame.rules.judgement.noise):",
         "if apart := []:",
         "a camera that was bumped bends the pose",
         (_STARTS,),
@@ -85,7 +85,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-three-markers-of-eight-are-the-body",
         "tracking/doubt.py",
-        "    yield Alternative(FEW, of_other_things(data, best))",
+        "    yield Alternative(FEW, log_odds_other(data, best))",
         "    yield from ()",
         "three markers of another body pass for this one where it was not expected",
         ("test_tracking_doubt.py",),
@@ -93,15 +93,15 @@ _PROPOSALS = (
     Mutant(
         "tracking-markers-met-by-chance-tell-a-body",
         "tracking/doubt.py",
-        "np.minimum(seen.met_by / max(len(data.views) / 2, 1), 1).sum()",
-        "np.minimum(seen.met_by, 1).sum()",
+        "np.minimum(matches.met_by / max(len(data.views) / 2, 1), 1).sum()",
+        "np.minimum(matches.met_by, 1).sum()",
         "a marker that one camera of many meets by chance counts as one of the body's",
         ("test_tracking_doubt.py",),
     ),
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "more = best.log_evidence - told",
+        "more = best.log_evidence - evidence",
         "more = 0.0",
         "another body that looks alike to one camera is ok after a frame or two",
         (_STARTS,),
@@ -173,16 +173,16 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers.py",
-        "yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)",
-        "yield Start(poses[0], frame.close, T_moved=moved)",
+        "yield frame.rival(best, T_alike, frame.close_uncertainty, T_moved=moved, left_out=out)",
+        "yield Start(poses[0], frame.close_uncertainty, T_moved=moved)",
         "a chessboard is followed a square off",
         (_STARTS,),
     ),
     Mutant(
         "tracking-slips-along-the-world",
         "tracking/proposers.py",
-        "(T @ one.T_body_other for one in alike)",
-        "(one.T_body_other @ T for one in alike)",
+        "(T @ part.T_body_other for part in alike)",
+        "(part.T_body_other @ T for part in alike)",
         "a chessboard that is turned is followed a square off",
         (_STARTS,),
     ),
@@ -197,8 +197,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers.py",
-        "for one in (*likely, frame.beside)",
-        "for one in (*likely[:1], frame.beside)",
+        "for branch in (*likely, frame.companion_prediction)",
+        "for branch in (*likely[:1], frame.companion_prediction)",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),
@@ -272,7 +272,8 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            near = max([_evidence(there, one) for one in starts]) - own",
+        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
+        "body_evidence",
         "            near = -math.inf",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
@@ -280,7 +281,8 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            near = max([_evidence(there, one) for one in starts]) - own",
+        "            near = max([_evidence(mirror_frame, start) for start in starts]) - "
+        "body_evidence",
         "            near = 9.0",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),
@@ -296,7 +298,8 @@ _REFLECTION = (
     Mutant(
         "tracking-a-body-given-mirrored-passes",
         "tracking/doubt.py",
-        "    return next((odds for odds in found if odds > likely), near if asked else -math.inf)",
+        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
+        "-math.inf)",
         "    return -math.inf",
         "few markers of a body given mirrored are met by chance, and the pose is ok",
         ("test_tracking_reflection.py",),
@@ -304,16 +307,17 @@ _REFLECTION = (
     Mutant(
         "tracking-nothing-tells-against-a-mirrored-body",
         "tracking/doubt.py",
-        "if one.log_odds > 0 or one.name == MIRRORED",
-        "if one.log_odds > 0",
+        "if mistake.log_odds > 0 or mistake.name == MIRRORED",
+        "if mistake.log_odds > 0",
         "frames whose markers are hidden are ambiguous, though others showed the body itself",
         ("test_tracking_reflection.py",),
     ),
     Mutant(
         "tracking-few-markers-are-a-mirror-image",
         "tracking/doubt.py",
-        "    return next((odds for odds in found if odds > likely), near if asked else -math.inf)",
-        "    return next((9.0 for odds in found), -math.inf)",
+        "    return next((odds for odds in log_odds if odds > likely), near if is_asked else "
+        "-math.inf)",
+        "    return next((9.0 for odds in log_odds), -math.inf)",
         "a body whose markers are hidden beside false points is never sure",
         ("test_tracking_reflection.py",),
     ),

@@ -18,7 +18,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-any-clutter",
         "tracking/ranges.py",
-        "false = np.maximum(found - probability * expected, 1 - probability)",
+        "false = np.maximum(M - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
         (_RANGES,),
@@ -42,7 +42,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-open-directions-unbounded",
         "tracking/ranges.py",
-        "information += np.diag(1 / frame.anywhere[1][free] ** 2)",
+        "information += np.diag(1 / frame.flat_prior[1][free] ** 2)",
         "information += 0",
         "directions that ranges leave open have no bound",
         (_RANGES,),
@@ -58,7 +58,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-maxima-forgotten",
         "tracking/tracker.py",
-        "sorted(verdict.faint if fuse else (), key=lambda each: -each[1])",
+        "sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])",
         "list[tuple[ScoredPose, float]]()",
         "where frames tell that another turn is right, that has to be found anew in one of them",
         (_MAXIMA,),
@@ -122,7 +122,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-unlikely-poses-expected-as-likely-ones",
         "tracking/frame.py",
-        "logs = np.logaddexp(logs, one.log_belief(surprise) + near)",
+        "logs = np.logaddexp(logs, branch.log_belief(surprise) + near)",
         "logs = np.logaddexp(logs, near)",
         "where the track is most likely wrong a better pose elsewhere is not looked for",
         (_MAXIMA,),
@@ -138,8 +138,8 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-few-are-too-few",
         "tracking/ranges.py",
-        "spare = np.maximum(found.reached - count, 0.0)",
-        "spare = found.reached - count",
+        "residual_degrees = np.maximum(sums.reached - count, 0.0)",
+        "residual_degrees = sums.reached - count",
         "fewer ranges than directions are searched again in every frame",
         (_MAXIMA,),
     ),

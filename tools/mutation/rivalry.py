@@ -18,7 +18,7 @@ MUTANTS = (
     Mutant(
         "tracking-a-row-too-many-is-chance",
         "tracking/rivals.py",
-        "max(_of_more_than_told(data, rival, best), 0.0)",
+        "max(_gain_by_more_features(data, rival, best), 0.0)",
         "0.0",
         "of a board with a row more than told the row that is met closer is ok",
         (_RIVALS,),
@@ -34,8 +34,8 @@ MUTANTS = (
     Mutant(
         "tracking-sensors-are-not-asked-each-alone",
         "tracking/twin.py",
-        "if (apart := _sure_by(data, others)) is not None:",
-        "if (apart := None) is not None:",
+        "if (contrary := _sure_pose_by(data, others)) is not None:",
+        "if (contrary := None) is not None:",
         "of two cameras one shows an old frame, and is ok",
         (_RIVALS,),
     ),
@@ -65,7 +65,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-covariance-of-the-middle",
-        "tracking/telling.py",
+        "tracking/reporting.py",
         "covariance = covariance_at(covariance, T[:3, :3] @ origin)",
         "covariance_at(covariance, T[:3, :3] @ origin)",
         "a tip that is far from the markers seems to be known as well as they are",
@@ -106,7 +106,7 @@ MUTANTS = (
     Mutant(
         "tracking-contradictions-of-second-poses-are-forgotten",
         "tracking/doubt.py",
-        "mistaken = {**mistaken, CONTRADICTION: _as_likely_as_not(data)}",
+        "mistaken = {**mistaken, CONTRADICTION: _even_odds(data)}",
         "mistaken = {**mistaken}",
         "the same, where the other camera was asked alone",
         (_RIVALS,),
@@ -146,8 +146,8 @@ MUTANTS = (
     Mutant(
         "tracking-near-spots-are-not-fitted",
         "tracking/refinements.py",
-        "return replace(seen, shares=shares, offsets=offsets) if is_more",
-        "return replace(seen, shares=shares) if is_more",
+        "return replace(matches, shares=shares, offsets=offsets) if is_more",
+        "return replace(matches, shares=shares) if is_more",
         "what is nearly met is taken for met exactly",
         ("test_tracking_refinements.py",),
     ),
@@ -162,7 +162,7 @@ MUTANTS = (
     Mutant(
         "tracking-second-poses-may-be-off",
         "tracking/twin.py",
-        "return (spots[1] - spots[0]) * _of_one_cut(data)",
+        "return (spots[1] - spots[0]) * _log_cut(data)",
         "return 0.0",
         "what differs from the body by a marker makes frames ambiguous, or is it once that is cut",
         ("test_tracking_twin.py",),
@@ -170,8 +170,8 @@ MUTANTS = (
     Mutant(
         "tracking-what-told-two-poses-apart-is-forgotten",
         "tracking/twin.py",
-        "is_told = is_image or elsewhere < accepted.log_doubt",
-        "is_told = is_image",
+        "is_decided = is_image or elsewhere < accepted.log_doubt",
+        "is_decided = is_image",
         "the same, where two of the body's markers are hidden later",
         ("test_tracking_twin.py",),
     ),

@@ -56,8 +56,8 @@ MUTANTS = (
     Mutant(
         "tracking-held-directions-tell-motion",
         "tracking/motion.py",
-        "seen = np.where(deviation > 0, -0.5 * (np.log(variance) + off), 0.0)",
-        "seen = -0.5 * (np.log(variance) + off)",
+        "logs_now = np.where(deviation > 0, -0.5 * (np.log(variance) + off), 0.0)",
+        "logs_now = -0.5 * (np.log(variance) + off)",
         "of a body whose tilt is held steady motion is believed whatever it does",
         ("test_tracking_track.py",),
     ),

@@ -166,7 +166,7 @@ def pose_near(
         data = tracker.data(track, number, _BEGIN_S, views)
         if not data.views:
             return None
-        likelihood, start = likelihood_of(data), Start(T_world_object, data.close)
+        likelihood, start = likelihood_of(data), Start(T_world_object, data.close_uncertainty)
         return likelihood.judge(likelihood.fit(start), start)
 
 

@@ -23,7 +23,7 @@ from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
 from mixpose.threads import prompt_switching
-from mixpose.tracking import Foreseen
+from mixpose.tracking import PosePredictor
 from mixpose.tracking.proposers import predicted
 
 
@@ -135,12 +135,12 @@ def _publishing(
     from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
     each = [(label, one.body) for one in session.objects for label in one.labels]
-    foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
+    foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in each}
     publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
     return stack.enter_context(publishing).watch
 
 
-def _foresee(known: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
+def _foresee(known: PosePredictor, seconds: float) -> Callable[[Estimate], Estimate]:
     """Foretells the poses of a body so many seconds ahead, by the estimates it is called with."""
 
     def foresee(estimate: Estimate) -> Estimate:

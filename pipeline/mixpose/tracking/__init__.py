@@ -7,7 +7,7 @@ from mixpose.tracking.clouds import (
 )
 from mixpose.tracking.doubt import CHANGED as CHANGED, TWICE as TWICE
 from mixpose.tracking.labels import labelled as labelled
-from mixpose.tracking.prediction import Foreseen as Foreseen
+from mixpose.tracking.prediction import PosePredictor as PosePredictor
 from mixpose.tracking.refinements import OUT_OF_STEP as OUT_OF_STEP
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import (

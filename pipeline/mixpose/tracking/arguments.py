@@ -1,4 +1,4 @@
-"""What programs give: arrays that cannot be meant are told."""
+"""Check the arguments of Python callers: arrays of wrong shape or content are errors."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mixpose.rigid import is_rigid
 _RIGID = "a rotation and a translation as one 4x4 matrix"
 
 
-def pose_meant(start: Any) -> Floats | None:
-    """A pose (4, 4) to start at, if any; a ValueError if it is none."""
+def start_pose(start: Any) -> Floats | None:
+    """Return a start as a pose (4, 4), or None; raise ValueError if it is not rigid."""
     if start is None:
         return None
     T = np.asarray(start, dtype=np.float64)
@@ -25,8 +25,8 @@ def pose_meant(start: Any) -> Floats | None:
     return T
 
 
-def require_meant(views: Sequence[View], model: Body) -> None:
-    """Raise a ValueError that says what is allowed, and what of it is not given."""
+def require_valid(views: Sequence[View], model: Body) -> None:
+    """Raise a ValueError that says what is wrong with views or a body, and what is allowed."""
     for number, feature in enumerate(model.features, 1):
         where = f"feature {number} of {model.name!r}"
         if not hasattr(feature, "nodes"):
@@ -41,9 +41,9 @@ def require_meant(views: Sequence[View], model: Body) -> None:
         raise ValueError(f"view {min(doubled)!r}: given twice; allowed: a name of its own for each")
     for view in views:
         where, sensor = f"view {view.name!r}", view.sensor
-        found, allowed = view.observation.dimension, sensor.dimension
-        if found != allowed:
-            raise ValueError(f"{where}: features of {found} coordinates; its sensor has {allowed}")
+        seen, allowed = view.observation.dimension, sensor.dimension
+        if seen != allowed:
+            raise ValueError(f"{where}: features of {seen} coordinates; its sensor has {allowed}")
         for name, shape in (("camera_matrix", (3, 3)), ("position", (3,))):
             if hasattr(sensor, name):
                 _require(getattr(sensor, name), shape, f"{where}, {name} of its sensor")
@@ -55,5 +55,5 @@ def _require(values: Any, shape: tuple[int, ...], what: str) -> None:
     """Raise a ValueError unless an array is finite and of a shape."""
     array = np.asarray(values, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        found = f"shape {array.shape}" if array.shape != shape else "NaN or infinity"
-        raise ValueError(f"{what}: found {found}; allowed: finite numbers of shape {shape}")
+        actual = f"shape {array.shape}" if array.shape != shape else "NaN or infinity"
+        raise ValueError(f"{what}: found {actual}; allowed: finite numbers of shape {shape}")

@@ -1,4 +1,4 @@
-"""Clouds of points as the views that an objective knows; what is told of them, as of one sensor.
+"""Clouds of points as views for an objective, and their reports as those of one sensor.
 
 A cloud is seen in three images (`mixpose.sensors.cloud`), each of them a view.
 """
@@ -17,52 +17,52 @@ from mixpose.sensors import PLANES, CloudSensor
 
 
 def plane_names(name: str) -> list[str]:
-    """What the views of a cloud are called."""
+    """Return the names of the views of a cloud."""
     return [f"{name}/{axes}" for axes, _ in PLANES]
 
 
 def plane_views(view: View) -> list[View]:
-    """What an objective knows of a view: three images of a cloud, of others the view itself."""
+    """Return the views for an objective: three images of a cloud; for others the view itself."""
     if not isinstance(view.sensor, CloudSensor):
         return [view]
     seen, pattern = view.observation, view.observation.pattern
     assert isinstance(pattern, PointPattern)
     return [
         View(
-            called,
+            name,
             plane,
             replace(seen, pattern=replace(pattern, points=pattern.points[:, axes])),
             view.delay,
         )
-        for called, plane, (_, axes) in zip(
+        for name, plane, (_, axes) in zip(
             plane_names(view.name), view.sensor.planes, PLANES, strict=True
         )
     ]
 
 
 def with_clouds(estimate: Estimate, clouds: Mapping[str, CloudSensor]) -> Estimate:
-    """An estimate with reports and offsets of clouds by name, in place of those of their views."""
+    """Return an estimate with reports and offsets of clouds in place of those of their views."""
     if not clouds:
         return estimate
     reports = dict(estimate.sensors)
     for name in clouds:
-        own = [reports.pop(each) for each in plane_names(name) if each in reports]
-        if own:
-            reports[name] = _report(own)
+        planes = [reports.pop(plane) for plane in plane_names(name) if plane in reports]
+        if planes:
+            reports[name] = _report(planes)
     return replace(estimate, sensors=reports, measured=partial(_offsets, estimate.measured, clouds))
 
 
 def _report(planes: Sequence[SensorReport]) -> SensorReport:
-    """How a cloud took part, by how its images did; distances are those in space."""
-    explained = [one.explained for one in planes if one.explained is not None]
-    labels = set.intersection(*[set(one.residuals) for one in planes])
+    """Return the report of a cloud from those of its images; distances are those in space."""
+    explained = [plane.explained for plane in planes if plane.explained is not None]
+    labels = set.intersection(*[set(plane.residuals) for plane in planes])
     return SensorReport(
-        any(one.used for one in planes),
+        any(plane.used for plane in planes),
         sum(explained) / len(explained) if explained else None,
-        _length([one.rms for one in planes]),
-        next((one.why for one in planes if not one.used and one.why), None),
+        _length([plane.rms for plane in planes]),
+        next((plane.why for plane in planes if not plane.used and plane.why), None),
         {
-            label: _length([one.residuals[label] for one in planes])
+            label: _length([plane.residuals[label] for plane in planes])
             for label in planes[0].residuals
             if label in labels
         },
@@ -70,8 +70,8 @@ def _report(planes: Sequence[SensorReport]) -> SensorReport:
 
 
 def _length(planes: Sequence[float | None]) -> float | None:
-    """A distance in space by those in the three images, where each coordinate is in two."""
-    known = [one for one in planes if one is not None]
+    """Return a distance in space by those in three images, each coordinate being in two."""
+    known = [distance for distance in planes if distance is not None]
     if len(known) < len(planes):
         return None
     return float(np.sqrt(np.square(known).sum() / 2))
@@ -80,24 +80,24 @@ def _length(planes: Sequence[float | None]) -> float | None:
 def _offsets(
     measured: Callable[[], Mapping[str, Offsets]], clouds: Mapping[str, CloudSensor]
 ) -> Mapping[str, Offsets]:
-    """Offsets of all sensors, of clouds in space."""
+    """Return the offsets of all sensors, of clouds in space."""
     offsets = dict(measured())
     for name, sensor in clouds.items():
-        own = [offsets.pop(each) for each in plane_names(name) if each in offsets]
-        if len(own) == len(PLANES):
-            offsets[name] = _in_space(own, sensor)
+        planes = [offsets.pop(plane) for plane in plane_names(name) if plane in offsets]
+        if len(planes) == len(PLANES):
+            offsets[name] = _in_space(planes, sensor)
     return offsets
 
 
 def _in_space(planes: Sequence[Offsets], sensor: CloudSensor) -> Offsets:
-    """Offsets along the three axes, each the mean of those in two images."""
+    """Return offsets along the three axes, each the mean of those in two images."""
     n = len(planes[0].features)
-    away, observed = np.zeros((n, 3)), np.zeros((n, 3))
-    for one, (_, axes) in zip(planes, PLANES, strict=True):
-        away[:, axes] += one.offsets / 2
-        observed[:, axes] += one.observed / 2
+    offsets, observed = np.zeros((n, 3)), np.zeros((n, 3))
+    for plane, (_, axes) in zip(planes, PLANES, strict=True):
+        offsets[:, axes] += plane.offsets / 2
+        observed[:, axes] += plane.observed / 2
     by_shift: Floats = np.broadcast_to(sensor.T_sensor_world[:3, :3], (n, 3, 3))
-    met = np.logical_and.reduce([one.met for one in planes])
-    shared = np.logical_or.reduce([one.shared for one in planes])
-    weights = np.minimum.reduce([one.weights for one in planes])
-    return Offsets(planes[0].features, met, away, by_shift, observed, shared, weights)
+    met = np.logical_and.reduce([plane.met for plane in planes])
+    shared = np.logical_or.reduce([plane.shared for plane in planes])
+    weights = np.minimum.reduce([plane.weights for plane in planes])
+    return Offsets(planes[0].features, met, offsets, by_shift, observed, shared, weights)

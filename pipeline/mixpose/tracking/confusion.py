@@ -1,9 +1,9 @@
-"""Which bodies may be taken for each other, by all that they meet, and by the frames before.
+"""Find bodies that may be taken for each other, by all that they meet and by the frames before.
 
-Of two bodies that meet the same detections only what each misses, and what was known before, tells
-which of the two it is: clutter is as dense for either.  What is followed stays what it is, so that
-where it goes tells nothing more.  Features that are hidden in one frame are in the next, so that of
-all frames the one counts that tells most, and not their product.
+Of two bodies that meet the same detections only the features that each misses, and earlier frames,
+tell which of the two it is: clutter is as dense for either.  A followed thing stays what it is, so
+that its motion tells nothing more.  Features hidden in one frame are hidden in the next, so that
+only the frame that tells most counts, not the product of all.
 """
 
 from __future__ import annotations
@@ -29,49 +29,49 @@ from mixpose.tracking.proposers import met_features
 
 
 class Confusion(NamedTuple):
-    """What else all that a body meets may be."""
+    """Another explanation of all that a body meets."""
 
     what: str  # in words
     log_odds: float
     alone: float  # log odds by this frame alone
-    before: float = -math.inf  # log odds by the frames before, of the other body
+    before: float = -math.inf  # log odds of the other body by the frames before
 
     def since(self, before: Mapping[str, float]) -> Alternative:
-        """By the frames before as well, of which the odds are known, by reasons."""
+        """Return the alternative with its odds by the frames before too, known by reason."""
         known = max(before.get(self.what, -math.inf), self.before)
         return Alternative(self.what, max(self.log_odds, min(known, self.alone)))
 
 
-def taken_for(
-    frames: Mapping[int, Frame], told: Mapping[int, Verdict]
+def confusions_of(
+    frames: Mapping[int, Frame], verdicts: Mapping[int, Verdict]
 ) -> dict[int, list[Confusion]]:
-    """What else all that bodies meet may be, by body, of those that meet something.
+    """Return other explanations of all that bodies meet, by body, for those that meet something.
 
-    Another body that is not surely elsewhere, its own markers where they repeat themselves, so that
-    it may be turned another way, or one that is elsewhere, if that may be this one.
+    Another body that is not surely elsewhere; the body itself turned another way, if its markers
+    repeat themselves; or a body that seems to be elsewhere, if this one may be there instead.
     """
-    bests = {k: one.best for k, one in told.items() if one.best and one.best.log_evidence > 0}
-    sure = [k for k, one in told.items() if one.status == "ok"]
+    bests = {k: v.best for k, v in verdicts.items() if v.best and v.best.log_evidence > 0}
+    sure = [k for k, verdict in verdicts.items() if verdict.status == "ok"]
 
     @cache
     def instead(k: int, j: int) -> list[Confusion]:
-        against = look_alikes_of(frames[k], bests[k], frames[j])
-        return sorted(against, key=lambda one: one.log_odds)
+        against = confusions_with(frames[k], bests[k], frames[j])
+        return sorted(against, key=lambda confusion: confusion.log_odds)
 
-    found = {k: [*instead(k, k)] for k in bests}
+    confusions = {k: [*instead(k, k)] for k in bests}
     for k, j in permutations(frames, 2):
         if k in bests and j not in sure and frames[k].body is not frames[j].body:
-            found[k] += _as_lost(instead(k, j), frames[k], frames[j])
+            confusions[k] += _despite_loss(instead(k, j), frames[k], frames[j])
     for steps in _exchanges(bests, frames, sure, instead):
         against = [instead(*step)[-1] for step in steps]
-        log_odds, alone = sum(one.log_odds for one in against), sum(one.alone for one in against)
-        asked = [(k, j, one.what) for (k, j), one in zip(steps, against, strict=True)]
-        before = max(frames[k].track.alike.get(what, -math.inf) for k, _, what in asked)
-        for k, j, what in asked:
+        log_odds, alone = sum(c.log_odds for c in against), sum(c.alone for c in against)
+        reasons = [(k, j, c.what) for (k, j), c in zip(steps, against, strict=True)]
+        before = max(frames[k].track.confused.get(what, -math.inf) for k, _, what in reasons)
+        for k, j, what in reasons:
             if j in sure:
                 changed = Confusion(what, log_odds, alone, before)
-                found[k] += _as_lost([changed], frames[k], frames[j])
-    return found
+                confusions[k] += _despite_loss([changed], frames[k], frames[j])
+    return confusions
 
 
 def _exchanges(
@@ -80,12 +80,12 @@ def _exchanges(
     sure: Sequence[int],
     instead: Callable[[int, int], list[Confusion]],
 ) -> Iterator[list[tuple[int, int]]]:
-    """Steps from bodies to those that may be what was found of them.
+    """Yield steps from bodies to those that may have their poses instead.
 
-    Two or three go round; or the last is one that is not surely elsewhere.
+    Two or three bodies exchange poses in a cycle; or the last one is not surely elsewhere.
     """
-    # what meets more is seldom the other
-    ranked = sorted(bests, key=lambda one: -bests[one].features[0])
+    # a body that meets more is seldom the other one
+    ranked = sorted(bests, key=lambda k: -bests[k].features[0])
 
     def may_be(k: int, j: int) -> bool:
         return frames[k].body is not frames[j].body and bool(instead(k, j))
@@ -110,46 +110,48 @@ def _exchanges(
             yield [(k, j), (j, i)]
 
 
-def look_alikes_of(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
-    """Parts of another body, or of its own, that what a pose meets might be as well."""
+def confusions_with(data: Frame, best: ScoredPose, other: Frame) -> Iterator[Confusion]:
+    """Yield parts of another body, or other parts of its own, that a pose may have met instead."""
     met = met_features(data, best)
-    parts = list(_in_place_of(data, best, met, other))
+    parts = list(_alike_parts(data, best, met, other))
     if not parts:
         return
     T = best.T_world_object
-    here = Start(T, left_out=best.left_out)
-    own = likelihood_of(data).density(Fit(T), here, best.matches)
-    seen = other.seen_otherwise(views=data.views, still=data.still)
+    start = Start(T, left_out=best.left_out)
+    own_density = likelihood_of(data).density(Fit(T), start, best.matches)
+    seen = other.changed(views=data.views, static_views=data.static_views)
     likelihood = likelihood_of(seen)
-    # what a pose meets does not depend on what is drawn
+    # the matches of a pose do not depend on the drawn densities
     drawn = replace(data.finest, projection=project_body(data.finest.projection.sensors, seen.body))
-    as_it_stands = likelihood_of(replace(seen, drawn=drawn))
+    as_it_stands = likelihood_of(replace(seen, precomputed=drawn))
     for part, T_other in parts:
-        there = as_it_stands.density(Fit(T_other), here, best.matches)
-        if there - own > -other.rules.look_alikes.behind:  # else it is none, however fitted
-            start = other.rival(best, T_other, other.close, left_out=best.left_out)
-            there = max(there, likelihood.density(likelihood.fit(start), start, best.matches))
-        known = other.prior(T_other)[0] - other.anywhere[0] - data.prior(T)[0] + data.anywhere[0]
-        alone = there - own - known
-        # of more than what may be either, where the other one was expected tells nothing
+        ahead = as_it_stands.density(Fit(T_other), start, best.matches) - own_density
+        if ahead > -other.rules.look_alikes.behind:  # else no fit makes it likely
+            rival = other.rival(best, T_other, other.close_uncertainty, left_out=best.left_out)
+            fitted = likelihood.density(likelihood.fit(rival), rival, best.matches)
+            ahead = max(ahead, fitted - own_density)
+        known = other.prior(T_other)[0] - other.flat_prior[0]
+        known = known - data.prior(T)[0] + data.flat_prior[0]
+        alone = ahead - known
+        # for a part of the met features only, the prediction of the other body tells nothing
         is_all = len(part.features) == len(met)
-        yield Confusion(part.reason, there - own if is_all else min(there - own, alone), alone)
+        yield Confusion(part.reason, ahead if is_all else min(ahead, alone), alone)
 
 
-def _in_place_of(
+def _alike_parts(
     data: Frame, best: ScoredPose, met: frozenset[int], other: Frame
 ) -> Iterator[tuple[LookAlike, Floats]]:
-    """Parts of a body that lie like what a pose meets, with its pose (4, 4) there.
+    """Yield parts of a body that lie like the features met at a pose, with its pose (4, 4) there.
 
-    Of another body like all but one of these, which is then held against it.
-    One camera sees a body that is larger by some factor, and as much farther away, as the same.
+    Another body may lack one of the features, which then counts against it.  One camera cannot tell
+    a body from one larger by some factor and as much farther away.
     """
     if not (is_pointlike(data.body) and is_pointlike(other.body)):
         return
     sizes, centre = [1.0], np.zeros(3)
     factor = data.body.radius / other.body.radius
-    if abs(factor - 1) > 1e-9 and (of_one := _centre_of_one(data, best)) is not None:
-        sizes, centre = [1.0, factor], of_one
+    if abs(factor - 1) > 1e-9 and (camera_centre := _centre_of_only_camera(data, best)) is not None:
+        sizes, centre = [1.0, factor], camera_centre
     for size in sizes:
         body = other.body if size == 1 else of_size(other.body, size)
         tolerance = tolerance_of(data.body, body, other.rules.look_alikes.alike)
@@ -161,18 +163,15 @@ def _in_place_of(
 
 
 def _is_open(data: Frame, part: LookAlike, other: Frame) -> bool:
-    """Whether a marker that another body lacks may be met by chance, as it may be that one.
-
-    Of a body that is new, was away, or in doubt so far.
-    """
+    """Test whether a marker that another body lacks may be met by chance, for a body in doubt."""
     track, rules = data.track, data.rules
-    is_new = track.believed < rules.proposals.believed or track.misses or track.doubted
-    is_doubted = track.alike.get(part.reason, -math.inf) > rules.acceptance.log_doubt
+    is_new = track.ok_count < rules.proposals.believed or track.misses or track.doubted
+    is_doubted = track.confused.get(part.reason, -math.inf) > rules.acceptance.log_doubt
     return other.body is not data.body and bool(is_new or is_doubted)
 
 
-def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
-    """Centre of projection (3,) of the camera that meets a pose, if it is the only sensor."""
+def _centre_of_only_camera(data: Frame, best: ScoredPose) -> Floats | None:
+    """Return the centre of projection (3,) of the camera, if a single one meets a pose."""
     meets = [name for name, met in zip(best.used.names, best.used.met.tolist()) if met]
     if len(meets) != 1:
         return None
@@ -182,7 +181,7 @@ def _centre_of_one(data: Frame, best: ScoredPose) -> Floats | None:
     return rays.origins[0] if rays and rays.central and len(rays) else None
 
 
-def _as_lost(against: Sequence[Confusion], one: Frame, other: Frame) -> list[Confusion]:
-    """Odds of two bodies of which the one may be the other, even where both were lost."""
-    least = math.log(0.5) if one.was_lost and other.was_lost else -math.inf
-    return [each._replace(log_odds=max(each.log_odds, min(least, each.alone))) for each in against]
+def _despite_loss(against: Sequence[Confusion], first: Frame, second: Frame) -> list[Confusion]:
+    """Return confusions of two bodies that may be each other, at least even if both were lost."""
+    least = math.log(0.5) if first.was_lost and second.was_lost else -math.inf
+    return [c._replace(log_odds=max(c.log_odds, min(least, c.alone))) for c in against]

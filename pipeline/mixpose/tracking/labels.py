@@ -1,4 +1,4 @@
-"""Which detection is which feature, and where features are in space by their detections alone."""
+"""Label detections with the features they show, and measure features in space by them alone."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from mixpose.rigid import transform
 
 @dataclass(frozen=True)
 class LabelRules:
-    """When detections of a feature put it in space."""
+    """When the detections of a feature measure its place in space."""
 
     least_sine: float = constant(
         0.035, "of the angle between two rays: at 2° a depth errs by 29 times what is across"
     )
 
     def fix(self, J: Floats) -> bool:
-        """Whether rows (K, 3), in deviations by length, fix a point in all directions."""
+        """Test whether rows (K, 3), in standard deviations per length, fix a point in space."""
         values = np.linalg.svd(J, compute_uv=False)
-        # two equal rays at a small angle a have singular values of which the ratio is a/2
+        # two equal rays at a small angle a have a ratio of singular values of a/2
         return len(values) == 3 and bool(values[2] >= self.least_sine / 2 * values[0])
 
 
@@ -35,23 +35,22 @@ def labelled(
     body: Body,
     rules: LabelRules = LabelRules(),
 ) -> Estimate:
-    """An estimate with the labels of its detections, and the points in space that they measure.
+    """Return an estimate with labels of its detections, and the points in space that they measure.
 
     Parameters
     ----------
     estimate : Estimate
-        Of a frame, as a tracker gives it.
+        Of a frame, from a tracker.
     seen : mapping of str to Observation
-        All that the sensors saw in that frame.
+        All observations of the sensors in that frame.
     body : Body
-        Of one point per feature; of others nothing is labelled.
+        With one point per feature; other bodies get no labels.
     rules : LabelRules
 
     Returns
     -------
     Estimate
-        With `SensorReport.labels` and `points`.  A detection that two features share puts neither
-        of them in space.
+        With `SensorReport.labels` and `points`; detections shared by two features measure none.
     """
     offsets, T = estimate.offsets, estimate.T_world_object
     if T is None or not offsets:
@@ -62,7 +61,7 @@ def labelled(
         else report
         for name, report in estimate.sensors.items()
     }
-    sigmas = {name: one.sigma for name, one in seen.items()}
+    sigmas = {name: observation.sigma for name, observation in seen.items()}
     places = transform(T, body.means)
     points = {}
     for i, (label, place) in enumerate(zip(body.labels, places, strict=True)):
@@ -72,14 +71,15 @@ def labelled(
     return replace(estimate, sensors=reports, points=points)
 
 
-def _labels(own: Offsets, seen: Observation, body: Body) -> dict[str, Label]:
-    """What one sensor met each feature by, exactly as it detected it."""
+def _labels(offsets: Offsets, seen: Observation, body: Body) -> dict[str, Label]:
+    """Return the detections that one sensor met features by, exactly as it detected them."""
     detections, labels = seen.points, {}
-    for i, at in zip(own.features[own.met].tolist(), own.observed[own.met], strict=True):
+    met = offsets.met
+    for i, at in zip(offsets.features[met].tolist(), offsets.observed[met], strict=True):
         if detections is None:
             labels[body.labels[i]] = Label(at)
         else:
-            # what another body has was left out where it was numbered
+            # numbers of the frame left out detections of other bodies
             nearest = int(np.square(detections - at).sum(axis=1).argmin())
             labels[body.labels[i]] = Label(detections[nearest], nearest)
     return labels
@@ -88,15 +88,15 @@ def _labels(own: Offsets, seen: Observation, body: Body) -> dict[str, Label]:
 def _measured(
     offsets: Mapping[str, Offsets], sigmas: Mapping[str, float], i: int, rules: LabelRules
 ) -> tuple[Floats, float] | None:
-    """How far (3,) a feature is from where the pose has it, and its residual; None: not fixed.
+    """Return the offset (3,) of a feature from the pose, and its residual; None if it is not fixed.
 
-    One step of least squares from the pose, as of the moments at which each sensor saw it: offsets
-    are so small beside distances that it is the last.
+    One least-squares step from the pose, as of the moments at which each sensor saw the feature:
+    offsets are so small beside distances that no second one is needed.
     """
     rows = [
-        (one.by_shift[k] / sigmas[name], one.offsets[k] / sigmas[name])
-        for name, one in offsets.items()
-        for k in np.flatnonzero((one.features == i) & one.met & ~one.shared).tolist()
+        (seen.by_shift[k] / sigmas[name], seen.offsets[k] / sigmas[name])
+        for name, seen in offsets.items()
+        for k in np.flatnonzero((seen.features == i) & seen.met & ~seen.shared).tolist()
     ]
     if not rows:
         return None
@@ -104,5 +104,5 @@ def _measured(
     if not rules.fix(J):
         return None
     shift = np.linalg.lstsq(J, np.concatenate([off for _, off in rows]))[0]
-    apart = [np.linalg.pinv(by_shift) @ (off - by_shift @ shift) for by_shift, off in rows]
-    return shift, float(np.sqrt(np.square(apart).sum(axis=1).mean()))
+    residuals = [np.linalg.pinv(by_shift) @ (off - by_shift @ shift) for by_shift, off in rows]
+    return shift, float(np.sqrt(np.square(residuals).sum(axis=1).mean()))

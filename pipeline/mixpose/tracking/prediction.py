@@ -1,4 +1,4 @@
-"""Poses of a little later than the last frame, for what shows or steers something."""
+"""Predict poses shortly after the last frame, for programs that show or steer something."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Estimate, Floats
 from mixpose.rigid import perturb, twist_between
-from mixpose.tracking.motion import Course, MotionRules
+from mixpose.tracking.motion import MotionFilter, MotionRules
 
 
 @dataclass(frozen=True)
-class Foreseen:
-    """A body as its poses so far let it go on: the state of a prediction.
+class PosePredictor:
+    """The state of predicting the poses of a body.
 
-    Each coordinate is followed by `mixpose.tracking.motion.Course`, whose filters take the
+    Each coordinate is followed by `mixpose.tracking.motion.MotionFilter`, whose filters take the
     velocity, and how steady it is, from the poses and their covariances.
     """
 
@@ -25,10 +25,10 @@ class Foreseen:
     rules: MotionRules = MotionRules()
     T_world_object: Floats | None = None  # (4, 4), the last pose
     time_s: float = 0.0  # of that pose
-    course: Course | None = None
+    motion_filter: MotionFilter | None = None
 
-    def after(self, estimate: Estimate) -> Foreseen:
-        """The state after one more estimate of the body; a lost one changes nothing.
+    def after(self, estimate: Estimate) -> PosePredictor:
+        """Return the state after one more estimate of the body; a lost one changes nothing.
 
         Raises
         ------
@@ -44,24 +44,24 @@ class Foreseen:
         if T is None or covariance is None:
             return self
         deviation, elapsed = np.sqrt(covariance.diagonal()), time_s - self.time_s
-        known = self.course is not None and 0 < elapsed <= self.rules.longest_s
-        if known and self.course is not None and self.T_world_object is not None:
+        known = self.motion_filter is not None and 0 < elapsed <= self.rules.longest_s
+        if known and self.motion_filter is not None and self.T_world_object is not None:
             moved = twist_between(self.T_world_object, T)
-            course = self.course.followed(moved, deviation, elapsed)
+            course = self.motion_filter.followed(moved, deviation, elapsed)
         else:
-            course = Course.begun(deviation, self.body.radius, self.rules)
-        return replace(self, T_world_object=T, time_s=time_s, course=course)
+            course = MotionFilter.begun(deviation, self.body.radius, self.rules)
+        return replace(self, T_world_object=T, time_s=time_s, motion_filter=course)
 
     def ahead(self, estimate: Estimate, seconds: float) -> Estimate:
-        """The estimate that this is the state after, some seconds later.
+        """Return the estimate that led to this state, moved some seconds ahead.
 
-        The covariance is that of the estimate, and what the velocity and its changes add to it in
-        that time.  Directions that are not estimated stay as they are.  Hypotheses are of the
-        frame alone and left out; a lost frame stays lost.
+        The covariance is that of the estimate plus the effect of the velocity and its changes in
+        that time.  Directions that are not estimated stay.  Hypotheses belong to the frame alone
+        and are left out; a lost frame stays lost.
         """
-        T, covariance, course = estimate.T_world_object, estimate.covariance, self.course
+        T, covariance, course = estimate.T_world_object, estimate.covariance, self.motion_filter
         later = None if estimate.time_s is None else estimate.time_s + seconds
-        # features were measured then, and not there
+        # points were measured at the frame's own time
         estimate = replace(estimate, time_s=later, hypotheses=(), points={})
         if T is None or covariance is None or course is None:
             return estimate

@@ -1,6 +1,6 @@
-"""Where the body of a frame may be: starts for fits, in the order in which they are tried.
+"""Propose starts for fits in a frame, in the order in which they are tried.
 
-A proposer yields starts for a frame, given the poses found so far, and says itself when it applies.
+A proposer yields starts for a frame, given the poses so far, and tests itself whether it applies.
 """
 
 from __future__ import annotations
@@ -33,22 +33,24 @@ from mixpose.search import (
 )
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.ranges import are_associated
-from mixpose.tracking.track import worth_telling
+from mixpose.tracking.track import likely_branches
 
-# from the poses found so far, the most evident first
+# takes the poses so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
 
 
 def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
-    """Where the branches of the track expect the body, and another body beside it; always.
+    """Return the predictions of the track and of a companion; always applies.
 
-    Or where it was found with all bodies at once.
+    Where several bodies are fitted together, their common starts instead.
     """
     likely = frame.predictions
     if len(likely) > 1 and not _are_ranges(frame):
-        likely = worth_telling(likely, frame.rules.acceptance.confidence)
+        likely = likely_branches(likely, frame.rules.acceptance.confidence)
     return frame.starts or [
-        Start(one.T_world_object, one.uncertainty, one) for one in (*likely, frame.beside) if one
+        Start(branch.T_world_object, branch.uncertainty, branch)
+        for branch in (*likely, frame.companion_prediction)
+        if branch
     ]
 
 
@@ -57,19 +59,19 @@ def _are_ranges(frame: Frame) -> bool:
 
 
 def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
-    """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
+    """Test whether no pose convinces yet, so that the body is sought elsewhere.
 
-    Once it was followed for some frames, a pose convinces that misses no more all at once and that
-    one sensor alone meets no farther off than chance makes it.  Single ranges of a small body are
-    met about as well at other turns: there it is asked whether a pose elsewhere may be as likely.
-    Before, what all sensors are farther off than that may be its image in a pane, or another thing.
+    After some ok frames a pose also convinces that misses no more features all at once, and that
+    one sensor alone meets no farther off than by chance.  Before, what all sensors meet farther off
+    may be a reflection in a pane, or another thing.  Single ranges of a small body are met about as
+    well at other turns: there the odds of a better pose elsewhere decide.
     """
     track, rules = frame.track, frame.rules
     if ranked and (odds := ranked[0].elsewhere) is not None:
         return odds > rules.acceptance.log_doubt
-    is_new = track.believed < rules.proposals.believed
+    is_new = track.ok_count < rules.proposals.believed
     is_far = bool(ranked) and _is_far(frame, ranked[0], is_new=is_new)
-    if frame.first_is(frame.trusted, ranked) and not is_far:
+    if frame.is_best_accepted(frame.criterion, ranked) and not is_far:
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
@@ -77,50 +79,49 @@ def is_doubtful(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
     before, used = sum(track.met_before.values()), ranked[0].used
     is_less = np.count_nonzero(used.shares) <= rules.acceptance.convincing * before
     misses_more = is_less and _leaves_any(frame, ranked[0])
-    # what two sensors meet is bent, and not elsewhere
+    # a body that two sensors meet is bent, and not elsewhere
     is_off = ranked[0].residual_ratio > 1 and np.count_nonzero(ranked[0].used.met) < 2
     return bool(is_new or is_far or track.misses or track.doubted or misses_more or is_off)
 
 
 def _leaves_any(frame: Frame, pose: ScoredPose) -> bool:
-    """Whether detections are left that may show the body elsewhere; of grey values nobody knows."""
+    """Test whether unmatched detections may show the body elsewhere; True for grey values."""
     if any(view.observation.points is None for view in frame.views):
         return True
     return bool((pose.matches.count > pose.matches.met + 0.5).any())
 
 
-def is_there(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
-    """Whether what is found convinces, or lies where it was expected and casts no doubt."""
-    return frame.first_is(frame.trusted, ranked) or not is_doubtful(frame, ranked)
+def is_convincing(frame: Frame, ranked: Sequence[ScoredPose]) -> bool:
+    """Test whether the best pose convinces, or lies where expected and is not doubtful."""
+    return frame.is_best_accepted(frame.criterion, ranked) or not is_doubtful(frame, ranked)
 
 
 def _is_far(frame: Frame, pose: ScoredPose, *, is_new: bool) -> bool:
-    """Whether a pose meets the body farther off, or less evidently, than one that convinces.
+    """Test whether a pose meets the body farther off, or less evidently, than a convincing one.
 
-    Of a track that `is_new`, by more than chance; what one sensor of several is off by is left out
-    already.
+    For a new track, farther than by chance; a single sensor that disagrees is left out already.
     """
     rules = frame.rules
     if is_new and pose.residual_ratio > 1 and not pose.left_out:
         return True
     if pose.gained < rules.proposals.fallen * frame.track.gained:
         return True
-    # much of it; or anything, where the frames before let nobody expect it
-    close = _close(frame, pose)
-    is_all = close * pose.coverage >= 1
-    return close < rules.acceptance.convincing or not (
+    # much is met far off; or at an unexpected pose anything
+    share = _close(frame, pose)
+    is_all = share * pose.coverage >= 1
+    return share < rules.acceptance.convincing or not (
         is_all or frame.is_expected(pose.T_world_object)
     )
 
 
 def _close(frame: Frame, pose: ScoredPose) -> float:
-    """Share of what is met that is met as closely as the noise of the frames before has it."""
+    """Return the share of met features that are as close as the noise of earlier frames allows."""
     shares = pose.used.shares
     return float(shares[_met_closely(frame, pose)].sum()) / max(float(shares.sum()), 1e-12)
 
 
 def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
-    """Which features (L, N) are met as closely as the noise has it, before the frame and in it."""
+    """Return which features (L, N) are met closely, by the noise before and in this frame."""
     errors, used = frame.rules.judgement.noise.errors, pose.used
     before = dict(zip((view.name for view in frame.views), frame.variances, strict=True))
     variances = np.minimum([before.get(name, np.inf) for name in used.names], pose.variances)
@@ -128,7 +129,7 @@ def _met_closely(frame: Frame, pose: ScoredPose) -> Mask:
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """Promising poses around the first prediction, where the coarsest blurs may lead astray."""
+    """Yield promising poses around the first prediction, where the widest blurs may mislead."""
     if frame.predictions and is_doubtful(frame, ranked):
         first, rules = frame.predictions[0], frame.rules.proposals
         wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
@@ -138,9 +139,9 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 
 def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """Poses that the first prediction allows, of single ranges: there may be several maxima.
+    """Yield poses that the first prediction of single ranges allows: there may be many maxima.
 
-    Where it is narrower than the noise there is only one.
+    A prediction narrower than the noise leaves only one.
     """
     first = frame.predictions[0] if frame.predictions else None
     if first is None or first.spread is None or not _are_ranges(frame):
@@ -152,16 +153,16 @@ def within(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 
 def _is_wide(frame: Frame, T_world_object: Floats, uncertainty: Floats) -> bool:
-    """Whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
-    given = T_world_object[None], uncertainty[None], frame.rules.fit
-    blurs = widest_blurs(frame.views, frame.body, *given)
+    """Test whether features may be off by more than σ_ε at a pose with standard deviations (6,)."""
+    arguments = T_world_object[None], uncertainty[None], frame.rules.fit
+    blurs = widest_blurs(frame.views, frame.body, *arguments)
     return bool((blurs > frame.sigmas).any())
 
 
 def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> list[Start]:
-    """What poses lead to that are drawn around one with standard deviations (6,): so many at most.
+    """Return starts to which poses drawn around one with standard deviations (6,) descend.
 
-    Those that meet anything, the best first.
+    At most `kept` that meet anything, the best first.
     """
     rules, sigmas = frame.rules.proposals, np.array(frame.sigmas)
     narrow = wide / rules.narrowing
@@ -172,8 +173,8 @@ def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> li
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    few = sparse(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
-    descent = Descent(frame.views, few, frame.free, frame.rules.search)
+    sparse_body = sparse(frame.body, 8 * frame.rules.search.sample)  # some features, far apart
+    descent = Descent(frame.views, sparse_body, frame.free, frame.rules.search)
     poses = np.concatenate([T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, kept), *stages])
     values = descent.objective().value(poses)
@@ -183,21 +184,21 @@ def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> li
 
 
 def searched(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """Candidates of a search everywhere, where nothing convinces yet."""
+    """Yield candidates of a search everywhere, while nothing convinces."""
     return starts_at(frame, candidates_of(frame)) if is_doubtful(frame, ranked) else []
 
 
 def starts_at(frame: Frame, candidates: Sequence[Candidate]) -> Iterable[Start]:
-    """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
+    """Yield candidates as they are, and fitted: wider blurs of a fit reach false detections."""
     for candidate in candidates:
         yield Start(candidate.T_world_object)
-        yield Start(candidate.T_world_object, frame.close)
+        yield Start(candidate.T_world_object, frame.close_uncertainty)
 
 
 def candidates_of(frame: Frame) -> list[Candidate]:
-    """What the search finds, the most evident first, as far as the budget reaches.
+    """Return the candidates of the search, the most evident first, within its budget.
 
-    Detections that stayed where they are while the body was lost are left out at first.
+    Detections that did not move while the body was lost are left out at first.
     """
     live = frame.options.search == "live"
     budget = frame.rules.live if live else frame.rules.search
@@ -225,57 +226,56 @@ def candidates_of(frame: Frame) -> list[Candidate]:
 
 
 def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """Poses at which the body looks the same, or nearly so, as at the best pose of the frame.
+    """Yield poses at which the body looks the same, or nearly so, as at the best pose.
 
-    What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
+    Met detections may lie like other features, as after a step of a chessboard's grid; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
     kinds, behind = frame.rules.look_alikes.kinds, frame.rules.look_alikes.behind
-    most = -behind / 2  # what is so much likelier clutter has no look-alike that is not
-    # once more, where what is moved is better: two that are as good would take turns for ever
+    most = -behind / 2  # look-alikes of a pose that is this much likelier clutter are clutter too
+    # again from a better look-alike; equally good ones would alternate for ever
     while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
         most = ranked[0].log_evidence + 0.01
         for start in _as_evident(frame, ranked[0]):
             yield start
             if ranked[0].log_evidence > most + behind:
-                break  # the rest are rivals of what is no rival
+                break  # the remaining starts are rivals of the pose before
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
     if ranked and frame.T_reference is None and frame.body.asymmetry:
         best = ranked[0].T_world_object
-        yield from (Start(best @ one) for one in frame.body.symmetries)
+        yield from (Start(best @ S) for S in frame.body.symmetries)
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
-    """In words, if one of the rivals is a look-alike of the best pose; else empty."""
+    """Return why one of the rivals is a look-alike of the best pose; empty if none is."""
     body, alike = frame.body, congruent(frame, best)
     limit = frame.rules.look_alikes.alike * body.radius
-    for rival, one in product(rivals, alike):
-        there = transform(rival.T_world_object @ body.symmetries, body.means)
-        away = np.abs(transform(best.T_world_object @ one.T_body_other, body.means) - there)
-        if away.max(axis=(1, 2)).min() < limit:
-            return one.reason
+    for rival, part in product(rivals, alike):
+        places = transform(rival.T_world_object @ body.symmetries, body.means)
+        distances = np.abs(transform(best.T_world_object @ part.T_body_other, body.means) - places)
+        if distances.max(axis=(1, 2)).min() < limit:
+            return part.reason
     return ""
 
 
 def met_features(frame: Frame, judged: ScoredPose) -> frozenset[int]:
-    """Numbers of the features that any sensor meets, no farther off than errors put them.
+    """Return the numbers of features that any sensor meets within its errors.
 
-    Of those that are farther off, or that only sensors meet which are left out, nobody knows what
-    meets them.
+    Features met farther off, or only by sensors that are left out, may be met by anything.
     """
     return frozenset(np.flatnonzero(_met_closely(frame, judged).any(axis=0)).tolist())
 
 
 def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
-    """The pose, where the frame before left open which look-alike is right: they move alike."""
+    """Return the pose, if earlier look-alikes are still open, which all move alike; else None."""
     return T_world_object if len(frame.track.branches) > 1 else None
 
 
 def congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
-    """Motions under which what is met at a pose lies like other features of the body."""
+    """Return motions under which the features met at a pose lie like other features of the body."""
     body = frame.body
-    # single ranges do not say what is met
+    # single ranges do not show which features are met
     if not is_pointlike(body) or 1 in best.matches.dimensions.tolist():
         return ()
     met, rules = met_features(frame, best), frame.rules.look_alikes
@@ -283,50 +283,50 @@ def congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
 
 
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The best pose moved, where it meets as much, and more where motion tells against it."""
+    """Yield the best pose moved to look-alikes that meet as much; more if motion contradicts."""
     rules, T, alike = frame.rules, best.T_world_object, congruent(frame, best)
     if not alike:
         return
-    poses = np.array([T, *(T @ one.T_body_other for one in alike)])
-    most, own, limits = best.matches.met.max(), frame.prior(T)[0], []
-    for one, pose in zip(alike, poses[1:], strict=True):
-        moved = _moves_alike(frame, T) if one.is_step else None
-        against = own - frame.prior(pose if moved is None else moved)[0]
+    poses = np.array([T, *(T @ part.T_body_other for part in alike)])
+    most, prior, limits = best.matches.met.max(), frame.prior(T)[0], []
+    for part, pose in zip(alike, poses[1:], strict=True):
+        moved = _moves_alike(frame, T) if part.is_step else None
+        against = prior - frame.prior(pose if moved is None else moved)[0]
         limits.append(1 - max(against, 0.0) / max(-rules.acceptance.log_doubt, 1.0))
     least = rules.look_alikes.fewer * np.array(limits)
-    # mostly what has no detection near it tells, which is less than to look all up
+    # detections nearby rule out most look-alikes, which is less work than looking up values
     near = _near_any(frame, poses)
-    (few,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()
-    if not few.size:
+    (chosen,) = (most * (1 - near[1:] / max(near[0], 1e-12)) < least).nonzero()
+    if not chosen.size:
         return
     # the value grows as the square of the features met
-    values = np.sqrt(frame.finest.shares(poses[[0, *(1 + few)]], whole=True).sum(axis=0))
+    values = np.sqrt(frame.finest.shares(poses[[0, *(1 + chosen)]], whole=True).sum(axis=0))
     fewer = most * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
     for k in np.argsort(fewer, kind="stable").tolist():  # the best first
-        if fewer[k] < least[few[k]]:
-            moved = _moves_alike(frame, T) if alike[few[k]].is_step else None
-            there, out = poses[1 + few[k]], best.left_out
-            yield frame.rival(best, there, frame.close, T_moved=moved, left_out=out)
+        if fewer[k] < least[chosen[k]]:
+            moved = _moves_alike(frame, T) if alike[chosen[k]].is_step else None
+            T_alike, out = poses[1 + chosen[k]], best.left_out
+            yield frame.rival(best, T_alike, frame.close_uncertainty, T_moved=moved, left_out=out)
 
 
 def _near_any(frame: Frame, poses: Floats) -> Floats:
-    """How many features have a detection near them at poses (H, 4, 4), or grey values may be.
+    """Return how many features have a detection nearby at poses (H, 4, 4), or lie in grey values.
 
-    The root of the sum of squares over sensors, as the value goes.
+    The root of the sum of squares over sensors, like the objective's value.
     """
-    at = frame.finest.projection.project(poses)
-    near = at.seen.copy()
+    images = frame.finest.projection.project(poses)
+    near = images.seen.copy()
     for k, (view, variance) in enumerate(zip(frame.views, frame.finest.variances[:, 0])):
         points, m = view.observation.points, view.sensor.dimension
         if points is not None:
             reach = DRAWING.reach * np.sqrt(variance)
-            away, _ = cKDTree(points).query(at.y[k, ..., :m], distance_upper_bound=reach)
+            away, _ = cKDTree(points).query(images.y[k, ..., :m], distance_upper_bound=reach)
             near[k] &= np.isfinite(away)
     return np.asarray(np.linalg.norm(near.sum(axis=2), axis=0))
 
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The pose tilted the other way, where cameras from one side meet what is nearly flat."""
+    """Yield the pose tilted the other way, if cameras on one side meet nearly flat features."""
     body, views, T = frame.body, frame.views, best.T_world_object
     if len(views) > 1:
         least, seen = frame.rules.acceptance.agreeing, best.matches
@@ -334,19 +334,19 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
         views = [view for view in views if view.name in met]
     if not views or any(view.sensor.dimension != 2 for view in views):
         return
-    some, flat = frozenset(range(len(body))), frame.rules.look_alikes.flat
+    features, flat = frozenset(range(len(body))), frame.rules.look_alikes.flat
     # a wrong tilt may be why little of a flat body is met
     if thickness(body) > flat and is_pointlike(body):
-        some = met_features(frame, best)
-    if len(some) >= 3 and thickness(body, some) <= flat:
-        middle = transform(T, body.means[sorted(some)].mean(axis=0, keepdims=True))
-        sights = np.array([view.sensor.towards(middle)[0] for view in views])
-        sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-        away = sights.mean(axis=0)
-        if np.linalg.norm(away) < math.cos(frame.rules.look_alikes.aside):
+        features = met_features(frame, best)
+    if len(features) >= 3 and thickness(body, features) <= flat:
+        middle = transform(T, body.means[sorted(features)].mean(axis=0, keepdims=True))
+        directions = np.array([view.sensor.towards(middle)[0] for view in views])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        axis = directions.mean(axis=0)
+        if np.linalg.norm(axis) < math.cos(frame.rules.look_alikes.aside):
             return
-        wide = frame.close * frame.rules.proposals.narrowing
-        tilted = other_tilt(body, some, T, away)
+        wide = frame.close_uncertainty * frame.rules.proposals.narrowing
+        tilted = other_tilt(body, features, T, axis)
         yield frame.rival(best, tilted, wide, T_moved=_moves_alike(frame, T))
 
 

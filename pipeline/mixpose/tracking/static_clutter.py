@@ -1,4 +1,4 @@
-"""Detections that stay where they are, frame after frame, while the body is lost.
+"""Detections that stay in place, frame after frame, while the body is lost.
 
 What is static, as lamps are, is searched last: a body that stands still is only found later.
 """
@@ -19,12 +19,12 @@ from mixpose.sensors import clouds_among
 
 @dataclass(frozen=True)
 class StaticClutter:
-    """Places (K, m) by sensor, and in how many frames more they were seen than not (K,)."""
+    """Places (K, m) by sensor, and in how many more frames each was seen than not (K,)."""
 
     places: Mapping[str, tuple[Floats, Indices]] = field(default_factory=dict)
 
     def learnt(self, views: Sequence[View], frames: int) -> StaticClutter:
-        """After one more frame without the body; what was seen as often as not is forgotten."""
+        """Return the clutter after one more frame; places missed as often as seen are dropped."""
         places = dict(self.places)
         for view in views:
             if (points := view.observation.points) is None:
@@ -41,10 +41,10 @@ class StaticClutter:
         return StaticClutter(places)
 
     def without(self, views: Sequence[View], frames: int) -> list[View]:
-        """The views without detections that were there in so many frames more than not."""
+        """Return the views without detections seen in place in `frames` more frames than not."""
         moving = [self._moving(view, frames) for view in views]
         for planes in clouds_among(tuple([view.sensor for view in views])):
-            # a point stays where it is if it does in all three images
+            # a point of a cloud is static if it is in all three images
             common = np.any([moving[k] for k in planes], axis=0)
             for k in planes:
                 moving[k] = common
@@ -54,18 +54,18 @@ class StaticClutter:
         ]
 
     def _moving(self, view: View, frames: int) -> Mask:
-        """Whether each detection (M,) of a view was not there in so many frames more than not."""
+        """Return which detections (M,) of a view are not static."""
         if (points := view.observation.points) is None:
-            return np.zeros(0, dtype=np.bool_)  # of no detections at all
+            return np.zeros(0, dtype=np.bool_)  # a view without single detections
         places, counts = self._known(view, points)
         static = places[counts >= frames]
         return np.asarray(_nearest(static, view.observation) == len(static))
 
     def _known(self, view: View, points: Floats) -> tuple[Floats, Indices]:
-        """Places of a view that has points (M, m), and their counts; none before it was seen."""
+        """Return the places of a view with points (M, m), and their counts; none for a new view."""
         return self.places.get(view.name, (points[:0], np.zeros(0, dtype=np.intp)))
 
 
 def _nearest(places: Floats, seen: Observation) -> Indices:
-    """Index of the place within σ_ε, five times what they err by, of detections; K for none."""
+    """Return the index of the place within σ_ε, five times its error, of detections; K for none."""
     return np.asarray(cKDTree(places).query(seen.points, distance_upper_bound=seen.sigma)[1])

@@ -1,4 +1,4 @@
-"""A tracked body: poses are proposed, fitted, judged, decided about and followed, by frame."""
+"""Track one body: propose, fit and judge poses, decide and follow, frame by frame."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
 from mixpose.rigid import from_parts
 from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.arguments import pose_meant, require_meant
-from mixpose.tracking.doubt import decided, of_other_things
+from mixpose.tracking.arguments import require_valid, start_pose
+from mixpose.tracking.doubt import decide_frame, log_odds_other
 from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, likelihood_of
@@ -30,28 +30,28 @@ from mixpose.tracking.proposers import (
     PROPOSERS,
     Proposer,
     congruent,
-    is_there,
+    is_convincing,
     predicted,
     searched,
 )
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
+from mixpose.tracking.reporting import offsets_of, reported_covariance, residuals_of
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import are_cut_otherwise, sizes_after, weighed_by_size
-from mixpose.tracking.telling import covariance_told, offsets_of, residuals_of
 from mixpose.tracking.track import Branch, Track, predict
-from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, left_by, with_second
+from mixpose.tracking.twin import SECOND_POSE, is_ok_but_for_mirrors, leftover_of, with_second
 
 
 @dataclass(frozen=True, eq=False)
 class Tracker(Setup):
-    """A tracked body: how its poses are sought and judged in each frame."""
+    """The tracker of one body: how poses are sought and judged in each frame."""
 
     T_start: Floats | None = None  # (4, 4)
-    proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
+    proposers: tuple[Proposer, ...] = PROPOSERS  # in the order tried; the first gives predictions
     refinements: tuple[Refinement, ...] = REFINEMENTS
-    instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
-    T_held: Floats | None = None  # (4, 4), that of another one, where directions are held
-    # (3,), the origin of the frame that poses are told of, in that of `body`
+    instance: int | None = None  # number among identical bodies of the same `Body`; None: only one
+    T_held: Floats | None = None  # (4, 4), another start, where directions are held
+    # (3,), origin of the frame of reported poses, in the frame of `body`
     origin: Floats = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
@@ -67,7 +67,7 @@ class Tracker(Setup):
         instance: int | None = None,
         T_held: Floats | None = None,
     ) -> Tracker:
-        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules.
+        """Create a tracker that starts about T_start (4, 4), within half-widths or the rules'.
 
         Raises ValueError if T_start is no rotation and translation.
         """
@@ -85,7 +85,7 @@ class Tracker(Setup):
             body.sample(options.samples, seed=options.seed),
             start,
             rules,
-            pose_meant(T_start),
+            start_pose(T_start),
             instance=instance,
             T_held=T_held,
         )
@@ -98,58 +98,58 @@ class Tracker(Setup):
         T_start: Floats | None = None,
         *,
         T_held: Floats | None = None,
-        **rest: Any,
+        **known: Any,
     ) -> Tracker:
-        """As `create`, with what is believed of motion said of the middle of the body.
+        """Create a tracker as `create`, which states motion at the middle of the features.
 
-        What moves, and how unsure that is, is the same wherever somebody put the origin.  Where
-        directions are held they are the origin's own, if turns that are free would move it there.
+        Motion and its uncertainty are then the same wherever the session puts the origin.  Where
+        directions are held and free turns would move the origin, the origin itself is tracked.
         """
         free = free_mask(options).reshape(2, 3)
         if any((free[1] & (np.arange(3) != held)).any() for held in np.flatnonzero(~free[0])):
-            return cls.create(body, options, T_start, T_held=T_held, **rest)
+            return cls.create(body, options, T_start, T_held=T_held, **known)
         centre = body.means.mean(axis=0)
-        there = from_parts(np.eye(3), centre)
-        told = pose_meant(T_start), T_held
-        T_start, T_held = (None if T is None else T @ there for T in told)
-        tracker = cls.create(body.centred, options, T_start, T_held=T_held, **rest)
+        T_centre = from_parts(np.eye(3), centre)
+        starts = start_pose(T_start), T_held
+        T_start, T_held = (None if T is None else T @ T_centre for T in starts)
+        tracker = cls.create(body.centred, options, T_start, T_held=T_held, **known)
         return replace(tracker, origin=-centre)
 
     @property
     def label(self) -> str:
-        """The body in one word."""
+        """Return the name of the body as one word."""
         return label_of(self.body.name, self.instance)
 
     def begin(self) -> Track:
-        """The track before the first frame."""
+        """Return the track before the first frame."""
         if self.T_start is None:
             return Track()
-        return Track((Branch(self.T_start, 1.0, self.start_uncertainty),), known=True)
+        return Track((Branch(self.T_start, 1.0, self.start_uncertainty),), is_identified=True)
 
     def advance(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> tuple[Track, Estimate]:
-        """Estimate one frame: the track for the next, and the estimate without its latency.
+        """Estimate one frame: return the track for the next, and the estimate without its latency.
 
         `views` are all sensors with a frame; those that saw nothing are reported and left out.
         """
         data = self.data(track, frame, time_s, views)
         ranked = self.explain(data)
-        verdict = decided(data, ranked)
+        verdict = decide_frame(data, ranked)
         if verdict.best is not None and is_ok_but_for_mirrors(verdict):
-            verdict = with_second(verdict, data, left_by(verdict.best, data))
-        after = followed(data, verdict)
+            verdict = with_second(verdict, data, leftover_of(verdict.best, data))
+        after = track_after(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
-        """Where the track expects the body in a frame."""
-        known, asked = track.foretold, (frame, time_s)
-        if asked not in known:
-            known[asked] = predict(track, self.body, frame, time_s, self.rules.motion)
-        return known[asked]
+        """Return where the track expects the body in a frame."""
+        cache, key = track.cached_predictions, (frame, time_s)
+        if key not in cache:
+            cache[key] = predict(track, self.body, frame, time_s, self.rules.motion)
+        return cache[key]
 
     def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
-        """A frame, and what is known before it; sensors that saw nothing are left out."""
+        """Return the frame with what is known before it, without sensors that saw nothing."""
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         reference = self.T_held if self.T_start is None else self.T_start
@@ -175,17 +175,17 @@ class Tracker(Setup):
         return _moving_at(data, predictions[0].T_world_object) if predictions else data
 
     def explain(self, data: Frame, *, quickly: bool = False) -> list[ScoredPose]:
-        """Propose, fit and judge poses: distinct ones, the most evident first.
+        """Propose, fit and judge poses: return distinct ones, the most evident first.
 
         `quickly` stops where the body is not where it is expected.
         """
         likelihood, ranked, fits = likelihood_of(data), list[ScoredPose](), list[Fit]()
 
         def consider(start: Start, fit: Fit, proposer: str) -> ScoredPose | None:
-            if start.T_moved is None and any(fit is one for one in fits):
-                return None  # judged before, and by the same prior
+            if start.T_moved is None and any(fit is known for known in fits):
+                return None  # judged already by the same prior
             fits.append(fit)
-            judged = _judged(likelihood, fit, start, proposer)
+            judged = _judge(likelihood, fit, start, proposer)
             insert(ranked, judged, data.body, data.free, data.rules.acceptance)
             return judged
 
@@ -196,42 +196,42 @@ class Tracker(Setup):
                     for refine in self.refinements:
                         for better in refine(data, likelihood, judged):
                             consider(better, likelihood.fit(better), refine.__name__)
-            if quickly and not is_there(data, ranked):
+            if quickly and not is_convincing(data, ranked):
                 break
             quickly = False
         weighed = weighed_at(data, ranked[0]) if ranked else data
         if weighed is data:
             return ranked
-        again = judged_again(weighed, ranked, fitted=True)
-        # what refinements found is not looked for again: it stays where that is no better
+        again = judge_again(weighed, ranked, fitted=True)
+        # poses of refinements are not sought again: they stay unless the new ones are better
         is_better = again[0].log_evidence > ranked[0].log_evidence
         return again if is_better or not data.track.sizes.count else ranked
 
     def estimate(
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
     ) -> Estimate:
-        """The estimate of a frame, with reports of the first pose, believed or not."""
-        body, best, at = self.body, verdict.best, self._T_body_origin
+        """Return the estimate of a frame; reports are those of the first pose, believed or not."""
+        body, best, T_origin = self.body, verdict.best, self._T_body_origin
         shown = best or next(iter(ranked), None)
         used = shown.used if shown and is_pointlike(body) else None
         reports = dict.fromkeys(data.sensors, SensorReport(False))
         reports |= shown.reports(residuals_of(used, body) if used else {}) if shown else {}
         rivals = verdict.kept if verdict.status == "ambiguous" else ()
         origin = best.proposer if best else ""
-        if data.is_found_at_once and origin == predicted.__name__:
+        if data.has_triangulated_start and origin == predicted.__name__:
             origin = searched.__name__
         return Estimate(
             frame=data.frame,
             time_s=data.time_s,
             object=body.name,
             status=verdict.status,
-            T_world_object=best.T_world_object @ at if best else None,
-            covariance=covariance_told(data, best, self.origin) if best else None,
+            T_world_object=best.T_world_object @ T_origin if best else None,
+            covariance=reported_covariance(data, best, self.origin) if best else None,
             score=shown.score if shown else 0.0,
             confidence=verdict.confidence,
             sensors=reports,
             hypotheses=tuple(
-                [Hypothesis(one.T_world_object @ at, weight) for one, weight in rivals]
+                [Hypothesis(pose.T_world_object @ T_origin, weight) for pose, weight in rivals]
             ),
             instance=self.instance,
             proposer=origin,
@@ -244,7 +244,7 @@ class Tracker(Setup):
 
     @cached_property
     def _T_body_origin(self) -> Floats:
-        """The frame (4, 4) that poses are told of, in that of `body`."""
+        """Return the frame (4, 4) of reported poses, in the frame of `body`."""
         return from_parts(np.eye(3), self.origin)
 
 
@@ -256,10 +256,10 @@ def estimate_pose(
 ) -> Estimate:
     """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
 
-    Raises ValueError for arrays that cannot be meant: a start or sensor that is no rigid motion,
-    NaN, other shapes, features of a view that have not the dimension of its sensor.
+    Raises ValueError for invalid arrays: a start or sensor that is no rigid motion, NaN, other
+    shapes, features of a view that have not the dimension of its sensor.
     """
-    require_meant(views, model)
+    require_valid(views, model)
     tracker = Tracker.about_centre(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     with one_blas_thread():
@@ -268,10 +268,10 @@ def estimate_pose(
 
 
 def weighed_at(data: Frame, pose: ScoredPose) -> Frame:
-    """The frame with spots weighed by size where a pose is; the same if that changes none of it.
+    """Return the frame with spots weighed by size at a pose; itself if no other spot is cut then.
 
-    Where it was expected they look as if they were cut if they are nearer, or others.  Before the
-    first frame that is ok the pose itself shows how large markers are.
+    By the scale of the predicted pose other spots may look cut.  Before the first ok frame the pose
+    itself shows how large markers are.
     """
     sizes, rules, T = data.track.sizes, data.rules.sizes, pose.T_world_object
     if not data.unweighed or (sizes.count and not np.count_nonzero(pose.matches.extra)):
@@ -281,23 +281,24 @@ def weighed_at(data: Frame, pose: ScoredPose) -> Frame:
     if not are_cut_otherwise(data.views, views):
         return data
     unweighed = data.unweighed
-    return _moving_at(data.seen_otherwise(views=views, still=(), unweighed=unweighed), T)
+    return _moving_at(data.changed(views=views, static_views=(), unweighed=unweighed), T)
 
 
 def _moving_at(data: Frame, T_world_object: Floats) -> Frame:
-    """The frame as of the common time, of a body that moves as is expected at a pose."""
-    is_moving = data.predictions and data.is_timed
-    return data.in_motion(data.expected(T_world_object).at(T_world_object)) if is_moving else data
+    """Return the frame at the common time, for a body that moves as expected at a pose."""
+    if not (data.predictions and data.is_timed):
+        return data
+    return data.in_motion(data.expected_velocity(T_world_object).at(T_world_object))
 
 
-def _judged(
+def _judge(
     likelihood: Likelihood,
     fit: Fit,
     start: Start,
     proposer: str,
-    blurs: tuple[Mapping[str, float], ...] = (),  # of the fit before, where there is none now
+    blurs: tuple[Mapping[str, float], ...] = (),  # of the previous fit, if there is none now
 ) -> ScoredPose:
-    """A pose that was fitted from a start, and what it comes from."""
+    """Judge a pose fitted from a start, and note its proposer, blurs and prior."""
     return replace(
         likelihood.judge(fit, start),
         proposer=proposer,
@@ -306,67 +307,67 @@ def _judged(
     )
 
 
-def judged_again(
+def judge_again(
     data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> list[ScoredPose]:
-    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first.
+    """Judge poses again by a frame with other detections, the most evident first.
 
-    Those that were far behind the first stay where they are.
+    With `fitted` they are fitted too, but for those far behind the first.
     """
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
     behind = data.rules.look_alikes.behind
-    for one in poses if data.views else ():
-        is_near = one.log_evidence > poses[0].log_evidence - behind
-        wide = data.close if fitted and is_near else None
-        start = Start(one.T_world_object, wide, left_out=one.left_out, T_moved=one.T_moved)
-        judged = _judged(likelihood, likelihood.fit(start), start, one.proposer, one.blurs)
+    for pose in poses if data.views else ():
+        is_near = pose.log_evidence > poses[0].log_evidence - behind
+        wide = data.close_uncertainty if fitted and is_near else None
+        start = Start(pose.T_world_object, wide, left_out=pose.left_out, T_moved=pose.T_moved)
+        judged = _judge(likelihood, likelihood.fit(start), start, pose.proposer, pose.blurs)
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
 
 
-def followed(data: Frame, verdict: Verdict) -> Track:
-    """The track after a frame."""
+def track_after(data: Frame, verdict: Verdict) -> Track:
+    """Return the track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
-    # what is likelier clutter is told, and not followed
+    # a pose that is likelier clutter is reported, and not followed
     if best is None or best.log_evidence < 0:
         clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
         state = data.searches[-1][1] if data.searches else Track.search
         return replace(track.missed(state, clutter), doubted=True)
-    found = _branches(data, verdict, best)
+    branches = _branches(data, verdict, best)
     used = best.used
-    met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
+    met, in_view = ((values > 0).sum(axis=1) for values in (used.shares, used.weights))
     agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
-    # sensors whose delays are not known contradict each other until they are
+    # sensors contradict each other until their delays are known
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
-    # after a frame that may show something else nobody knows what is new
+    # after a doubtful frame the clutter rates begin anew
     sizes, rates = track.sizes, ClutterRates()
     if is_ok:
         rates = track.rates.followed(used, data.rules.judgement.noise.memory)
         sizes = sizes_after(sizes, best, data.body, data.rules.sizes)
     return follow(
         data,
-        found,
+        branches,
         residuals=best.noise if is_ok else track.residuals,
         rates=rates,
         sizes=sizes,
         met_before=dict(zip(used.names, met.tolist(), strict=True)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
-        agreed=track.agreed or agreeing,
-        known=is_ok
-        or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
-        believed=track.believed + is_ok,
+        sensors_agreed=track.sensors_agreed or agreeing,
+        is_identified=is_ok
+        or (track.is_identified and log_odds_other(data, best) < data.rules.acceptance.log_doubt),
+        ok_count=track.ok_count + is_ok,
         elsewhere=_elsewhere_after(data, best),
         gained=best.gained if is_ok else track.gained,
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
-        twice=track.twice if verdict.second is None else verdict.second.there,
+        log_odds_twice=track.log_odds_twice if verdict.second is None else verdict.second.there,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 
 
 def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
-    """Log odds that single ranges have a better pose elsewhere, after a frame and its searches."""
+    """Return log odds of a better pose elsewhere (single ranges) after a frame and its searches."""
     if best.elsewhere is None or not data.options.fuse:
         return -math.inf
     is_searched = any(report.refined for report, _ in data.searches)
@@ -377,25 +378,25 @@ def _elsewhere_after(data: Frame, best: ScoredPose) -> float:
 def _branches(
     data: Frame, verdict: Verdict, best: ScoredPose
 ) -> list[tuple[Branch, list[Floats] | None]]:
-    """Poses to be followed, the best first, and motions to what looks the same, as `follow` has it.
+    """Return the poses to be followed, the best first, and motions to their look-alikes.
 
-    Of single ranges, where frames are not kept apart, unlikely ones too.
+    Of single ranges, where frames are fused, unlikely poses too.
     """
-    found, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
-    faint = sorted(verdict.faint if fuse else (), key=lambda each: -each[1])
-    for one, weight in (*verdict.kept, *faint[: data.rules.ranges.modes]):
-        # what may be mere clutter counts as little in the next frame
-        belief = weight * float(expit(one.log_evidence))
-        momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
-        spread = one.spread if fuse else None
-        T, second = one.T_world_object, verdict.second
-        other = data.other_at(T)
-        if second and one is second.pose:
+    branches, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
+    unlikely = sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])
+    for pose, weight in (*verdict.kept, *unlikely[: data.rules.ranges.modes]):
+        # a pose that may be clutter counts as little in the next frame
+        belief = weight * float(expit(pose.log_evidence))
+        sigmas = np.sqrt((pose.covariance - pose.persistent).diagonal()) if data.is_timed else None
+        spread = pose.spread if fuse else None
+        T, second = pose.T_world_object, verdict.second
+        other = data.log_odds_other_at(T)
+        if second and pose is second.pose:
             other = -second.either
-        elif second and second.told and one is best:
+        elif second and second.told and pose is best:
             other = second.either
-        branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
-        is_new = one.proposer == SECOND_POSE
-        alike = None if is_new else [each.T_body_other for each in congruent(data, one)]
-        found.append((branch, alike))
-    return found
+        branch = Branch(T, belief, spread=spread, deviation=sigmas, log_odds_other=other)
+        is_new = pose.proposer == SECOND_POSE
+        alike = None if is_new else [part.T_body_other for part in congruent(data, pose)]
+        branches.append((branch, alike))
+    return branches

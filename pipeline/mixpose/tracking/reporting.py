@@ -1,4 +1,4 @@
-"""What an estimate tells of a pose beside the pose: how sure it is, and what it was met by."""
+"""What an estimate reports beside the pose: its covariance, and the offsets of features."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from mixpose.search import is_pointlike
 from mixpose.tracking.frame import Frame
 
 
-def covariance_told(data: Frame, pose: ScoredPose, origin: Floats) -> Floats:
-    """The covariance (6, 6) of a pose at a point (3,) of the body, with all it may be turned by."""
+def reported_covariance(data: Frame, pose: ScoredPose, origin: Floats) -> Floats:
+    """Return the covariance (6, 6) of a pose at a point (3,) of the body, with all likely turns."""
     T, covariance = pose.T_world_object, pose.covariance
     if pose.spread is None and is_pointlike(data.body):
         sensors = tuple([view.sensor for view in data.views if view.name not in pose.left_out])
-        given = T, pose.used, pose.variances, project_body(sensors, data.body), data.free
-        covariance = with_likely_turns(covariance, *given)
+        arguments = T, pose.used, pose.variances, project_body(sensors, data.body), data.free
+        covariance = with_likely_turns(covariance, *arguments)
     covariance = covariance_at(covariance, T[:3, :3] @ origin)
     return with_wide_turn(covariance, T, data.body.means - origin)
 
 
 def residuals_of(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
-    """How far off each sensor met the features in view; None for those that it missed."""
-    off = used.sigmas[:, None] * np.sqrt(used.squared)
-    rows = zip(off.tolist(), used.shares.tolist(), used.weights.tolist(), strict=True)
+    """Return the distance at which each sensor met features in view; None for missed ones."""
+    distances = used.sigmas[:, None] * np.sqrt(used.squared)
+    rows = zip(distances.tolist(), used.shares.tolist(), used.weights.tolist(), strict=True)
     return {
         name: {label: r if s else None for label, r, s, w in zip(body.labels, *row) if w}
         for name, row in zip(used.names, rows, strict=True)
@@ -36,7 +36,7 @@ def residuals_of(used: Matches, body: Body) -> dict[str, dict[str, float | None]
 
 
 def offsets_of(used: Matches, variances: Floats) -> dict[str, Offsets]:
-    """By how much each sensor met the features of a body whose features are points.
+    """Return the offsets of met features by sensor, for a body of points.
 
     Noise has variances (L,), σ_ε².
     """
@@ -44,11 +44,11 @@ def offsets_of(used: Matches, variances: Floats) -> dict[str, Offsets]:
     for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
         i = np.flatnonzero(used.weights[k])
         y, by_shift = sigma * used.offsets[k, i, :m], used.J[k, i, :m, :3]
-        by, places = used.detections[k, i], used.places[k, i, :m]
-        alike = (by[:, None] == by) & (by >= 0)[:, None]
-        shared = alike.sum(axis=1) > 1
-        # offsets of two that share a detection are those of their middle
-        middle = alike @ places / np.maximum(alike.sum(axis=1), 1)[:, None]
+        detections, places = used.detections[k, i], used.places[k, i, :m]
+        is_same = (detections[:, None] == detections) & (detections >= 0)[:, None]
+        shared = is_same.sum(axis=1) > 1
+        # two features that share a detection have the offset of their middle
+        middle = is_same @ places / np.maximum(is_same.sum(axis=1), 1)[:, None]
         observed = np.where(shared[:, None], middle, places) + y
         met = used.shares[k, i] > 0
         weights = variances[k] / (variances[k] + used.extra[k, i])
