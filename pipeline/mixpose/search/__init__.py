@@ -1,4 +1,4 @@
-"""Search: the first pose from nothing, over all orientations and positions."""
+"""Search of a pose without a start, over all orientations and positions."""
 
 from mixpose.search.copies import (
     Copy as Copy,
@@ -13,7 +13,7 @@ from mixpose.search.poses import (
     Descent as Descent,
     Stage as Stage,
     spread_turns as spread_turns,
-    unlike as unlike,
+    distinct_poses as distinct_poses,
 )
 from mixpose.search.problem import (
     LIVE as LIVE,

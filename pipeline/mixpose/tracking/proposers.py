@@ -209,7 +209,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         T_reference=frame.T_reference,
         rules=frame.rules.judgement,
         seed=frame.options.seed,
-        known=frame.gains,
+        log_prior=frame.gains,
     )
     among_moving, spent = list[Candidate](), SearchReport()
     moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)
