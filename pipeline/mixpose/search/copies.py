@@ -84,8 +84,8 @@ class SeenTogether:
     @cached_property
     def _cameras(self) -> list[tuple[SensorDetections, Rays, float]]:
         """Sensors with lines of sight, and the largest errors of their detections."""
-        sensors = [sensor for sensor in self.detections if sensor.rays]
-        return [(sensor, sensor.rays, largest_error(sensor, self.rules)) for sensor in sensors]
+        reach = partial(largest_error, rules=self.rules)
+        return [(sensor, sensor.rays, reach(sensor)) for sensor in self.detections if sensor.rays]
 
     @cached_property
     def points(self) -> TriangulatedPoints | None:
