@@ -21,7 +21,7 @@ from mixpose.judgement import (
     nearest_alike,
 )
 from mixpose.objective import View
-from mixpose.records import DelaySeen, Floats, Mask
+from mixpose.records import DelayEstimate, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Course, Distances, MotionRules, RandomWalk, per_kind
@@ -85,11 +85,11 @@ class DelayEvidence:
     unknown_s: float = constant(0.1, "standard deviation of a delay of which nothing is known")
 
     @cached_property
-    def seconds(self) -> Mapping[str, DelaySeen]:
+    def seconds(self) -> Mapping[str, DelayEstimate]:
         """How late each sensor is, as far as it is known, and how surely."""
         inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / self.unknown_s**2)
         late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
-        return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
+        return dict(zip(self.names, map(DelayEstimate, late.tolist(), deviations.tolist())))
 
     def applied(self, views: Sequence[View], time_s: float | None) -> list[View]:
         """Views as late as they are known to be; none is without times."""
@@ -98,7 +98,7 @@ class DelayEvidence:
         applied = list(views)
         for k, view in enumerate(views):
             if view.unsure is not None:
-                late = self.seconds.get(view.name, DelaySeen(0.0, self.unknown_s))
+                late = self.seconds.get(view.name, DelayEstimate(0.0, self.unknown_s))
                 applied[k] = replace(
                     view,
                     delay=view.delay + late.seconds,
