@@ -48,8 +48,8 @@ BACKGROUND = BackgroundRules()
 def background_tiles(image: Grey) -> Grey:
     """Return the medians of an image's tiles (rows, columns), a coarse map of its background."""
     tile = tile_side(image)
-    rows, v = _sample_places(image.shape[0], tile)
-    columns, u = _sample_places(image.shape[1], tile)
+    rows, v = _sample_indices(image.shape[0], tile)
+    columns, u = _sample_indices(image.shape[1], tile)
     # Indexing rows, then columns, is several times as fast as both at once, and two to three times
     # as fast as `skimage.measure.block_reduce` of the same samples (0.03 to 0.11 ms).
     places = image[v][:, u].reshape(rows, v.size // rows, columns, u.size // columns)
@@ -59,7 +59,7 @@ def background_tiles(image: Grey) -> Grey:
     return cv2.min(cv2.medianBlur(tiles, 3), cv2.medianBlur(tiles, 5))
 
 
-def spread_out(tiles: Grey, image: Grey, inner: tuple[slice, slice]) -> Grey:
+def interpolated(tiles: Grey, image: Grey, inner: tuple[slice, slice]) -> Grey:
     """Return the background of each pixel in a part of an image (H, W), in its type, from tiles.
 
     It is bilinear between the middles of tiles, and linear from there to the border.
@@ -95,8 +95,8 @@ def noise_of(image: Grey) -> float:
     if image.shape[1] <= 2 * spacing:
         return 0.0 if image.dtype == np.float32 else 1.0
     tile = tile_side(image)
-    _, v = _sample_places(image.shape[0], tile)
-    _, u = _sample_places(image.shape[1] - 2 * spacing, tile)
+    _, v = _sample_indices(image.shape[0], tile)
+    _, u = _sample_indices(image.shape[1] - 2 * spacing, tile)
     places = np.concatenate([u + shift * spacing for shift in range(3)])
     signed = np.int16 if image.dtype == np.uint8 else np.float32
     rows: NDArray[Any] = image[v][:, places].astype(signed).reshape(v.size, 3, u.size)
@@ -107,17 +107,17 @@ def noise_of(image: Grey) -> float:
     deviations = np.abs(differences).ravel()
     # Whole grey values hide a noise of less than 1.
     min_noise = 0.0 if image.dtype == np.float32 else 1.0
-    mean = _counted if image.dtype == np.uint8 else _trimmed
+    mean = _trimmed_mean_of_counts if image.dtype == np.uint8 else _trimmed_mean
     return max(math.sqrt(math.pi / 2 / 6) * mean(deviations, math.sqrt(6) * min_noise), min_noise)
 
 
-def _trimmed(deviations: Grey, min_noise: float) -> float:
+def _trimmed_mean(deviations: Grey, min_noise: float) -> float:
     """Return the mean of deviations up to four medians: finer than a median of whole numbers."""
     limit = 4 * max(float(_median(deviations)), min_noise)
     return float(deviations[deviations <= limit].mean())
 
 
-def _counted(deviations: Grey, min_noise: float) -> float:
+def _trimmed_mean_of_counts(deviations: Grey, min_noise: float) -> float:
     """Return `_trimmed` of small whole numbers, by counting, which is faster than sorting."""
     counts = np.bincount(deviations)
     median = int(np.searchsorted(np.cumsum(counts), deviations.size // 2, side="right"))
@@ -132,7 +132,7 @@ def tile_side(image: Grey) -> int:
 
 
 @lru_cache(maxsize=PLACES)
-def _sample_places(side: int, tile_side: int) -> tuple[int, NDArray[np.intp]]:
+def _sample_indices(side: int, tile_side: int) -> tuple[int, NDArray[np.intp]]:
     """Return the number of tiles along a side, and the indices of sampled pixels, in a row."""
     tiles = max(round(side / tile_side), 1)
     tile = side // tiles

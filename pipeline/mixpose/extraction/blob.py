@@ -77,8 +77,7 @@ def deviations_of(blobs: Sequence[Blob], usual: float) -> Floats:
     """
     if not blobs:
         return np.zeros(0)
-    # areas, lengths, directions, errors
-    table = np.array([(*blob[2:5], blob.error or 0.0) for blob in blobs])
+    table = np.array([(*blob[2:5], blob.error or 0.0) for blob in blobs])  # area, length, direction
     radii, lengths, errors = np.sqrt(table[:, 0] / np.pi), table[:, 1], table[:, 3]
     excess = lengths / np.sort(lengths)[(len(blobs) + 3) // 4 - 1] - 1
     # by how much a whole blob may be longer than others; a whole rim excludes a cut

@@ -30,19 +30,19 @@ from mixpose.extraction.contours import (
     Contour,
     cut_out,
     filled_area,
+    is_on_border,
     length_by_width,
     lobes,
-    on_border,
+    moment_ellipses,
+    outer_contours,
     outlines,
-    ovals,
-    pieces,
     touching_groups,
 )
 from mixpose.extraction.ellipse import RIMS, are_waisted, find_rims
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.shape import centre_errors
 from mixpose.extraction.single_spots import find_spots_together
-from mixpose.extraction.spots import SPOTS, come_apart
+from mixpose.extraction.spots import SPOTS, split_long
 from mixpose.extraction.threshold import Foreground, Window, above, foreground
 from mixpose.records import Image, PointPattern
 
@@ -100,7 +100,7 @@ def find_blobs(scenes: Sequence[tuple[Foreground, ExtractOptions]]) -> list[list
     ]
     regions = list(chain(*by_scene))
     large = [region for region in regions if region.area > BLOBS.small_area]
-    ellipses = ovals([region.contour for region in large])
+    ellipses = moment_ellipses([region.contour for region in large])
     shapeless = [large[k] for k in np.flatnonzero(~ellipses.is_ellipse).tolist()]
     for _ in range(2):
         for region in shapeless:
@@ -138,7 +138,7 @@ def _descendants(regions: Sequence[Region]) -> Iterator[Region]:
 
 
 def _find_disks(regions: Sequence[Region], ellipses: Ellipses) -> list[Region]:
-    """Store the disks of large regions, and return the large regions without one.
+    """Store the disks of large regions; return those without one, or with a core on their disk.
 
     `ellipses` are the start ellipses of the first of them.
     """
@@ -269,9 +269,9 @@ def _check_disk(scene: Foreground, contour: Contour, contrast: float) -> tuple[b
 
 
 def _split(region: Region, *, with_islands: bool = False) -> None:
-    """Split a large region without an elliptical rim at higher levels, if it is not compact.
+    """Split a large region without an elliptical rim at higher levels, or keep it as a blob.
 
-    `with_islands` also makes regions of what is in its holes.
+    `with_islands` also makes regions of the islands in its holes.
     """
     region.is_split, scene, contour, level = True, region.scene, region.contour, region.level
     box = cv2.boundingRect(contour)
@@ -283,8 +283,8 @@ def _split(region: Region, *, with_islands: bool = False) -> None:
     first = contour[0, 0] - corner
     cv2.floodFill(inside, None, first.tolist(), 2, flags=8)
     if with_islands:
-        holes = pieces((inside == 1).view(np.uint8), corner)
-        region.islands = _regions(scene, holes, level, region.limits)
+        island_contours = outer_contours((inside == 1).view(np.uint8), corner)
+        region.islands = _regions(scene, island_contours, level, region.limits)
     inside >>= 1
     peak, typical = cv2.minMaxLoc(patch, inside)[1], 0.0
     hull = cv2.convexHull(contour)
@@ -295,10 +295,10 @@ def _split(region: Region, *, with_islands: bool = False) -> None:
         and 0 < typical >= scene.least_peak
         and _step(scene, contour, box, BLOBS.step) >= SPOTS.min_step * typical
     )
-    if (stands_out or not scene.is_selective) and not on_border(scene, box):
+    if (stands_out or not scene.is_selective) and not is_on_border(scene, box):
         region.fallback = region.fallback or [_hull_blob(contour)]
     if scene.is_selective:
-        parts = come_apart(scene, contour, patch, inside, level)
+        parts = split_long(scene, contour, patch, inside, level)
         has_core = peak >= BLOBS.core_ratio * typical
         # pixels brighter than half of a core are not just lit by it
         floor = BLOBS.core_ratio / 2 * typical if has_core else 0.0
@@ -306,7 +306,7 @@ def _split(region: Region, *, with_islands: bool = False) -> None:
         is_clear = stands_out and not has_core
         if not parts and not is_clear and higher < peak:
             parts = [(above(patch, higher) & inside, higher)]
-        contours = [(pieces(mask, corner), valley) for mask, valley in parts]
+        contours = [(outer_contours(mask, corner), part_level) for mask, part_level in parts]
         region.higher = [_regions(scene, *layer, region.limits) for layer in contours]
     for inner in chain(region.islands, *region.higher):
         if inner.area > BLOBS.small_area:

@@ -74,7 +74,7 @@ def outlines(scene: Foreground) -> list[Contour]:
     return list(contours)
 
 
-def pieces(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:
+def outer_contours(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:
     """Return the outer contours of all connected parts of a mask, islands in holes included.
 
     `corner` is the position (u, v) of the mask's first pixel.
@@ -108,7 +108,7 @@ def length_by_width(contour: Contour) -> tuple[float, float]:
     return length, math.atan2(y, x) / 2
 
 
-def ovals(contours: Sequence[Contour]) -> Ellipses:
+def moment_ellipses(contours: Sequence[Contour]) -> Ellipses:
     """Return the ellipses with the moments of contours; rows without one where areas disagree.
 
     For most of them, rims agree.
@@ -165,7 +165,7 @@ def cut_out(
     Return the signal (h, w), a mask (h, w), 1 inside of the contour, and the first pixel (u, v).
     """
     patch, corner = signal_about(scene, box, margin)
-    return patch, filled(contour, patch.shape, corner), corner
+    return patch, mask_of(contour, patch.shape, corner), corner
 
 
 def signal_about(
@@ -178,7 +178,7 @@ def signal_about(
     return grey.astype(np.float32) - np.float32(scene.zero), (u0, v0)
 
 
-def filled(contour: Contour, shape: tuple[int, ...], corner: tuple[int, int]) -> NDArray[np.uint8]:
+def mask_of(contour: Contour, shape: tuple[int, ...], corner: tuple[int, int]) -> NDArray[np.uint8]:
     """Return a mask of a shape, its first pixel at a corner (u, v): 1 inside of a contour."""
     inside = np.zeros(shape, np.uint8)
     offset = (-corner[0], -corner[1])
@@ -186,7 +186,7 @@ def filled(contour: Contour, shape: tuple[int, ...], corner: tuple[int, int]) ->
     return inside
 
 
-def on_border(scene: Foreground, box: Box) -> bool:
+def is_on_border(scene: Foreground, box: Box) -> bool:
     """Test whether the box of a contour reaches the border of the window, which may cut it."""
     u, v, width, height = box
     rows, columns = scene.grey.shape

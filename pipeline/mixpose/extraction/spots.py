@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.contours import Contour, filled, on_border, signal_about
+from mixpose.extraction.contours import Contour, is_on_border, mask_of, signal_about
 from mixpose.extraction.shape import areas_at_half_height, background, centroids
 from mixpose.extraction.threshold import Foreground, above
 
@@ -60,20 +60,20 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
     u, v, width, height = box
     # The cheap test comes first: most specks of a busy scene are dim.
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1] - scene.zero
-    if highest < scene.least_peak or on_border(scene, box):
+    if highest < scene.least_peak or is_on_border(scene, box):
         return []
     patch, corner = signal_about(scene, box, SPOTS.margin)
     base = background(patch)
     # Mostly nothing else is in the patch, so that it needs no mask.
     is_alone = np.count_nonzero(patch > level) == area
-    inside = None if is_alone else filled(contour, patch.shape, corner)
+    inside = None if is_alone else mask_of(contour, patch.shape, corner)
     peak = cv2.minMaxLoc(patch, inside)[1]
     if scene.is_selective and peak - base < SPOTS.min_step * peak:
         return []
     if scene.is_selective and peak - level < SPOTS.prominence * peak:
         return []
     base = min(base, level)
-    parts = come_apart(scene, contour, patch, inside, level)
+    parts = split_long(scene, contour, patch, inside, level)
     own_signal = patch if inside is None else patch * inside
     size = float(areas_at_half_height(own_signal[None], np.array([base]), np.array([peak]))[0])
     spots = []
@@ -93,7 +93,7 @@ def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -
     return spots
 
 
-def come_apart(
+def split_long(
     scene: Foreground,
     contour: Contour,
     patch: NDArray[np.float32],

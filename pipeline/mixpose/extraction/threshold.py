@@ -18,8 +18,8 @@ from mixpose.constants import constant
 from mixpose.extraction.background import (
     Grey,
     background_tiles,
+    interpolated,
     noise_of,
-    spread_out,
 )
 from mixpose.extraction.options import ExtractOptions
 from mixpose.records import Image
@@ -204,7 +204,7 @@ def _without_background(
         # The background is even already, as in most dark frames: nothing is subtracted.
         halves = ascending[(tiles.size - 1) // 2], ascending[tiles.size // 2]
         return bright[inner], (float(halves[0]) + float(halves[1])) / 2
-    background = spread_out(tiles, bright, inner)
+    background = interpolated(tiles, bright, inner)
     return cv2.subtract(bright[inner], background, dst=background), 0.0
 
 
@@ -216,14 +216,14 @@ def _peak(grey: Grey, tops: Grey) -> float:
     if grey.shape[1] < 2:
         return float(tops.max())
     count = min(PEAK_ROWS, len(tops))
-    peak = _shared(grey[np.argpartition(tops, -count)[-count:]])
+    peak = _pair_maximum(grey[np.argpartition(tops, -count)[-count:]])
     brighter = np.flatnonzero(tops > peak)
     # In blocks that stay in the cache, as bright frames have many such rows.
     blocks = (brighter[first : first + BLOCK_ROWS] for first in range(0, brighter.size, BLOCK_ROWS))
-    return float(max([peak, *(_shared(grey[block]) for block in blocks)]))
+    return float(max([peak, *(_pair_maximum(grey[block]) for block in blocks)]))
 
 
-def _shared(rows: Grey) -> np.number[Any]:
+def _pair_maximum(rows: Grey) -> np.number[Any]:
     return cast("np.number[Any]", cv2.min(rows[:, :-1], rows[:, 1:]).max())
 
 

@@ -12,7 +12,7 @@ from mixpose.search.from_points import (
 from mixpose.search.poses import (
     Descent as Descent,
     Stage as Stage,
-    spread_turns as spread_turns,
+    spread_rotations as spread_rotations,
     distinct_poses as distinct_poses,
 )
 from mixpose.search.problem import (
@@ -36,5 +36,5 @@ from mixpose.search.three_points import (
 )
 from mixpose.search.triples import (
     far_apart as far_apart,
-    sparse as sparse,
+    thinned as thinned,
 )

@@ -22,9 +22,9 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
 from mixpose.search.from_points import (
     TriangulatedPoints,
-    by_promise,
     feature_triangles,
-    of_triples,
+    poses_of_triples,
+    sort_by_support,
     triangulate,
 )
 from mixpose.search.poses import (
@@ -54,7 +54,7 @@ class _Candidates(NamedTuple):
 
     poses: Floats  # (K, 4, 4)
     evidence: Floats  # (K,) log odds against clutter, without the price of having been chosen
-    gains: Floats  # (K,) log prior in nats
+    log_priors: Floats  # (K,) nats
     numbers: Indices  # (K, L N) detections met, numbered over all cameras; -1 for none
 
 
@@ -131,12 +131,12 @@ def search_copies(
     ]
     triangles = [feature_triangles(bodies[k], 6 * budget.sample, budget.min_sine) for k in kinds]
     longest = max(float(tree.data.max(initial=0.0)) for _, tree in triangles)
-    # a point whose error is as large as a body says nothing about its pose
+    # a point that errs by half of a body or more says nothing about its pose
     points = TriangulatedPoints._make(array[points.tolerance < longest / 2] for array in points)
-    points = by_promise(problems[0], points)
+    points = sort_by_support(problems[0], points)
     triples = _near_triples(points, longest, budget.batch)
     poses = [
-        of_triples(problem, points, corners, triples)
+        poses_of_triples(problem, points, corners, triples)
         for problem, corners in zip(problems, triangles, strict=True)
     ]
     candidates = {
@@ -173,7 +173,7 @@ def _candidates(
 
 
 def _near_triples(points: TriangulatedPoints, longest: float, limit: int) -> Indices:
-    """Return triples (K, 3) of points that share no ray and are no farther apart than `longest`.
+    """Return triples (K, 3) of points that share no ray and may be within `longest` of each other.
 
     The most promising come first; there are `limit` at most.
     """
@@ -210,7 +210,7 @@ def _resolve_shared(
     kinds = np.repeat(list(candidates), [len(group.poses) for group in groups]).tolist()
     poses = np.concatenate([group.poses for group in groups])
     evidence = np.concatenate([group.evidence for group in groups])
-    scores = evidence + np.concatenate([group.gains for group in groups])
+    scores = evidence + np.concatenate([group.log_priors for group in groups])
     rows = [row[row >= 0].tolist() for group in groups for row in group.numbers]
     owners, rivals = dict[int, int](), dict[int, int]()
     order = np.argsort(-scores, kind="stable")
@@ -222,8 +222,8 @@ def _resolve_shared(
             owners = dict.fromkeys(rows[k], k) | owners
             continue
         for j in set(taken) - set(rivals):
-            is_near = kinds[j] == kinds[k] and scores[k] > scores[j] - budget.outdone
-            if is_near and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
+            is_rival = kinds[j] == kinds[k] and scores[k] > scores[j] - budget.outdone
+            if is_rival and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
                 rivals[j] = k
     return [
         Copy(kinds[k], poses[k], float(evidence[k]), poses[rivals[k]] if k in rivals else None)

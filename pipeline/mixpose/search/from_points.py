@@ -25,8 +25,8 @@ from mixpose.search.three_points import (
     SECOND,
     Guesses,
     align_triples,
+    corners_of,
     from_three_rays,
-    gathered,
 )
 from mixpose.search.triples import far_apart
 from mixpose.sensors import Rays
@@ -54,7 +54,7 @@ def generators_of(problem: SearchProblem) -> list[Guesses]:
     generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
     if len(rays) < 2:
         return generators
-    points = by_promise(problem, triangulate(rays, reaches, budget))
+    points = sort_by_support(problem, triangulate(rays, reaches, budget))
     crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
     # in a crowd few of the points tried, and of the rays near them, are right
     place = len(generators) if crowded else 0
@@ -118,7 +118,7 @@ def _meetings(
         yield TriangulatedPoints((on_a + on_b) / 2, off, share, sensors, pairs)
 
 
-def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
+def sort_by_support(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
     """Sort points by the sensors that confirm them, then by their errors, without duplicates.
 
     Guesses combine them in this order (PROSAC, Chum and Matas, CVPR 2005).
@@ -148,7 +148,7 @@ def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Gu
     budget = problem.budget
     triangles = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
     for triples in point_triples(problem, points) if len(triangles[0]) else ():
-        yield partial(of_triples, problem, points, triangles, triples)
+        yield partial(poses_of_triples, problem, points, triangles, triples)
 
 
 @lru_cache(maxsize=16)
@@ -185,7 +185,7 @@ def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterato
         yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 
 
-def of_triples(
+def poses_of_triples(
     problem: SearchProblem,
     points: TriangulatedPoints,
     triangles: tuple[Indices, cKDTree],
@@ -212,7 +212,7 @@ def of_triples(
     chosen = index[which, rank]
     is_alike = (np.abs(sides[which] - tree.data[chosen]) <= allowed[which]).all(axis=1)
     features, world = corners[chosen[is_alike]], triples[which[is_alike]]
-    return align_triples(gathered(body.means, features.T), gathered(points.points, world.T))
+    return align_triples(corners_of(body.means, features.T), corners_of(points.points, world.T))
 
 
 def _sides(points: Floats, triples: Indices, min_sine: float) -> tuple[Floats, Mask]:
@@ -227,10 +227,10 @@ def _sides(points: Floats, triples: Indices, min_sine: float) -> tuple[Floats, M
 def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
     """Yield batches of poses with one point in space as a feature, the most promising first."""
     for p in range(min(len(points.points), 2 * problem.budget.sample)):
-        yield partial(_of_point, problem, points, p)
+        yield partial(_poses_of_point, problem, points, p)
 
 
-def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
+def _poses_of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
     """Return poses with a point as each feature and two others where rays cut their spheres."""
     means, budget = problem.body.means, problem.budget
     features = means[far_apart(means, budget.sample)]

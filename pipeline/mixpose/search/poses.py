@@ -86,7 +86,7 @@ def label_image(sensor: SensorDetections, rays: Rays, reach: float) -> LabelImag
 def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tuple[Floats, Floats]:
     """Count distinct detections (L, H) that poses explain, and sum nearness (H,), 0 to 1 each."""
     counts, nearness = np.zeros((len(images), len(poses))), np.zeros(len(poses))
-    chunk = max(2**17 // len(body), 1)  # numbers that stay in the cache
+    chunk = max(2**17 // len(body), 1)  # poses whose numbers stay in the cache
     for part in (slice(k, k + chunk) for k in range(0, len(poses), chunk)):
         axes = np.ascontiguousarray(poses[part, :3].transpose(1, 0, 2))
         world = axes[..., :3] @ body.means.T + axes[..., 3:]
@@ -142,7 +142,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     detections = np.full(seen.shape, -1)
     boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
     lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)
-    pairs = _met_in_space(problem, y, seen)
+    pairs = _pairs_in_space(problem, y, seen)
     for k, (sensor, sigma) in enumerate(zip(sensors, sigmas, strict=True)):
         points, smallest = sensor.points, rules.min_region * sigma
         pose, feature, detection = pairs.get(k) or _pairs(
@@ -150,8 +150,8 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         )
         shares[pose, k, feature], detections[pose, k, feature] = 1.0, detection
         offsets[pose, k, feature] = (points[detection] - y[pose, k, feature]) / sigma
-        boxes_of = points, lower[:, k], upper[:, k], smallest, shares[:, k].sum(axis=1)
-        in_view, in_space = crowding(*boxes_of)
+        crowd_inputs = points, lower[:, k], upper[:, k], smallest, shares[:, k].sum(axis=1)
+        in_view, in_space = crowding(*crowd_inputs)
         crowd[:, k], clutter[:, k] = in_view * sigma**2, in_space * sigma**3
     clouds = clouds_among(tuple([sensor.view.sensor for sensor in sensors]))
     for planes in clouds:
@@ -160,7 +160,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         smallest, met = rules.min_region * sigmas[planes[0]], shares[:, planes[0]].sum(axis=1)
         dense = crowding(points, low, high, smallest, met, deep=1.0)[1]
         clutter[:, planes] = dense[:, None] * sigmas[planes] ** 3
-    nothing = np.zeros(crowd.shape)
+    zeros = np.zeros(crowd.shape)
     return Matches(
         names=tuple(sensor.view.name for sensor in sensors),
         dimensions=projection.dimensions,
@@ -171,23 +171,23 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         offsets=offsets,
         J=J / sigmas[:, None, None, None],
         detections=detections,
-        explained=nothing,
+        explained=zeros,
         unseen=np.count_nonzero(faced & ~seen, axis=2),
         cut=np.full((*seen.shape, 2), np.nan),
-        merged=nothing.astype(np.intp),
-        count=nothing + [len(sensor.points) for sensor in sensors],
+        merged=zeros.astype(np.intp),
+        count=zeros + [len(sensor.points) for sensor in sensors],
         crowd=crowd,
         others=clutter,
-        unmatched_nearby=nothing,
+        unmatched_nearby=zeros,
         beside=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),
         radii=np.zeros(seen.shape),
-        finest=nothing + 1.0,
+        finest=zeros + 1.0,
         owners=owners_of(len(sensors), clouds),
     )
 
 
-def _met_in_space(
+def _pairs_in_space(
     problem: SearchProblem, y: Floats, seen: Mask
 ) -> dict[int, tuple[Indices, Indices, Indices]]:
     """Return the result of `_pairs` in space for the images of clouds, the same for all three."""
@@ -240,7 +240,7 @@ class Descent:
         for factors, steps, survivors in stages if len(poses) else ():
             objective = self.objective(factors)
             if steps:
-                ascent = stepped(objective, poses, self._moved, self.free, steps, damping=1e-3)
+                ascent = stepped(objective, poses, self._move, self.free, steps, damping=1e-3)
                 poses = ascent.states
             if len(poses) > survivors:
                 # shares are near (k/n)²: their roots count the k of n features that are met
@@ -249,7 +249,7 @@ class Descent:
             poses = poses[distinct_poses(self.body, poses, self.budget.alike / 5)[:survivors]]
         return poses
 
-    def _moved(self, poses: Floats, twists: Floats) -> Floats:
+    def _move(self, poses: Floats, twists: Floats) -> Floats:
         """Move poses (H, 4, 4) by twists (H, 6), by 20° at most, as far as the model is linear."""
         shift, turn = np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).T
         longest = np.maximum(turn, 0.175 / max(self.body.radius, 1e-12) * shift)
@@ -265,18 +265,18 @@ def distinct_poses(body: Body, poses: Floats, cell: float, *, whole: bool = Fals
     corners = body.means if whole else body.means[[0, len(body) // 2, -1]]
     places = transform(poses, corners).reshape(len(poses), corners.size)
     cells = np.round(places / (cell * body.radius))
-    # places beyond that, or NaN, count as one
+    # places farther off, or NaN, become one place
     cells = np.clip(np.nan_to_num(cells), -(2.0**62), 2.0**62).astype(np.int64)
     keys = cells @ np.random.default_rng(0).integers(1, 2**40, cells.shape[1])
     return np.sort(np.unique(keys, return_index=True)[1])
 
 
-def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage]]:
+def spread_poses(problem: SearchProblem) -> tuple[Floats, list[Stage]]:
     """Return poses (H, 4, 4) of all orientations, and the stages of their descent."""
     budget, T_reference, free = problem.budget, problem.T_reference, problem.free
     step = budget.orientation_step
-    rotations = spread_turns(free[3:], step) @ T_reference[:3, :3]
-    places = _centres(problem)[:, None] - rotations @ problem.body.means.mean(axis=0)
+    rotations = spread_rotations(free[3:], step) @ T_reference[:3, :3]
+    places = _centre_positions(problem)[:, None] - rotations @ problem.body.means.mean(axis=0)
     poses = from_parts(rotations, np.where(free[:3], places, T_reference[:3, 3]))
     # a turn by one step moves features by that share of their spread
     spreads = [sensor.moments[1] / sensor.sigma for sensor in problem.detections]
@@ -287,7 +287,7 @@ def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage
     return poses.reshape(-1, 4, 4), stages
 
 
-def spread_turns(free: Mask, step: float) -> Floats:
+def spread_rotations(free: Mask, step: float) -> Floats:
     """Return turns (count, 3, 3) about the free world axes (3,), about `step` radians apart."""
     if free.all():  # a super-Fibonacci spiral (Alexa, Low-Discrepancy Sampling of SO(3), CVPR 2022)
         count = int(np.ceil(np.pi**2 * 1.5 / step**3))
@@ -303,18 +303,18 @@ def spread_turns(free: Mask, step: float) -> Floats:
     return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
-def _centres(problem: SearchProblem) -> Floats:
+def _centre_positions(problem: SearchProblem) -> Floats:
     """Return positions (C, 3) of the body's centre that agree with the means of all detections.
 
     For ranges alone also positions a standard error away, as false ranges may move the means.
     """
-    radius, middles = problem.body.radius, Sum(tuple(map(_Middle, problem.detections)))
+    radius, middles = problem.body.radius, Sum(tuple(map(_CentreOffset, problem.detections)))
 
     def move(places: Floats, steps: Floats) -> Floats:
         length = np.linalg.norm(steps, axis=1, keepdims=True)
         return np.asarray(places + steps * np.minimum(1.0, 5 * radius / np.maximum(length, 1e-30)))
 
-    starts, free = _starts(problem), problem.free[:3]
+    starts, free = _start_positions(problem), problem.free[:3]
     places = stepped(middles, starts, move, free, 12, damping=1e-6).states
     distances = np.sqrt(-2 * middles.linearise(places).value)
     count = np.count_nonzero(distances < distances.min(initial=np.inf) + radius)
@@ -332,7 +332,7 @@ def _centres(problem: SearchProblem) -> Floats:
     return np.asarray((near[:, None] + shifts).reshape(-1, 3))
 
 
-def _starts(problem: SearchProblem) -> Floats:
+def _start_positions(problem: SearchProblem) -> Floats:
     """Return start positions (S, 3): on rays, at the distance by size, and about range sensors."""
     centre = problem.body.means.mean(axis=0)
     size = float(np.sqrt(((problem.body.nodes.points - centre) ** 2).sum(axis=1).mean()))
@@ -353,7 +353,7 @@ def _starts(problem: SearchProblem) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Middle:
+class _CentreOffset:
     """Minus half the squared offset of a position from the mean of a sensor's detections."""
 
     seen: SensorDetections

@@ -38,7 +38,7 @@ class SearchBudget:
         "largest error of a point in gaps of its two rays: 6 of 7 ratios of two errors are less",
     )
     least_off: float = constant(
-        0.3, "smallest such error in errors that gates allow: thrice the 0.3 σ_ε that spots err by"
+        0.3, "smallest such error, as a share of the gates: thrice the 0.3 σ_ε that spots err by"
     )
     crowded: float = constant(
         2.0, "detections per feature above which detections far apart are right 2.7 times less"
@@ -69,7 +69,7 @@ class SearchBudget:
     wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
     )
-    orientation_step: float = constant(np.pi / 15, "of a turn: finds 99 of 100 of 3 ranges 6/0/0")
+    orientation_step: float = constant(np.pi / 15, "radians: finds 99 of 100 of 3 ranges 6/0/0")
     orientation_stages: tuple[tuple[float, int, int], ...] = constant(
         ((1.0, 0, 500), (1.0, 3, 300), (0.6, 4, 150), (0.3, 4, 60), (0.0, 6, 24)),
         "rows of the power of the blur that such a step causes, steps, and poses that go on",
@@ -204,7 +204,7 @@ class SearchProblem:
         """Largest error of a sensor's detections, in its units."""
         return largest_error(sensor, self.rules)
 
-    def allowed(self, poses: Floats) -> Floats:
+    def constrained(self, poses: Floats) -> Floats:
         """Return poses (H, 4, 4) with their held directions set to the reference's."""
         if self.free.all() or not len(poses):
             return poses

@@ -23,9 +23,9 @@ from mixpose.search.poses import (
     count_inliers,
     distinct_poses,
     evidence,
-    from_spread_orientations,
     label_image,
     matches_of,
+    spread_poses,
 )
 from mixpose.search.problem import (
     THOROUGH,
@@ -35,7 +35,7 @@ from mixpose.search.problem import (
     sensor_detections,
 )
 from mixpose.search.three_points import Guesses
-from mixpose.search.triples import sparse
+from mixpose.search.triples import thinned
 
 _MISSED = 4.0  # nats that a missed detection costs
 
@@ -98,9 +98,8 @@ def search_frame(
     """Find poses that explain the views of one frame, without a start.
 
     `rules` rank them, the same that judge the result.  `seed` sets the random order of guesses,
-    `state` is the result's of the frame before, where its budget was used up.  `log_prior` decides
-    between poses that explain about as much.  Raises `SessionError` if directions are held without
-    a reference pose.
+    `state` is the result's of the frame before.  `log_prior` decides between poses that explain
+    about as much.  Raises `SessionError` if directions are held without a reference pose.
     """
     if T_reference is None and not free.all():
         raise SessionError(
@@ -133,7 +132,7 @@ class _Search:
         self._has_several_cameras = self._by_evidence and len(cameras) > 1
         self._has_one_camera = self._by_evidence and len(cameras) == 1
         self._descent = Descent(
-            views, sparse(self._body, 4 * self._budget.sample), problem.free, self._budget
+            views, thinned(self._body, 4 * self._budget.sample), problem.free, self._budget
         )
         # where not all sensors are cameras the descent ends at σ_ε
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
@@ -159,7 +158,7 @@ class _Search:
         # guesses from detections lead to any pose that has evidence
         is_guessed = self._by_evidence and (self._cost["made"] > 0 or budget.useful >= 0)
         if self._coverage() < budget.sufficient and not is_guessed:
-            self._refine(*from_spread_orientations(self._problem))
+            self._refine(*spread_poses(self._problem))
         return SearchResult(self._candidates(), SearchReport(**self._cost), next_state)
 
     def _candidates(self) -> list[Candidate]:
@@ -184,12 +183,12 @@ class _Search:
         most_seen = max(len(rays) for _, rays in self._problem.cameras)
         seen = max(min(most_seen, len(body)), 1)
         margin = budget.outdone / _MISSED  # detections
-        reduced, limit = sparse(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
-        poses, ranks, gains = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
+        reduced, limit = thinned(body, 2 * budget.sample * len(body) // seen), budget.refined(seen)
+        poses, ranks, priors = np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0)
         best, best_checked, batches, repeats = 0.0, 0.0, skip, 0
         for make_guesses in islice(generator, skip, None):
             batches += 1
-            guesses = self._problem.allowed(make_guesses())
+            guesses = self._problem.constrained(make_guesses())
             self._cost["made"] += len(guesses)
             if reduced is not body and len(guesses) > budget.shortlist:
                 rank = self._count(reduced, guesses)
@@ -199,10 +198,10 @@ class _Search:
             is_likely, previous = rank > ranks.max(initial=0.0) - margin, poses[:1]
             poses = np.concatenate([poses, guesses[is_likely]])
             ranks = np.append(ranks, rank[is_likely])
-            gains = np.append(gains, self._log_prior(guesses[is_likely]))
-            order = np.argsort(-ranks - gains / _MISSED, kind="stable")
+            priors = np.append(priors, self._log_prior(guesses[is_likely]))
+            order = np.argsort(-ranks - priors / _MISSED, kind="stable")
             order = order[distinct_poses(body, poses[order], budget.alike)][:limit]
-            poses, ranks, gains = poses[order], ranks[order], gains[order]
+            poses, ranks, priors = poses[order], ranks[order], priors[order]
             best = float(ranks.max(initial=0.0))
             if self._has_one_camera:
                 near_best = guesses[rank > best - 1]
@@ -240,7 +239,7 @@ class _Search:
         return np.asarray(counts.sum(axis=0) + 0.1 * near)
 
     def _are_sufficient(self, guesses: Floats, explained: float) -> bool:
-        """Refine the best guesses of several cameras, and test whether others are needed still."""
+        """Refine the best guesses of several cameras, and test whether the search may end."""
         if not self._has_several_cameras or (
             explained < self._sufficient and self._judge(guesses)[0].max() < self._budget.hopeless
         ):
@@ -276,7 +275,7 @@ class _Search:
         return float(self._scores[1, :1].sum())
 
     def _distinct(self, count: int) -> list[int]:
-        """Return indices of the best poses that put the body, symmetries aside, apart."""
+        """Return indices of the best poses that differ, symmetries of the body aside."""
         means, kept, images = self._body.means, list[int](), np.zeros((0, len(self._body), 3))
         radius = self._budget.alike * self._body.radius  # root mean square distance of features
         for k, pose in enumerate(self._poses):

@@ -35,7 +35,7 @@ SIDES = [(0, 1), (0, 2), (1, 2)]
 _EACH, (FIRST, SECOND) = np.arange(len(SIDES)), np.transpose(SIDES)
 
 
-def gathered(points: Floats, corners: Indices) -> Floats:
+def corners_of(points: Floats, corners: Indices) -> Floats:
     """Return the corners (3, 3, K) of triangles, given as indices (3, K) of points (n, 3)."""
     return np.take(points.T, corners, axis=1).swapaxes(0, 1)
 
@@ -176,12 +176,12 @@ def _perspective(
     clear = np.sqrt(squared.max(axis=0))[which] > reach * rays.slope * distances.min(axis=0)
     distances, corners, detections = distances[:, clear], corners[:, which], detections[:, which]
     corners, detections = corners[:, clear], detections[:, clear]
-    seen = gathered(rays.directions, detections) * distances[:, None]
-    poses = align_triples(gathered(features, corners), rays.origins[0][:, None] + seen)
+    seen = corners_of(rays.directions, detections) * distances[:, None]
+    poses = align_triples(corners_of(features, corners), rays.origins[0][:, None] + seen)
     if body.normals is None:
         return poses
     columns = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
-    normals = zip(gathered(body.normals, corners), seen, strict=True)
+    normals = zip(corners_of(body.normals, corners), seen, strict=True)
     facing = [_dot(np.asarray(sum(map(np.multiply, n, columns))), ray) < 0 for n, ray in normals]
     return np.asarray(poses[np.all(facing, axis=0)])
 
@@ -193,7 +193,7 @@ def _orthographic(
 
     The depths must add up.  As the body's depth is not seen, its middle is on the sensor's plane.
     """
-    features, seen = gathered(body.means, corners), gathered(rays.origins, detections)
+    features, seen = corners_of(body.means, corners), corners_of(rays.origins, detections)
     tolerance = 2 * reach * rays.offset
     length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (features, seen))
     rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))

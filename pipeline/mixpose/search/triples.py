@@ -35,14 +35,13 @@ def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, I
     if cameras > 1:  # a hit of one camera is enough; half as many would miss 1 body in 24
         limit //= 4 * cameras
     if comb(M, 3) * perm(n, 3) <= limit:
-        yield from _shuffled(_combined(np.arange(M)), _seen_together(body), limit, batch, rng)
+        yield from _shuffled(_triples(np.arange(M)), _seen_together(body), limit, batch, rng)
         return
     if budget.crowded * n >= M:  # in a crowd the outermost detections are not the body's
         limit //= 4
-        neighbours = _neighbours(rays.pixels), _neighbouring(body)
+        near = _neighbour_triples(rays.pixels), _neighbour_features(body)
         outer = far_apart(rays.pixels, 3 * budget.sample // 2)
-        apart = _combined(outer), _of_sides(body, budget.sample)
-        for detections, corners in (neighbours, apart):
+        for detections, corners in (near, (_triples(outer), _far_features(body, budget.sample))):
             yield from _shuffled(detections, corners, limit, batch, rng)
         limit *= 2
     # by point, the indices of all points from the nearest to the farthest
@@ -55,7 +54,7 @@ def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, I
     for k in range(limit // batch):
         crowd = crowds[k % len(crowds)]
         few = min(max(crowd // 2, 3), n)
-        yield _drawn(near_rays, min(crowd, M), batch, rng), _drawn(near_features, few, batch, rng)
+        yield _draw(near_rays, min(crowd, M), batch, rng), _draw(near_features, few, batch, rng)
 
 
 def _shuffled(
@@ -68,7 +67,7 @@ def _shuffled(
         yield detections[:, a], corners[:, b]
 
 
-def _combined(numbers: Indices) -> Indices:
+def _triples(numbers: Indices) -> Indices:
     """Return all triples (3, K) of numbers, in their order."""
     return np.array(list(combinations(numbers.tolist(), 3)), dtype=np.intp).reshape(-1, 3).T
 
@@ -78,7 +77,7 @@ def _in_all_orders(triples: Indices) -> Indices:
     return np.unique(np.concatenate([triples[list(order)] for order in _ORDERS], axis=1), axis=1)
 
 
-def _neighbours(points: Floats) -> Indices:
+def _neighbour_triples(points: Floats) -> Indices:
     """Return triples (3, K) of points (n, d): every point with two of the three nearest to it."""
     distances = np.linalg.norm(points[:, None] - points, axis=2)
     nearest = np.argsort(distances, axis=1, kind="stable")[:, :4]
@@ -88,19 +87,19 @@ def _neighbours(points: Floats) -> Indices:
 
 
 @lru_cache(maxsize=32)
-def _neighbouring(body: Body) -> Indices:
-    """Return the `_neighbours` (3, P), in all orders, among the features of a side."""
+def _neighbour_features(body: Body) -> Indices:
+    """Return the `_neighbour_triples` (3, P) of the features of each side, in all orders."""
     sides = [side for side in _sides(body) if len(side) > 2]
-    triples = [side[_neighbours(body.means[side])] for side in sides]
+    triples = [side[_neighbour_triples(body.means[side])] for side in sides]
     return _in_all_orders(np.concatenate([np.zeros((3, 0), dtype=np.intp), *triples], axis=1))
 
 
 @lru_cache(maxsize=32)
-def _of_sides(body: Body, count: int) -> Indices:
+def _far_features(body: Body, count: int) -> Indices:
     """Return triples (3, P), in all orders, of `count` features far apart on each side."""
     selected = [side[far_apart(body.means[side], count)] for side in _sides(body)]
     # sides with less than three features have no triples
-    return _in_all_orders(np.concatenate([_combined(np.sort(side)) for side in selected], axis=1))
+    return _in_all_orders(np.concatenate([_triples(np.sort(side)) for side in selected], axis=1))
 
 
 @lru_cache(maxsize=32)
@@ -109,7 +108,7 @@ def _seen_together(body: Body) -> Indices:
 
     Such features face away from each other, and neither is in front of the other's face.
     """
-    triples = _combined(np.arange(len(body)))
+    triples = _triples(np.arange(len(body)))
     if body.normals is not None:
         turned_away = body.normals @ body.normals.T < _TURNED_AWAY
         arms = body.means - body.means[:, None]
@@ -131,7 +130,7 @@ def far_apart(points: Floats, count: int) -> Indices:
 
 
 @lru_cache(maxsize=32)
-def sparse(body: Body, count: int) -> Body:
+def thinned(body: Body, count: int) -> Body:
     """Return the body with only `count` of its features, far from one another; itself if fewer."""
     if len(body) <= count or not is_pointlike(body):
         return body
@@ -154,7 +153,7 @@ def _sides(body: Body) -> list[Indices]:
     return sides
 
 
-def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
+def _draw(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
     """Draw random triples (3, count): a point, and two of the `crowd - 1` nearest to it."""
     first = rng.integers(0, len(nearest), count)
     # the two lowest of random numbers, by a partition: sorting thousands would take most time

@@ -29,7 +29,7 @@ from mixpose.search import (
     SearchState,
     is_pointlike,
     search_frame,
-    sparse,
+    thinned,
 )
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.ranges import are_associated
@@ -172,7 +172,7 @@ def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> li
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    few = sparse(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
+    few = thinned(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
     descent = Descent(frame.views, few, frame.free, frame.rules.search)
     poses = np.concatenate([T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, kept), *stages])
