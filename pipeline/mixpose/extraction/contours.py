@@ -68,9 +68,9 @@ def outlines(scene: Foreground) -> list[Contour]:
     contours = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     if rows.size < len(wanted):
         # No row within a contour was left out, so that all of it moves by the same shift.
-        left_out = (rows - np.arange(rows.size)).tolist()
+        rows_removed = (rows - np.arange(rows.size)).tolist()
         for contour in contours:
-            contour[:, 0, 1] += left_out[contour[0, 0, 1]]
+            contour[:, 0, 1] += rows_removed[contour[0, 0, 1]]
     return list(contours)
 
 
@@ -111,20 +111,20 @@ def length_by_width(contour: Contour) -> tuple[float, float]:
 def moment_ellipses(contours: Sequence[Contour]) -> Ellipses:
     """Return the ellipses with the moments of contours; rows without one where areas disagree.
 
-    For most of them, rims agree.
+    For most of them the fitted rims agree.
     """
     if not contours:
         return no_ellipses(0)
     rows = [_MOMENTS(cv2.moments(contour)) for contour in contours]
     area, u, v, uu, vv, uv = np.array(rows, dtype=np.float64).T
     spread = np.sqrt(np.maximum(uu * vv - uv * uv, 0.0))
-    sound = (area > 0) & (area * area >= OVAL * 4 * math.pi * spread)
-    area = np.where(sound, area, 1.0)
+    valid = (area > 0) & (area * area >= OVAL * 4 * math.pi * spread)
+    area = np.where(valid, area, 1.0)
     middle, half = (uu + vv) / 2, np.hypot((uu - vv) / 2, uv)
     # the contour runs through the centres of the outermost pixels, half a pixel inside
     squares = np.maximum(np.stack([middle + half, middle - half], axis=1), 0.0) / area[:, None]
     centres = np.stack([u, v], axis=1) / area[:, None]
-    return Ellipses(centres, 2 * np.sqrt(squares) + 0.5, 0.5 * np.arctan2(2 * uv, uu - vv), sound)
+    return Ellipses(centres, 2 * np.sqrt(squares) + 0.5, 0.5 * np.arctan2(2 * uv, uu - vv), valid)
 
 
 def lobes(contour: Contour, depth: float, min_way: float) -> list[Contour]:

@@ -89,7 +89,7 @@ def _meetings(
     step = max(_AT_ONCE // max(len(b), 1), 1)
     ones = np.ones((len(b), 1))
     origins_b = b.origins - a.origins[:1].sum(axis=0)  # near zero, as products would lose digits
-    of_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
+    moments_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
     along_b = np.hstack([(origins_b * b.directions).sum(axis=1, keepdims=True), -b.directions])
     for start in range(0, max(len(a), 1), step):
         u = a.directions[start : start + step]
@@ -100,7 +100,7 @@ def _meetings(
         to_b = np.hstack([np.ones((len(o), 1)), o]) @ along_b.T
         s = (to_a - cosine * to_b) / sine2
         t = (cosine * to_a - to_b) / sine2
-        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ of_b.T) / np.sqrt(sine2)
+        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ moments_b.T) / np.sqrt(sine2)
         tolerance = np.hypot(
             gates[0] * (a.offset + a.slope * np.abs(s)), gates[1] * (b.offset + b.slope * np.abs(t))
         )
@@ -119,11 +119,11 @@ def _meetings(
 
 
 def sort_by_support(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
-    """Sort points by the sensors that confirm them, then by their errors, without duplicates.
+    """Sort points by the number of sensors that confirm them, then by errors; drop duplicates.
 
     Guesses combine them in this order (PROSAC, Chum and Matas, CVPR 2005).
     """
-    places, most = points.points, problem.budget.max_triples // 40  # 40 triples per point
+    places, most = points.points, problem.budget.max_triples // 40  # one of 40 triples
     first = np.argsort(points.gap, kind="stable")[:most]
     if len(problem.cameras) > 2:  # two cameras give no duplicates
         (support, error), chosen = np.zeros((2, len(places))), list[int]()
@@ -196,13 +196,13 @@ def poses_of_triples(
     if not (len(triples) and len(corners)):  # features on a line have no triangles
         return np.zeros((0, 4, 4))
     # error of a side between two features that give way
-    bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
+    bending = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
     sides, is_wide = _sides(points.points, triples, budget.min_sine)
-    slack = 2 * points.tolerance[triples].max(axis=1) + bent
+    slack = 2 * points.tolerance[triples].max(axis=1) + bending
     is_possible = is_wide & (sides.max(axis=1) < tree.data.max() + slack)
     triples, sides = triples[is_possible], sides[is_possible]
     squares = points.tolerance[triples] ** 2
-    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bent**2)
+    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bending**2)
     distances, index = tree.query(
         sides,
         k=np.arange(1, min(2 * budget.sample, len(corners)) + 1),
