@@ -326,7 +326,7 @@ class Estimate:
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
     # (3,) tip in body coordinates; None without a tip
     tip_object: Floats | None = field(default=None, compare=False)
-    filled: bool = False  # whether the pose is interpolated from other frames: nothing was measured
+    filled: bool = False  # whether nothing was measured: the pose is from other frames
     ahead_s: float = 0.0  # time from the frame to the pose, seconds, of a pose that was foretold
 
     @cached_property

@@ -260,7 +260,7 @@ def distinct_poses(body: Body, poses: Floats, cell: float, *, whole: bool = Fals
     """Return ascending indices of poses (H, 4, 4) that do not repeat an earlier one.
 
     Poses are the same if three features, or those of the `whole` body, fall into the same cells,
-    whose side is a share `cell` of the body's radius.  This is quick, and approximate at the rims.
+    whose side is a share `cell` of the body's radius.  Poses at cell borders may escape.
     """
     corners = body.means if whole else body.means[[0, len(body) // 2, -1]]
     places = transform(poses, corners).reshape(len(poses), corners.size)
