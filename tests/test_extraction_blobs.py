@@ -346,7 +346,7 @@ def test_ellipses_of_many_rims_at_once_are_those_of_each_by_itself(shown: int) -
     chosen = np.tile(np.arange(72) < shown, (40, 1))
     chosen[0, 5:] = False  # too few
     together = fit_conics(rims, chosen, 0.15)
-    assert together.sound.tolist() == [False] + 39 * [True]
+    assert together.is_ellipse.tolist() == [False] + 39 * [True]
     for k in range(1, 40):
         alone = fit_conics(rims[k : k + 1], chosen[k : k + 1], 0.15)
         # OpenCV computes in single precision, of which a quarter of a rim leaves less

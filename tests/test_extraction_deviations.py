@@ -103,6 +103,6 @@ def test_a_disk_whose_rim_is_not_seen_all_around_may_err(radius: float, cut: flo
 
 def test_what_errs_by_more_weighs_less_by_its_variance() -> None:
     pattern = PointPattern(CENTRES, np.ones(5), np.array([0.0, 0.0, 1.0, 2.0, 0.0]))
-    np.testing.assert_allclose(pattern.weighed(0.5), [1.0, 1.0, 0.2, 1 / 17, 1.0])
-    assert not pattern.is_even
-    assert pattern.only(np.array([True, True, False, False, True])).is_even
+    np.testing.assert_allclose(pattern.effective_weights(0.5), [1.0, 1.0, 0.2, 1 / 17, 1.0])
+    assert not pattern.is_uniform
+    assert pattern.only(np.array([True, True, False, False, True])).is_uniform

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.extraction.sampling import sample, sample_each
+from mixpose.extraction.sampling import sample, sample_lines
 
 
 def test_many_features_in_several_images_are_looked_up_as_exactly_as_one() -> None:
@@ -20,7 +20,7 @@ def test_many_features_in_several_images_are_looked_up_as_exactly_as_one() -> No
     places, steps = np.zeros((2, 2, *u.shape))
     places[:] = centres.T[..., None]
     steps[:] = np.array([u, v]) - places
-    middles, found = sample_each(images, own, places, steps, np.array([0.0, 1.0]))
+    middles, found = sample_lines(images, own, places, steps, np.array([0.0, 1.0]))
     assert (middles == middles[..., :1]).all()
     for k, image in enumerate(images):
         inside = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mixpose.extraction.blobs import extract_blobs
-from mixpose.extraction.conics import together
+from mixpose.extraction.conics import ellipses_of
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.shape import centroids, off_centre
+from mixpose.extraction.shape import centre_errors, centroids
 from mixpose.extraction.threshold import Foreground
 
 Singles = NDArray[np.float32]
@@ -72,17 +72,16 @@ def test_patches_side_by_side_are_as_each_by_itself_and_empty_ones_have_no_centr
 def test_an_ellipse_beside_the_light_that_it_is_of_seems_off_by_as_much() -> None:
     image = np.full((40, 40), 20.0, np.float32) + disk((7.0, 7.0))
     top = image.max(axis=1)
-    scene = Foreground(image, 20.0, 40.0, noise=1.0, least_peak=60.0, judged=True, tops=top)
+    scene = Foreground(image, 20.0, 40.0, noise=1.0, least_peak=60.0, is_selective=True, tops=top)
     u, v = MIDDLE.tolist()
     right, beside = ((u + d, v, 7.0, 7.0, 0.0) for d in (0.0, 0.5))
-    off = off_centre([scene], np.zeros(2, np.intp), together([right, beside]), 3, 0.1, 2.0)
+    off = centre_errors([scene], np.zeros(2, np.intp), ellipses_of([right, beside]), 3, 0.1, 2.0)
     assert off[0] < 0.03
     assert off[1] == pytest.approx(0.5, rel=0.1)
     flat = replace(scene, grey=np.full((40, 40), 20.0, np.float32))
-    assert off_centre([flat], np.zeros(1, np.intp), together([right]), 3, 0.1, 2.0).tolist() == [
-        0.0
-    ]
-    assert not off_centre([scene], np.zeros(0, np.intp), together([]), 3, 0.1, 2.0).size
+    none = centre_errors([flat], np.zeros(1, np.intp), ellipses_of([right]), 3, 0.1, 2.0)
+    assert none.tolist() == [0.0]
+    assert not centre_errors([scene], np.zeros(0, np.intp), ellipses_of([]), 3, 0.1, 2.0).size
 
 
 @pytest.mark.parametrize("radius", [3.5, 4.3])

@@ -23,7 +23,7 @@ def test_jitter_of_the_network_is_gone_from_the_times_of_a_stamped_stream() -> N
     arrived = np.maximum.accumulate(captured + 0.02 + rng.exponential(0.03, FRAMES))
     times = CaptureTimes("rtsp://camera/1")
     moments = [times.moment(*one) for one in zip(stamps, arrived, strict=True)]
-    assert {one.of for one in moments} == {"capture"}
+    assert {one.event for one in moments} == {"capture"}
     found = np.array([one.seconds for one in moments])
     assert (found <= arrived).all()
     assert (np.diff(found) > 0).all()
@@ -36,10 +36,10 @@ def test_jitter_of_the_network_is_gone_from_the_times_of_a_stamped_stream() -> N
 
 
 def test_stamps_that_stand_still_or_are_made_up_are_not_believed() -> None:
-    assert CaptureTimes("rtsp://camera/1").moment(0.0, 10.0).of == "arrival"
+    assert CaptureTimes("rtsp://camera/1").moment(0.0, 10.0).event == "arrival"
     times = CaptureTimes("rtsp://camera/1")
-    assert [times.moment(0.5, 10.0).of, times.moment(0.5, 10.1).of] == ["capture", "arrival"]
-    assert CaptureTimes("http://camera/1").moment(0.5, 10.0).of == "arrival"
+    assert [times.moment(0.5, 10.0).event, times.moment(0.5, 10.1).event] == ["capture", "arrival"]
+    assert CaptureTimes("http://camera/1").moment(0.5, 10.0).event == "arrival"
 
 
 def test_stream_that_begins_anew_with_other_stamps_is_followed() -> None:
@@ -54,7 +54,7 @@ def test_stream_that_begins_anew_with_other_stamps_is_followed() -> None:
 
 def test_stamps_of_a_camera_at_this_machine_are_taken_as_they_are() -> None:
     moment = CaptureTimes(0).moment(99.96, 100.0)
-    assert (moment.seconds, moment.of) == (99.96, "capture")
+    assert (moment.seconds, moment.event) == (99.96, "capture")
 
 
 class Triggered:
@@ -99,7 +99,7 @@ def test_frames_of_two_live_cameras_are_paired_by_when_they_were_captured(
     for frame_set in pair(sources):
         shown.append([int(np.asarray(one.data)[0, 0]) for one in frame_set.frames.values()])
         assert frame_set.moment is not None
-        assert frame_set.moment.of == "capture"
+        assert frame_set.moment.event == "capture"
         if len(shown) == 15:
             break
     # by arrival the first one would always be two frames ahead of the second, 70 ms

@@ -14,7 +14,7 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.search import SeenTogether, search_copies
-from mixpose.search.copies import _Candidates, _near_triples, _shared_out
+from mixpose.search.copies import _Candidates, _near_triples, _resolve_shared
 from mixpose.search.from_points import TriangulatedPoints, feature_triangles
 from mixpose.search.problem import SearchBudget
 
@@ -88,7 +88,7 @@ def test_a_rival_is_a_pose_of_the_same_body_that_is_not_outdone(
         )
         for k, some in enumerate(found)
     }
-    (copy,) = _shared_out(rivals, [TRIANGLE, HEAD], SearchBudget())
+    (copy,) = _resolve_shared(rivals, [TRIANGLE, HEAD], SearchBudget())
     assert (copy.rival is not None) == is_rival
 
 

@@ -9,7 +9,7 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.poses import count_inliers, label_image, spread_turns
+from mixpose.search.poses import count_inliers, label_image, spread_rotations
 from mixpose.search.problem import SearchProblem, peaks, sensor_detections
 from mixpose.sensors import PinholeCamera
 
@@ -51,7 +51,7 @@ def test_peaks_of_an_image_are_found_between_pixels() -> None:
 
 
 def test_spread_rotations_leave_no_large_gap() -> None:
-    rotations = Rotation.from_matrix(spread_turns(ALL_FREE[3:], np.radians(8.45)))
+    rotations = Rotation.from_matrix(spread_rotations(ALL_FREE[3:], np.radians(8.45)))
     assert len(rotations) == 4616
     probes = Rotation.random(4000, rng=np.random.default_rng(0)).as_quat()
     cosines = np.abs(probes @ rotations.as_quat().T).max(axis=1)
@@ -60,7 +60,7 @@ def test_spread_rotations_leave_no_large_gap() -> None:
 
 
 def test_turns_keep_to_the_free_axes() -> None:
-    about_z = spread_turns(np.array([False, False, True]), 0.1)
+    about_z = spread_rotations(np.array([False, False, True]), 0.1)
     assert np.abs(about_z[:, 2] - [0.0, 0.0, 1.0]).max() < 1e-12
     assert len(about_z) == 63
-    assert spread_turns(np.zeros(3, dtype=np.bool_), 0.1).shape == (1, 3, 3)
+    assert spread_rotations(np.zeros(3, dtype=np.bool_), 0.1).shape == (1, 3, 3)

@@ -31,9 +31,9 @@ Floats = NDArray[np.float64]
 def test_directions_that_are_held_stay_where_the_reference_has_them() -> None:
     free = np.array([True, False, False, False, False, True])
     pose = perturb(TRUTH, np.array([5.0, 7.0, -3.0, 0.0, 0.0, 0.2]))
-    (allowed,) = SearchProblem([], EIGHT, free, TRUTH).allowed(pose[None])
+    (constrained,) = SearchProblem([], EIGHT, free, TRUTH).constrained(pose[None])
     expected = np.array([5.0, 0, 0, 0, 0, 0.2])
-    np.testing.assert_allclose(twist_between(TRUTH, allowed), expected, atol=1e-9)
+    np.testing.assert_allclose(twist_between(TRUTH, constrained), expected, atol=1e-9)
 
 
 def test_features_that_turn_their_back_to_a_camera_explain_no_detection(

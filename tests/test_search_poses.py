@@ -19,7 +19,7 @@ from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
 from mixpose.search import LIVE, THOROUGH, Candidate, SearchBudget, SearchState, search_frame
-from mixpose.search.poses import unlike
+from mixpose.search.poses import distinct_poses
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import ParallelBeam, PinholeCamera
 from mixpose.tracking import estimate_pose
@@ -309,4 +309,4 @@ def test_poses_that_are_nowhere_are_told_apart_without_a_warning() -> None:
     poses[1, 0, 3], poses[2, 0, 3], poses[3, 0, 3] = 1e300, np.inf, 5.0
     with np.errstate(all="raise", invalid="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert {0, 3} <= {*unlike(body, poses, 0.1).tolist()}
+        assert {0, 3} <= {*distinct_poses(body, poses, 0.1).tolist()}

@@ -14,9 +14,9 @@ from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
 from mixpose.search import SearchBudget
 from mixpose.search.from_points import (
-    by_promise,
     feature_triangles,
     from_point_triples,
+    sort_by_support,
     triangulate,
 )
 from mixpose.search.problem import SearchProblem, sensor_detections
@@ -147,7 +147,7 @@ def test_points_that_more_cameras_confirm_come_first() -> None:
     rays = [each.rays for each in detections if each.rays is not None]
     budget = SearchBudget(max_triples=40 * 10)
     problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget=budget)
-    found = by_promise(problem, triangulate(rays, [3.0] * 3))
+    found = sort_by_support(problem, triangulate(rays, [3.0] * 3))
     off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)
     # 40 false detections a view leave a point by chance that three confirm now and then
     assert np.sum(off < 0.1) >= 4

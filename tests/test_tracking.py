@@ -291,5 +291,5 @@ def test_a_spot_that_is_cut_tells_little_of_how_far_off_a_sensor_is_met(
         rms = found.sensors[name].rms
         assert rms is not None
         assert rms > 0.5
-        assert found.whole_rms[name] == pytest.approx(one.rms)
+        assert found.weighted_rms[name] == pytest.approx(one.rms)
         assert one.rms < 0.2

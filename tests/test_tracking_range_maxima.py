@@ -18,7 +18,7 @@ from mixpose.judgement import ahead
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform, twist_between
-from mixpose.search.poses import from_spread_orientations
+from mixpose.search.poses import spread_poses
 from mixpose.search.problem import SearchProblem, sensor_detections
 from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.tracking import Tracker
@@ -99,7 +99,7 @@ def test_places_are_searched_as_far_aside_as_false_ranges_move_the_middle() -> N
         detections = sensor_detections(views, body)
         problem = SearchProblem(detections, body, np.ones(6, dtype=np.bool_), np.eye(4))
         middle = body.means.mean(axis=0)[None]
-        places = transform(from_spread_orientations(problem)[0], middle)
+        places = transform(spread_poses(problem)[0], middle)
         off.append(np.linalg.norm(places - transform(T, middle), axis=2).min())
     # the middle of all ranges is 0.34 m off, in the median
     assert np.median(off) < 0.25

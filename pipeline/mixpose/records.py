@@ -33,14 +33,14 @@ class PointPattern:
 
     points: Floats  # (M, m) in sensor coordinates
     weights: Floats  # (M,) positive; 1 for a plain detection
-    # (M,) by how much more than others each may err, sensor units; 0 but for blobs that are cut
+    # (M,) standard deviation beyond that of other points, sensor units; 0 but for cut blobs
     deviations: Floats = field(default_factory=lambda: np.zeros(()))
-    # (M,) of a disk of as much area as is seen of each, sensor units; 0 where that is not known
+    # (M,) radius of a disk of the visible area, sensor units; 0 where that is unknown
     radii: Floats = field(default_factory=lambda: np.zeros(()))
-    # (M, 2) chance that each is cut or merged unseen, and what it errs by then, sensor units
+    # (M, 2) probability that a point is cut or merged unnoticed, and its error then, sensor units
     cut: Floats | None = None
 
-    is_even: bool = field(init=False, default=True)  # whether none errs by more than others
+    is_uniform: bool = field(init=False, default=True)  # whether all `deviations` are 0
 
     @property
     def size(self) -> int:
@@ -58,7 +58,7 @@ class PointPattern:
         return bool(self.size and self.radii.all())
 
     def only(self, chosen: Mask) -> PointPattern:
-        """Some of the points (M,)."""
+        """Return the pattern of the chosen (M,) points."""
         return self._with(
             self.deviations[chosen],
             None if self.cut is None else self.cut[chosen],
@@ -67,21 +67,21 @@ class PointPattern:
             radii=self.radii[chosen],
         )
 
-    def erring(self, deviations: Floats, cut: Floats | None) -> PointPattern:
-        """With other `deviations` (M,) and `cut` (M, 2)."""
-        same = {"points": self.points, "weights": self.weights, "radii": self.radii}
-        return self._with(deviations, cut, **same)
+    def with_errors(self, deviations: Floats, cut: Floats | None) -> PointPattern:
+        """Return the pattern with other `deviations` (M,) and `cut` (M, 2)."""
+        unchanged = {"points": self.points, "weights": self.weights, "radii": self.radii}
+        return self._with(deviations, cut, **unchanged)
 
     def _with(self, deviations: Floats, cut: Floats | None, **fields: Floats) -> PointPattern:
-        """Of what was checked already."""
-        made = object.__new__(PointPattern)
-        is_even = not np.count_nonzero(deviations)
-        made.__dict__.update(fields, deviations=deviations, cut=cut, is_even=is_even)
-        return made
+        """Make a pattern of fields that were checked already."""
+        pattern = object.__new__(PointPattern)
+        is_uniform = not np.count_nonzero(deviations)
+        pattern.__dict__.update(fields, deviations=deviations, cut=cut, is_uniform=is_uniform)
+        return pattern
 
-    def weighed(self, deviation: float) -> Floats:
-        """Weights (M,) as exact as detections are beside those that err by a deviation."""
-        if self.is_even:
+    def effective_weights(self, deviation: float) -> Floats:
+        """Return the weights (M,), less by the errors of points, for others with a `deviation`."""
+        if self.is_uniform:
             return self.weights
         return np.asarray(self.weights / (1 + (self.deviations / deviation) ** 2))
 
@@ -91,9 +91,9 @@ class PointPattern:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
         for name in ("deviations", "radii"):
-            if (own := getattr(self, name)).shape != weights.shape:
-                object.__setattr__(self, name, np.full(weights.shape, own))
-        object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
+            if (values := getattr(self, name)).shape != weights.shape:
+                object.__setattr__(self, name, np.full(weights.shape, values))
+        object.__setattr__(self, "is_uniform", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(
                 f"points: found the shape {points.shape}; allowed: (M, 2) for pixels, (M, 1) for "
@@ -121,7 +121,7 @@ class PointPattern:
 
     @property
     def spots(self) -> tuple[Floats, Floats]:
-        """Places (K, m) where anything is, and how much of it (K,)."""
+        """Positions (K, m) with feature density, and their weights (K,)."""
         return self.points, self.weights
 
 
@@ -156,7 +156,7 @@ class GridPattern:
 
     @property
     def spots(self) -> tuple[Floats, Floats]:
-        """Places (K, m) where anything is, from a tenth of the most, and how much of it (K,)."""
+        """Positions (K, m) of values above a tenth of the largest, and these values (K,)."""
         rows, columns = np.nonzero(self.values > 0.1 * self.values.max())
         steps = np.stack([columns, rows], axis=1)[:, : self.dimension]
         weights = self.values[rows, columns].astype(np.float64)
@@ -168,10 +168,10 @@ Pattern: TypeAlias = PointPattern | GridPattern
 
 @dataclass(frozen=True)
 class Moment:
-    """When a frame was taken, by the steady clock of this machine."""
+    """The time at which a frame was taken, by the monotonic clock of this machine."""
 
     seconds: float  # of `time.monotonic`
-    of: Literal["capture", "arrival"]  # what happened then: capture where the source tells
+    event: Literal["capture", "arrival"]  # what is timed: capture where the source reports it
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,14 @@ class FrameSet:
 
     @property
     def moment(self) -> Moment | None:
-        """When it was taken, by the first sensor that knows, as `time_s`; None in a recording."""
-        return next((one.moment for one in self.frames.values() if one.moment is not None), None)
+        """Time of the first sensor that has one, as for `time_s`; None in a recording."""
+        moments = (frame.moment for frame in self.frames.values())
+        return next((moment for moment in moments if moment is not None), None)
 
 
 @dataclass(frozen=True)
-class DelaySeen:
-    """How late a sensor is against the first one, in seconds, and its standard deviation."""
+class DelayEstimate:
+    """Delay of a sensor against the first one, and its standard deviation, in seconds."""
 
     seconds: float
     deviation: float
@@ -212,57 +213,56 @@ class DelaySeen:
 
 @dataclass(frozen=True)
 class Label:
-    """What a sensor met a feature by."""
+    """The detection by which a sensor met a feature."""
 
-    at: Floats  # (m,) its sensor coordinates
-    # its place among the sensor's of the frame, from 0; None without single ones
+    at: Floats  # (m,) sensor coordinates
+    # its number among the sensor's detections of the frame, from 0; None in a density
     detection: int | None = None
 
 
 @dataclass(frozen=True)
 class MeasuredPoint:
-    """Where sensors together put a feature, by what they met it by."""
+    """The position of a feature by the detections of several sensors, without the pose."""
 
     at: Floats  # (3,) in the world
-    residual: float  # root mean square distance from what each saw of it, length units
+    residual: float  # root mean square distance from the sensors' detections, length units
 
 
 @dataclass(frozen=True)
 class SensorReport:
-    """How one sensor took part in an estimate."""
+    """The contribution of one sensor to an estimate."""
 
-    # Whether the pose rests on it.  Not without features, where it was left out, and where it meets
-    # none of the body; of a frame without a pose, by the likeliest one.
+    # Whether the pose depends on it.  False without features, if it was excluded, and if it meets
+    # no feature of the body; in a frame without a pose, at the likeliest one.
     used: bool
-    # share of the sensor's feature density that the pose accounts for, 0 to 1
+    # share of the sensor's feature density that the pose explains, 0 to 1
     explained: float | None = None
     rms: float | None = None  # residual of the explained features, px or length units
     why: str | None = None  # why a sensor with features was not used
-    # How far off each feature in view was met, px or length units, by what it is called; None where
-    # it was not met.
+    # Residual of each feature in view by its label, px or length units; None where it was not met.
     residuals: Mapping[str, float | None] = field(default_factory=dict)
-    # What each feature was met by, where `mixpose.run` was asked for labels.
+    # Detection of each feature that was met, if `mixpose.run` was asked for labels.
     labels: Mapping[str, Label] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """By how much a sensor met the features of a pose; n of them are in view."""
+    """Offsets of a sensor's detections from the features of a pose, of which n are in view."""
 
-    features: NDArray[np.intp]  # (n,) their places in the body
-    met: NDArray[np.bool_]  # (n,)
-    offsets: Floats  # (n, m) observed minus predicted place, sensor units; 0 where it was not met
-    # (n, m, 3) derivative of the predicted place by a shift of the body in the world
+    features: NDArray[np.intp]  # (n,) their indices in the body
+    met: NDArray[np.bool_]  # (n,) whether each has a detection
+    offsets: Floats  # (n, m) detected minus predicted position, sensor units; 0 where not met
+    # (n, m, 3) Jacobian of the predicted position by a shift of the body in the world
     by_shift: Floats
-    # (n, m) place of what met each, sensor units; the prediction where it was not met
+    # (n, m) position of the detection, sensor units; of the prediction where not met
     observed: Floats
     shared: Mask  # (n,) whether another feature was met by the same detection
-    # (n,) how much each tells, as its noise goes: 1, or less where what met it is cut or shared
+    # (n,) weight by noise: 1, or less where the detection is cut or shared
     weights: Floats
 
     @property
     def rms(self) -> float:
-        """Root mean square, sensor units, of those that were met by what each tells."""
+        """Weighted root mean square of the offsets of features met, sensor units."""
         weights = self.weights * self.met
         squares = float(weights @ np.vecdot(self.offsets, self.offsets))
         return math.sqrt(squares / max(float(weights.sum()), 1e-12))
@@ -270,14 +270,14 @@ class Offsets:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A pose that explains a frame, with its share of belief among its rivals."""
+    """A pose that explains a frame, with its probability among its rivals."""
 
     T_world_object: Floats
     weight: float
 
 
 def label_of(name: str, instance: int | None) -> str:
-    """What a body is called in one word: its name, of identical ones with a number."""
+    """Return the label of a body: its name, with a number if there are identical ones."""
     return name if instance is None else f"{name}-{instance}"
 
 
@@ -286,7 +286,7 @@ Status: TypeAlias = Literal["ok", "ambiguous", "lost"]
 
 @dataclass(frozen=True)
 class Estimate:
-    """The pose of one frame; the fields of a pose line, but for those called no part of it."""
+    """The pose of one body in one frame: the fields of a pose line, and some that are not in it."""
 
     frame: int
     time_s: float | None
@@ -295,57 +295,57 @@ class Estimate:
     T_world_object: Floats | None  # (4, 4); None when the status is "lost"
     # (6, 6) in the order and axes of `mixpose.rigid`, lengths² and radians²
     covariance: Floats | None
-    # 0 to 1: how well the predicted densities meet the observed ones, over all sensors; None where
-    # a file does not say, as `latency_ms` is then.
+    # 0 to 1: agreement of predicted and observed densities, over all sensors; None, like
+    # `latency_ms`, where it was read from a file without it.
     score: float | None
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...] = ()
     latency_ms: float | None = field(default=0.0, compare=False)
-    # of identical bodies, from 0; None where the session has one of this name
+    # number among identical bodies, from 0; None if the session has only one of this name
     instance: int | None = None
-    # Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
-    # lost, None where a file does not say.
+    # Probability that the truth is within the pose's 99.9 % ellipsoid; 0 if the frame is lost, None
+    # if it was read from a file without it.
     confidence: float | None = None
-    # Which of `mixpose.tracking.proposers` or `refinements` the pose came from; empty without one.
-    # No part of the pose line.
+    # Function of `mixpose.tracking.proposers` or `refinements` that made the pose; empty without
+    # one.  Not in the pose line.
     proposer: str = field(default="", compare=False)
-    # Standard deviations of a feature, by sensor, of the objectives that the pose was fitted by, in
-    # their order; empty where it was not fitted to this frame. No part of the pose line.
+    # Blurs by sensor of the objectives that the pose was fitted with, in their order; empty if it
+    # was not fitted to this frame.  Not in the pose line.
     blurs: tuple[Mapping[str, float], ...] = field(default=(), compare=False, repr=False)
-    # Where the body was searched for: guesses made, tested on everything, and refined.
+    # If the body was searched: guesses made, tested on all features and sensors, and refined.
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
-    # How late sensors are beyond what the session says, as far as the frames so far show it; no
-    # part of the pose line.
-    delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
-    # Why a frame is ambiguous, other than for its rivals.
+    # Delays of sensors beyond those of the session, estimated from the frames so far.  Not in the
+    # pose line.
+    delays: Mapping[str, DelayEstimate] = field(default_factory=dict, compare=False)
+    # Why a frame is ambiguous, if not for its rivals.
     doubt: str = field(default="", compare=False)
-    # Works out `offsets`.
+    # Computes `offsets`.
     measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)
-    # Features that sensors together put in space without the pose, where `mixpose.run` was asked
-    # for labels.
+    # Features triangulated by several sensors without the pose, if `mixpose.run` was asked for
+    # labels.
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
-    # (3,) of the body in its own coordinates; None where it has no tip
+    # (3,) tip in body coordinates; None without a tip
     tip_object: Floats | None = field(default=None, compare=False)
-    filled: bool = False  # whether nothing was measured: the pose is what frames around it say
-    ahead_s: float = 0.0  # how much later than its frame the pose is, of one that was foretold
+    filled: bool = False  # whether nothing was measured: the pose is from other frames
+    ahead_s: float = 0.0  # time from the frame to the pose, seconds, of a pose that was foretold
 
     @cached_property
     def offsets(self) -> Mapping[str, Offsets]:
-        """By how much each sensor met the features of the best pose."""
+        """Offsets of each sensor's detections from the features of the best pose."""
         return self.measured()
 
     @property
-    def whole_rms(self) -> Mapping[str, float | None]:
-        """As `SensorReport.rms` by sensor; what is known to be cut or shared counts less."""
+    def weighted_rms(self) -> Mapping[str, float | None]:
+        """`SensorReport.rms` by sensor, with less weight of detections that are cut or shared."""
         offsets = self.offsets
         return {
-            name: offsets[name].rms if name in offsets and one.rms is not None else one.rms
-            for name, one in self.sensors.items()
+            name: offsets[name].rms if name in offsets and report.rms is not None else report.rms
+            for name, report in self.sensors.items()
         }
 
     @property
     def tip(self) -> Floats | None:
-        """Where the tip is in the world, (3,); None without a tip or a pose."""
+        """Position of the tip in the world, (3,); None without a tip or a pose."""
         T = self.T_world_object
         return (
             None if T is None or self.tip_object is None else T[:3, :3] @ self.tip_object + T[:3, 3]
@@ -353,7 +353,7 @@ class Estimate:
 
     @property
     def tip_covariance(self) -> Floats | None:
-        """Of the tip, (3, 3), as far as the pose errs; None without a tip or a covariance."""
+        """Covariance (3, 3) of the tip by the pose's; None without a tip or a covariance."""
         tip, C, T = self.tip, self.covariance, self.T_world_object
         if tip is None or C is None or T is None:
             return None
@@ -363,5 +363,5 @@ class Estimate:
 
     @property
     def label(self) -> str:
-        """The body in one word."""
+        """Label of the body: its name, with a number if there are identical ones."""
         return label_of(self.object, self.instance)

@@ -24,8 +24,8 @@ from mixpose.records import Floats
 
 TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
-_NEXT = np.array([1, 2, 0])  # of each axis the one that follows
-_CHI2_95 = 7.815  # of three degrees of freedom
+_NEXT = np.array([1, 2, 0])  # the axis that follows each axis
+_CHI2_95 = 7.815  # 95 % quantile for three degrees of freedom
 
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
@@ -51,7 +51,7 @@ def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> 
 
 
 def from_orthonormal(V: ArrayLike, w: ArrayLike) -> Floats:
-    """The paper's rigid affine transformation x = Vᵀ(z + w) of V (3, 3) and w (3,) as a 4x4 motion.
+    """Return the paper's transformation x = Vᵀ(z + w), of V (3, 3) and w (3,), as a 4x4 motion.
 
     Raises `ValueError` if V is not orthonormal and right-handed within 1e-6.
     """
@@ -63,14 +63,14 @@ def from_orthonormal(V: ArrayLike, w: ArrayLike) -> Floats:
 
 
 def rotation_matrix(rotation_vector: ArrayLike) -> Floats:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
     vectors = np.asarray(rotation_vector, dtype=np.float64)
     matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     return np.asarray(matrices, dtype=np.float64).reshape(*vectors.shape[:-1], 3, 3)
 
 
 def inverse(T_a_b: Floats) -> Floats:
-    """The motion back: T_b_a of shape (..., 4, 4)."""
+    """Return the inverse motions T_b_a (..., 4, 4)."""
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     return from_parts(R_b_a, -np.einsum("...ij,...j->...i", R_b_a, T_a_b[..., :3, 3]))
 
@@ -78,7 +78,7 @@ def inverse(T_a_b: Floats) -> Floats:
 def perturb(T_world_object: Floats, twist: Floats) -> Floats:
     """Move poses (..., 4, 4) by twists (..., 6) in world axes, lengths and radians."""
     if twist.size == 6 and T_world_object.size == 16:
-        # one pose after the other is what optimisers ask for: no time for broadcasting
+        # optimisers call this for one pose at a time: broadcasting would be slow
         T = T_world_object.copy()
         single, six = T.reshape(4, 4), twist.reshape(6)
         single[:3, :3] = cv2.Rodrigues(six[3:])[0] @ single[:3, :3]
@@ -89,14 +89,14 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
 
 
 def twist_between(T_from: Floats, T_to: Floats) -> Floats:
-    """The twist (..., 6) with ``perturb(T_from, twist) == T_to``."""
+    """Return the twists (..., 6) with ``perturb(T_from, twist) == T_to``."""
     R_difference = T_to[..., :3, :3] @ T_from[..., :3, :3].swapaxes(-1, -2)
     if R_difference.ndim == 2:
         twist = np.empty(6)
         twist[:3] = T_to[:3, 3] - T_from[:3, 3]
         (a, b, c), (d, e, f), (g, h, i) = R_difference.tolist()
-        twist[3:] = axis = h - f, c - g, d - b  # as long as twice the sine of the angle
-        if (cosine := a + e + i - 1) > 0:  # twice that of an angle below 90°
+        twist[3:] = axis = h - f, c - g, d - b  # its length is twice the sine of the angle
+        if (cosine := a + e + i - 1) > 0:  # twice the cosine; the angle is below 90°
             length = math.hypot(*axis)
             twist[3:] *= math.atan2(length, cosine) / length if length else 0.5
         else:
@@ -110,12 +110,12 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """A × b of vectors with their components first (3, ...): for few quicker than NumPy's own."""
+    """Return a × b of vectors with components first (3, ...); faster than NumPy's for few."""
     return (a * b.take(_NEXT, axis=0) - a.take(_NEXT, axis=0) * b).take(_NEXT, axis=0)
 
 
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:
-    """A pose's covariance (..., 6, 6) at a point an arm (..., 3) in world axes from its origin."""
+    """Move a pose's covariance (..., 6, 6) from its origin by an arm (..., 3) in world axes."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
     J[..., range(6), range(6)] = 1.0
     x, y, z = np.asarray(arm).T
@@ -126,35 +126,35 @@ def covariance_at(covariance: Floats, arm: Floats) -> Floats:
 
 
 def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
-    """Angle in degrees (...,) of the rotation that leads from one pose to the other."""
+    """Return the angle in degrees (...,) of the rotation from one pose to the other."""
     angle = np.linalg.norm(twist_between(T_a, T_b)[..., 3:], axis=-1)
     return np.asarray(np.degrees(angle), dtype=np.float64)
 
 
 def mean_motion(T: Floats) -> Floats:
-    """The motion (4, 4) with the mean rotation and the mean translation of motions (n, 4, 4)."""
+    """Return the motion (4, 4) with the mean rotation and translation of motions (n, 4, 4)."""
     R = Rotation.from_matrix(T[:, :3, :3]).mean().as_matrix()
     return from_parts(R, T[:, :3, 3].mean(axis=0))
 
 
 def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
-    """The ellipsoid that holds the position with 95 %, of a pose's covariance (6, 6).
+    """Return the 95 % ellipsoid of the position, from a pose's covariance (6, 6).
 
     Half-axes (3,), ascending, and their directions in world axes as columns (3, 3): a rotation.
     """
     variances, axes = np.linalg.eigh(covariance[:3, :3])
-    axes[:, 0] *= np.linalg.det(axes)  # right-handed, as a rotation is
+    axes[:, 0] *= np.linalg.det(axes)  # right-handed, so that it is a rotation
     return np.sqrt(_CHI2_95 * np.maximum(variances, 0.0)), np.asarray(axes)
 
 
 def quaternion_xyzw(T_a_b: Floats) -> Floats:
-    """Unit quaternion (4,), (x, y, z, w) with w >= 0, of one motion."""
-    # OpenCV takes turns of less than 1e-5 rad for none
+    """Return the unit quaternion (4,), (x, y, z, w) with w >= 0, of one motion."""
+    # not by OpenCV, which rounds turns of less than 1e-5 rad to none
     return np.asarray(Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True))
 
 
 def is_rigid(T: Floats, tolerance: float = 1e-4) -> bool:
-    """Whether a 4x4 matrix is a rotation and a translation, within a tolerance on each entry."""
+    """Test whether a 4x4 matrix is a rotation and a translation, within a tolerance per entry."""
     T = np.asarray(T, dtype=np.float64)
     return bool(
         T.shape == (4, 4)
@@ -166,7 +166,7 @@ def is_rigid(T: Floats, tolerance: float = 1e-4) -> bool:
 
 
 def nearest_rigid(T: Floats) -> Floats:
-    """The rigid motion nearest to a 4x4 matrix whose rotation carries rounding errors."""
+    """Return the rigid motion nearest to a 4x4 matrix whose rotation has rounding errors."""
     U, _, Vt = np.linalg.svd(np.asarray(T, dtype=np.float64)[:3, :3])
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return from_parts(R, np.asarray(T, dtype=np.float64)[:3, 3])

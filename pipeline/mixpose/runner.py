@@ -1,4 +1,4 @@
-"""A whole run: session in, estimates out, one frame after the other."""
+"""Run a session: estimate the poses of a recording, frame by frame."""
 
 from __future__ import annotations
 
@@ -52,18 +52,18 @@ Starts: TypeAlias = Mapping[str, Floats]
 
 
 LEAST_DELAY_S = 1e-6
-"""Sensors that differ by less count as in step."""
+"""Frames of sensors that differ by less are simultaneous."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """All that a run knows between two frames."""
+    """The state of a run between two frames."""
 
     tracks: tuple[Track, ...]  # one per body
 
 
 _KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
-"""What is read for sensors that are no cameras."""
+"""Kind of source of sensors that are no cameras, by their model."""
 
 
 Remember: TypeAlias = Callable[[Memory], None]
@@ -83,7 +83,7 @@ def run(
 ) -> Generator[Estimate, None, None]:
     """Estimate the poses of every frame of a recording, one per body.
 
-    The recording is opened at once, its frames are read as estimates are asked for.
+    The recording is opened at once; frames are read when the next estimate is requested.
 
     Parameters
     ----------
@@ -95,33 +95,33 @@ def run(
         Recordings that `open_sources` opened already, in place of `sources`.
     selection : Selection
     T_start : (4, 4) array, mapping of str to (4, 4) array, or None
-        Pose to begin at in place of the session's ``[start]``; of several bodies by their labels.
+        Start pose that replaces the session's ``[start]``; of several bodies by their labels.
     watch : callable or None
         Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
-        raw frames and the features found in them, while tracking around the bodies only; its time
-        is not in the latency.
+        raw frames and the features extracted from them, while tracking around the bodies only; its
+        time is not in the latency.
     memory : Memory or None
-        What a run knew after the frame before the first of `selection`; None: nothing.
+        State of a run after the frame before the first of `selection`; None to begin anew.
     remember : callable or None
-        Called with what is known after a frame, before its first estimate is yielded.
+        Called with the state after a frame, before its first estimate is yielded.
     labels : bool
-        Whether estimates say which detection is which feature (`SensorReport.labels`), and where
-        features are in space by these alone (`Estimate.points`).
+        Whether estimates hold the detection of each feature (`SensorReport.labels`), and the
+        positions of features in space by these alone (`Estimate.points`).
 
     Returns
     -------
     generator of Estimate
-        As soon as a frame is done, by ascending frame number; its bodies in the session's order.
+        Yielded when a frame is done, by ascending frame number; bodies in the session's order.
 
     Raises
     ------
     SessionError
-        If the session names no source for a sensor or no body that `T_start` does, or frames are
+        If the session names no source for a sensor or lacks a body of `T_start`, or frames are
         selected by other than whole numbers.
     ValueError
         If `T_start` is no rotation and translation.
     RecordingError
-        At once, if a recording cannot be opened or its table of times lacks rows; else in place
+        At once, if a recording cannot be opened or its table of times lacks rows; later, in place
         of the first frame that cannot be read.
     """
     if opened is None:
@@ -139,24 +139,24 @@ def run(
         raise SessionError(f"T_start: no body {unknown[0]!r}; allowed: {allowed}")
     scene = scene_of(session, starts)
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    begun = Memory(scene.begin()) if memory is None else memory
-    return _estimates(session, scene, begun, frames, watch, remember, labels=labels)
+    initial = Memory(scene.begin()) if memory is None else memory
+    return _estimates(session, scene, initial, frames, watch, remember, labels=labels)
 
 
 def scene_of(session: Session, starts: Starts | None = None) -> Scene:
-    """The bodies of a session, with poses to begin at in place of the session's, by label."""
+    """Make the scene of a session's bodies; `starts` replace its start poses, by label."""
     bodies = []
-    for one in session.objects:
-        for instance, label in zip(one.instances, one.labels, strict=True):
-            start, T_start = one.start if not instance else None, (starts or {}).get(label)
-            held = None if one.start is None else one.start.T_world_object
-            given = session, one.body, start, T_start
-            bodies.append(_tracker(Tracker.about_centre, *given, instance=instance, T_held=held))
+    for setup in session.objects:
+        for instance, label in zip(setup.instances, setup.labels, strict=True):
+            start, T_start = setup.start if not instance else None, (starts or {}).get(label)
+            T_held = None if setup.start is None else setup.start.T_world_object
+            inputs = session, setup.body, start, T_start
+            bodies.append(_tracker(Tracker.about_centre, *inputs, instance=instance, T_held=T_held))
     return Scene(tuple(bodies))
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
-    """The tracker of a session's first body, and its track before the first frame."""
+    """Return the tracker of a session's first body, and its track before the first frame."""
     tracker = _tracker(Tracker.create, session, session.body, session.start, T_start)
     return tracker, tracker.begin()
 
@@ -167,7 +167,7 @@ def _tracker(
     body: Body,
     start: Start | None,
     T_start: Floats | None,
-    **rest: Any,
+    **options: Any,
 ) -> Tracker:
     if T_start is None and start is not None:
         T_start = start.T_world_object
@@ -177,7 +177,7 @@ def _tracker(
         T_start,
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
-        **rest,
+        **options,
     )
 
 
@@ -199,7 +199,7 @@ def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Sou
 
 
 def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> SourceSpec:
-    """What the frames of a sensor are read from."""
+    """Return the specification of the source that a sensor's frames are read from."""
     if replaced is None and not setup.source:
         raise SessionError(
             f"{session.path}: sensor {setup.name!r}: source: found none, name the recording here "
@@ -229,13 +229,13 @@ def _estimates(
     labels: bool,
 ) -> Generator[Estimate, None, None]:
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
-    bodies = {one.body.name: one.body for one in session.objects}
+    bodies = {setup.body.name: setup.body for setup in session.objects}
     clouds, names = clouds_of(session), [setup.name for setup in session.sensors]
     with closing(frames):
         for frame_set in frames:
-            frames_of = frame_set.frames.items()
-            images = {name for name, one in frames_of if isinstance(one.data, np.ndarray)}
-            began = time.perf_counter()
+            raw_frames = frame_set.frames.items()
+            images = {name for name, frame in raw_frames if isinstance(frame.data, np.ndarray)}
+            start_s = time.perf_counter()
             with one_blas_thread(), prompt_switching():
                 tracks, estimates, views = windowed.advance(
                     tracks,
@@ -244,14 +244,14 @@ def _estimates(
                     partial(observe, session, frame_set),
                     images,
                 )
-            latency_ms = 1e3 * (time.perf_counter() - began)
-            views = as_sensors(session, frame_set, views)
-            seen = {view.name: view.observation for view in views}
-            for k, one in enumerate(estimates):
-                estimate = with_clouds(one, clouds)
+            latency_ms = 1e3 * (time.perf_counter() - start_s)
+            views = merge_clouds(session, frame_set, views)
+            observations = {view.name: view.observation for view in views}
+            for k, by_planes in enumerate(estimates):
+                estimate = with_clouds(by_planes, clouds)
                 if labels:
-                    estimate = labelled(estimate, seen, bodies[one.object])
-                # also of sensors without a frame
+                    estimate = labelled(estimate, observations, bodies[estimate.object])
+                # sensors without a frame have a report, too
                 reports = {name: estimate.sensors.get(name, SensorReport(False)) for name in names}
                 tip = bodies[estimate.object].tip
                 estimate = replace(estimate, latency_ms=latency_ms, tip_object=tip, sensors=reports)
@@ -263,10 +263,9 @@ def _estimates(
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
-    """Cameras whose features in a part of the frame are those of the whole frame.
+    """Return the cameras whose features in a window are those of the whole frame.
 
-    The other rules for a threshold depend on all that is in the image: on its histogram, or on
-    its size.
+    The other rules for a threshold depend on the whole image: on its histogram, or on its size.
     """
     return {
         setup.name: setup.sensor
@@ -280,7 +279,7 @@ def _windowed(session: Session) -> dict[str, Sensor]:
 def observe(
     session: Session, frame_set: FrameSet, windows: Mapping[str, Window] | None = None
 ) -> list[View]:
-    """Extract the features of every sensor that has a frame, of some in a window only."""
+    """Extract the features of every sensor that has a frame, only in its window if it has one."""
     views = []
     frames = frame_set.frames
     for setup, observation in _observations(session, session.sensors, frames, windows or {}):
@@ -291,12 +290,12 @@ def observe(
 def _view(
     setup: SensorSetup, observation: Observation, frame_set: FrameSet, frame: RawFrame
 ) -> View:
-    """What a sensor observed, and when: how much later than the set's time, as far as is known."""
+    """Make the view of a sensor, with its delay against the time of the frame set."""
     delay = 0.0
     if frame.time_s is not None and frame_set.time_s is not None:
         delay = frame.time_s - frame_set.time_s
     delay = delay if abs(delay) > LEAST_DELAY_S else 0.0
-    told = 0.0 if setup.delay == "estimate" else setup.delay
+    stated_delay = 0.0 if setup.delay == "estimate" else setup.delay
     error = setup.calibration_error
     if (setup.delay or setup.readout) and frame_set.time_s is None:
         key = "delay" if setup.delay else "readout"
@@ -308,7 +307,7 @@ def _view(
         setup.name,
         setup.sensor,
         observation,
-        delay + told,
+        delay + stated_delay,
         setup.readout,
         DelayEvidence.unknown_s if setup.delay == "estimate" else None,
         doubts=doubted(setup.sensor, error) if error else (),
@@ -316,7 +315,7 @@ def _view(
 
 
 def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
-    """The feature pattern of one sensor's frame, with the width of its features."""
+    """Return the feature pattern of one sensor's frame, with the width of its features."""
     return _observations(session, [setup], {setup.name: frame}, {})[0][1]
 
 
@@ -326,23 +325,23 @@ def _observations(
     frames: Mapping[str, RawFrame],
     windows: Mapping[str, Window],
 ) -> list[tuple[SensorSetup, Observation]]:
-    """The same of all that have a frame, of some in a window only; images are taken together."""
+    """Return the observations of all sensors that have a frame; images are extracted together."""
     images, observations = {}, []
-    there = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
-    for setup, data in there:
+    available = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
+    for setup, data in available:
         if isinstance(data, np.ndarray):
             _refuse_code(session, setup.extract.method)
             images[setup.name] = data, setup.extract, windows.get(setup.name)
     patterns = extract_together(images, base=session.folder)
-    for setup, data in there:
+    for setup, data in available:
         options = setup.extract
         pattern = patterns[setup.name] if isinstance(data, np.ndarray) else data
         if isinstance(pattern, GridPattern):
-            # noise may take a profile below zero; cutting that off would leave a floor of noise
+            # noise makes profiles negative in places; clipping would leave a floor of noise
             width = float(np.hypot(options.sigma, options.spot_sigma))
             observation = Observation(pattern, width, intrinsic=options.spot_sigma)
         elif setup.name in patterns and len(pattern.points) > MOST_DETECTIONS:
-            # flooded with light or noise: nothing in it can be told from anything
+            # flooded with light or noise: no detection can be distinguished from others
             empty = PointPattern(pattern.points[:0], pattern.weights[:0])
             observation = Observation(empty, options.sigma, passed_over=pattern.size)
         else:
@@ -352,7 +351,7 @@ def _observations(
 
 
 def _refuse_code(session: Session, method: str) -> None:
-    """A session file comes from anywhere: what it names is run only where that was allowed."""
+    """Refuse code that a session file names unless that was allowed: the file may be anyone's."""
     if ":" in method and not session.allow_code:
         raise SessionError(
             f'{session.path}: extract.method: "{method}" runs code of a module that the session '
@@ -362,13 +361,13 @@ def _refuse_code(session: Session, method: str) -> None:
 
 
 def clouds_of(session: Session) -> dict[str, CloudSensor]:
-    """The clouds among the sensors of a session."""
-    found = {setup.name: setup.sensor for setup in session.sensors}
-    return {name: one for name, one in found.items() if isinstance(one, CloudSensor)}
+    """Return the cloud sensors of a session by name."""
+    sensors = {setup.name: setup.sensor for setup in session.sensors}
+    return {name: sensor for name, sensor in sensors.items() if isinstance(sensor, CloudSensor)}
 
 
-def as_sensors(session: Session, frame_set: FrameSet, views: list[View]) -> list[View]:
-    """A view of each sensor that has a frame: clouds in space, not by their images."""
+def merge_clouds(session: Session, frame_set: FrameSet, views: list[View]) -> list[View]:
+    """Replace the three image views of each cloud by one view in space."""
     clouds = clouds_of(session)
     if not clouds:
         return views

@@ -187,14 +187,14 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "search/search.py",
-        "if self._are_enough(poses[:3], best):",
-        "if self._are_enough(poses[:4], best):",
+        "if self._are_sufficient(poses[:3], best):",
+        "if self._are_sufficient(poses[:4], best):",
         "only speed: a fourth guess is refined at once",
     ),
     Harmless(
         "search/search.py",
-        "if self._are_enough(poses[:3], best):",
-        "if self._are_enough(poses[:6], best):",
+        "if self._are_sufficient(poses[:3], best):",
+        "if self._are_sufficient(poses[:6], best):",
         "only speed: three more guesses are refined at once",
     ),
     Harmless(
@@ -271,8 +271,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "search/search.py",
-        "best, checked, done, alike = 0.0, 0.0, skipped, 0",
-        "best, checked, done, alike = 0.0, 1.0, skipped, 0",
+        "best, best_checked, batches, repeats = 0.0, 0.0, skip, 0",
+        "best, best_checked, batches, repeats = 0.0, 1.0, skip, 0",
         "guesses that explain two detections are never enough, whether that is asked or not",
     ),
 )

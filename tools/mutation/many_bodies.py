@@ -13,7 +13,7 @@ MUTANTS = (
     Mutant(
         "search-copies-share-markers",
         "search/copies.py",
-        "if len(others) <= (1 - budget.convincing) * len(rows[k]):",
+        "if len(taken) <= (1 - budget.convincing) * len(rows[k]):",
         "if True:",
         "bodies are found where others are already",
         (_COPIES,),
@@ -21,8 +21,8 @@ MUTANTS = (
     Mutant(
         "search-copies-of-one-kind-only",
         "search/copies.py",
-        "for problem, own in zip(problems, triangles, strict=True)",
-        "for problem, own in zip(problems, triangles[:1] * len(problems), strict=True)",
+        "for problem, corners in zip(problems, triangles, strict=True)",
+        "for problem, corners in zip(problems, triangles[:1] * len(problems), strict=True)",
         "only bodies like the first are found at once",
         (_COPIES,),
     ),

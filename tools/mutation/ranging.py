@@ -106,7 +106,7 @@ MUTANTS = (
     Mutant(
         "tracking-ranges-same-maximum-many-times",
         "tracking/ranges.py",
-        "for k in order[unlike(frame.body, ends[order], cell, whole=True)]:",
+        "for k in order[distinct_poses(frame.body, ends[order], cell, whole=True)]:",
         "for k in order:",
         "poses that are one are judged as often as starts lead to them",
         (_MAXIMA,),

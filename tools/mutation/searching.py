@@ -43,8 +43,8 @@ _SEARCH = (
     Mutant(
         "search-bright-detections-count-more",
         "search/problem.py",
-        "seen = Observation(PointPattern(points, np.ones(len(points))),",
-        "seen = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
+        "observation = Observation(PointPattern(points, np.ones(len(points))),",
+        "observation = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
         "a bright blob is worth more features than a faint one",
     ),
     Mutant(
@@ -64,8 +64,8 @@ _SEARCH = (
     Mutant(
         "search-back-sides-counted",
         "search/poses.py",
-        "met = np.where((outward * towards).sum(axis=0) > 0, met, 0)",
-        "met = np.where(True, met, 0)",
+        "cells = np.where((outward * towards).sum(axis=0) > 0, cells, 0)",
+        "cells = np.where(True, cells, 0)",
         "a pose seen from behind explains as much as the right one",
     ),
     Mutant(
@@ -100,7 +100,7 @@ _SEARCH = (
     Mutant(
         "search-every-pose-a-candidate",
         "search/search.py",
-        "if ranks[k] > least]",
+        "if ranks[k] > threshold]",
         "if ranks[k] > -np.inf]",
         "poses that the best leaves no chance are fitted",
     ),
@@ -131,8 +131,8 @@ _SEARCH = (
     Mutant(
         "search-goes-on-for-what-it-has",
         "search/search.py",
-        "return alike * int(np.count_nonzero(at[0])) + int(np.count_nonzero(at[1]))",
-        "return int(np.count_nonzero(at[1]))",
+        "return repeats * int(np.count_nonzero(is_near[0])) + int(np.count_nonzero(is_near[1]))",
+        "return int(np.count_nonzero(is_near[1]))",
         "of a large body before one camera all triples are tried, ten times as many as tell",
         ("test_search_triples.py",),
     ),
@@ -171,23 +171,23 @@ _SEARCH = (
     Mutant(
         "search-starts-again-each-frame",
         "search/search.py",
-        "after = SearchState(k, done)",
-        "after = SearchState(k, 0)",
+        "next_state = SearchState(k, batches)",
+        "next_state = SearchState(k, 0)",
         "a limited search tries the same guesses in every frame",
     ),
     Mutant(
         "search-points-that-rays-fix-are-as-vague-as-gates",
         "search/from_points.py",
-        "np.clip(budget.by_gap * apart, budget.least_off, 1.0)",
-        "np.clip(budget.by_gap * apart, 1.0, 1.0)",
+        "np.clip(budget.by_gap * share, budget.least_off, 1.0)",
+        "np.clip(budget.by_gap * share, 1.0, 1.0)",
         "of small bodies before cameras side by side no point is within the body",
         ("test_search_triangulation.py",),
     ),
     Mutant(
         "search-points-as-exact-as-rays-happen-to-meet",
         "search/from_points.py",
-        "np.clip(budget.by_gap * apart, budget.least_off, 1.0)",
-        "np.clip(budget.by_gap * apart, 0.0, 1.0)",
+        "np.clip(budget.by_gap * share, budget.least_off, 1.0)",
+        "np.clip(budget.by_gap * share, 0.0, 1.0)",
         "where two rays meet by luck their point is taken for exact, and its body is not found",
         ("test_search_triangulation.py",),
     ),

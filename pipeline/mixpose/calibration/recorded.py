@@ -17,7 +17,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import ImageSequence, Source, numbers_of, pair, spread_over
 from mixpose.objective import View
 from mixpose.records import Floats, FrameSet, GridPattern, Indices, PointPattern
-from mixpose.runner import as_sensors, observe, open_sources
+from mixpose.runner import merge_clouds, observe, open_sources
 from mixpose.search import is_pointlike, peaks
 from mixpose.session import Session
 
@@ -120,7 +120,7 @@ def _without_others(source: Source, wanted: Collection[int] | None) -> Source:
 
 
 def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:
-    views = as_sensors(session, frame_set, observe(session, frame_set))
+    views = merge_clouds(session, frame_set, observe(session, frame_set))
     points = {index[view.name]: _points(view) for view in views}
     times = {
         index[name]: frame.time_s

@@ -18,7 +18,7 @@ from mixpose.objective import BodyProjection, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of, stepped
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, rotation_angle_deg
-from mixpose.search import far_apart, sparse, spread_turns
+from mixpose.search import far_apart, spread_rotations, thinned
 from mixpose.sensors import RangeSensor, as_images
 from mixpose.session import SensorSetup
 
@@ -60,7 +60,7 @@ def look_alikes(
     """
     noises = [noise_of(setup) for setup in setups]
     sensors, noise, _ = as_images([setup.sensor for setup in setups], noises)
-    few = sparse(body, _MOST_FEATURES)
+    few = thinned(body, _MOST_FEATURES)
     projection = project_body(sensors, body)
     here = projection.project(T_world_object[None])
     measured = _Measured(projection, here.y[:, 0], here.seen[:, 0], noise)
@@ -183,7 +183,7 @@ def _least_squares(toward: Floats, J: Floats, seen: Mask, noise: Floats) -> Quad
 
 def _turned(T_world_object: Floats, body: Body, free: Mask) -> Floats:
     """The pose turned all ways (H, 4, 4) about the body's middle, which stays in view."""
-    turns, middle = spread_turns(free[3:], _STEP_RAD), body.means.mean(axis=0)
+    turns, middle = spread_rotations(free[3:], _STEP_RAD), body.means.mean(axis=0)
     poses = np.broadcast_to(T_world_object, (len(turns), 4, 4)).copy()
     poses[:, :3, :3] = turns @ T_world_object[:3, :3]
     shift = T_world_object[:3, :3] @ middle - poses[:, :3, :3] @ middle

@@ -363,6 +363,6 @@ def _met(session: Session, number: int, views: Views) -> tuple[bool, float]:
     # a sensor that is left out agrees with none of them
     shares = [(one.explained or 0.0) * one.used for one in estimate.sensors.values()]
     is_ok = estimate.status == "ok" and min(shares, default=0.0) > 0.1
-    sigmas, rms = {view.name: view.observation.sigma for view in views}, estimate.whole_rms
+    sigmas, rms = {view.name: view.observation.sigma for view in views}, estimate.weighted_rms
     offs = [math.inf if off is None else off / sigmas[name] for name, off in rms.items()]
     return is_ok, max(offs, default=math.inf)

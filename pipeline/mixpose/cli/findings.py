@@ -166,7 +166,7 @@ class Findings:
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
             return
-        found = estimate.whole_rms
+        found = estimate.weighted_rms
         for name, one in estimate.sensors.items():
             usual, off = self._usual[name], found[name]
             if off is None or not one.used:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.calibration.task import Progress
     from mixpose.frames import Source
-    from mixpose.records import DelaySeen, Estimate
+    from mixpose.records import DelayEstimate, Estimate
     from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
@@ -117,7 +117,7 @@ class Summary:
         self.left_out: Counter[tuple[str, str]] = Counter()  # sensors, and why
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
         self.told = {setup.name: setup.delay for setup in session.sensors}
-        self.delays: Mapping[str, DelaySeen] = {}
+        self.delays: Mapping[str, DelayEstimate] = {}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
@@ -147,7 +147,7 @@ class Summary:
             self.split_frames += 1
             self.split.update(idle)
         if estimate.status == "ok":
-            found = estimate.whole_rms
+            found = estimate.weighted_rms
             for name, residuals in self.residuals.items():
                 if (rms := found[name]) is not None:
                     residuals.append(rms)

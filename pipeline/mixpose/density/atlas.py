@@ -72,7 +72,7 @@ class Atlas:
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
-            weights = pattern.weighed(DRAWING.exact * sigmas[k])
+            weights = pattern.effective_weights(DRAWING.exact * sigmas[k])
             share.append(weights / weights.sum())
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)

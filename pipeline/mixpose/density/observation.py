@@ -182,7 +182,7 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(self.pattern, PointPattern):
-            weights = self.pattern.weighed(DRAWING.exact * self.blur(sigma, matched=True))
+            weights = self.pattern.effective_weights(DRAWING.exact * self.blur(sigma, matched=True))
             overlap = self_overlap(self.pattern.points, weights, 2 * sigma**2)
             return overlap / float(weights.sum()) ** 2
         g = self.density(sigma, (np.array(-np.inf), np.array(np.inf)))

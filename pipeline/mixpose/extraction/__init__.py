@@ -42,7 +42,7 @@ def extract(
     window: Window | None = None,
     base: Path | None = None,
 ) -> Pattern:
-    """Feature pattern g0 of an image.
+    """Extract the feature pattern g0 of an image.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def extract(
         Grey values; pixel centres have integer coordinates.
     options : ExtractOptions
     window : (u0, v0, u1, v1), optional
-        Box of pixels to look in, u1 and v1 exclusive; the part of it outside of the image is
+        Box of pixels to search, u1 and v1 exclusive; the part of it outside of the image is
         ignored.  Features that its border cuts are not found.
     base : Path, optional
         Folder that holds the module of a method "module:function".
@@ -73,12 +73,12 @@ def extract(
 def extract_together(
     images: Mapping[str, tuple[Image, ExtractOptions, Window | None]], *, base: Path | None = None
 ) -> dict[str, Pattern]:
-    """As `extract`, of several images with options and windows: blobs of all in fewer calls."""
+    """Extract the patterns of several images, as `extract`; blobs of all in fewer calls."""
     patterns: dict[str, Pattern] = {}
     blobs: dict[str, tuple[Image, ExtractOptions, Window]] = {}
-    for name, (given, options, window) in images.items():
+    for name, (raw, options, window) in images.items():
         check_options(options)
-        image = _checked(given)
+        image = _checked(raw)
         height, width = image.shape
         u0, v0, u1, v1 = (0, 0, width, height) if window is None else window
         box = (max(int(u0), 0), max(int(v0), 0), min(int(u1), width), min(int(v1), height))
@@ -95,7 +95,7 @@ def extract_together(
 
 
 def check_options(options: ExtractOptions, *, base: Path | None = None) -> None:
-    """Check options before the first image comes; with a `base`, import "module:function", too.
+    """Check options before the first image; with a `base`, import "module:function", too.
 
     Raises `SessionError` if one is wrong: a line with the key, what was found and what is allowed.
     """
@@ -119,8 +119,8 @@ def check_options(options: ExtractOptions, *, base: Path | None = None) -> None:
 
 def _check_custom(method: str, base: Path | None) -> None:
     if ":" not in method:
-        near = difflib.get_close_matches(method, METHODS, n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        similar = difflib.get_close_matches(method, METHODS, n=1)
+        hint = f" (did you mean {similar[0]!r}?)" if similar else ""
         raise SessionError(
             f"extract.method: {method!r} is unknown{hint}; allowed are"
             f" {', '.join(repr(name) for name in METHODS)} and 'module:function' for your own"
@@ -146,13 +146,13 @@ def _is_number(value: object) -> bool:
 
 
 def _checked(image: Image) -> Image:
-    """The image, in a layout that OpenCV takes."""
+    """Check an image, and return it in a layout for OpenCV."""
     if image.ndim != 2 or image.dtype not in IMAGE_TYPES:
         raise RecordingError(
             f"an image of shape {image.shape} and type {image.dtype}; allowed are grey images"
             " (height, width) of uint8, uint16 or float32"
         )
-    # Of infinite values one end tells, of NaN both.
+    # Infinite values are at one end of the range, and NaN at both.
     ends = (image.min(), image.max()) if image.size and image.dtype == np.float32 else ()
     if not all(math.isfinite(end) for end in ends):
         raise RecordingError("an image holds NaN or infinite values; give them a grey value")

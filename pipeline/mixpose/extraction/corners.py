@@ -1,11 +1,11 @@
-"""Corners where two bright and two dark fields meet, as on a chessboard: saddles of the grey.
+"""Extract corners where two bright and two dark fields meet, as on a chessboard.
 
-A saddle is where the Hessian of the blurred image has a negative determinant.  Its place is the
-stationary point of a quadratic through the pixels around it.  (In tests with noise and blur it
-came 1.4 to 2 times closer to the truth than `cv2.cornerSubPix`, and 1.7 times closer than
-`skimage.feature.corner_subpix`, 0.046 to 0.080 px.)  What looks like a saddle by chance is told by
-two rings of samples around it: they must cross from bright to dark four times and look the same
-after half a turn.
+They are saddles of the grey values, where the Hessian of the blurred image has a negative
+determinant, located at the stationary point of a quadratic through the pixels around.  (In tests
+with noise and blur that came 1.4 to 2 times closer to the truth than `cv2.cornerSubPix`, and 1.7
+times closer than `skimage.feature.corner_subpix`, 0.046 to 0.080 px.)  Two rings of samples around
+a corner must cross from bright to dark four times and look the same after half a turn, which
+excludes saddles by chance.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mixpose.records import Floats, Image, PointPattern
 
 BAND_ROWS = 48
 RING_SAMPLES = 32
-# Candidates that are looked at together.
+# Candidates that are fitted together.
 BATCH = 256
 
 
@@ -36,30 +36,30 @@ class CornerRules:
     """Which saddles are corners."""
 
     blur: float = constant(
-        1.5, "px before the Hessian: enough against noise, little enough for fields of 8 px"
+        1.5, "px of blur before the Hessian: enough against noise, and little for fields of 8 px"
     )
-    spacing: int = constant(3, "px: two corners are not closer")
+    spacing: int = constant(3, "px: least distance of two corners")
     ring_radii: tuple[float, ...] = constant(
-        (3.0, 5.0), "px, of the rings that must cross four fields: within fields of 8 px"
+        (3.0, 5.0), "px, radii of the rings that must cross four fields: within fields of 8 px"
     )
-    symmetry: float = constant(0.9, "of a ring, that stays the same after half a turn")
-    margin: int = constant(6, "px to the border: rings and quadratics fit in")
+    symmetry: float = constant(0.9, "of a ring, that must stay the same after half a turn")
+    margin: int = constant(6, "px to the border: room for rings and quadratics")
     noise_factor: float = constant(
         2.5,
-        "of the noise, for a corner's step: saddles of noise have 0.3 at this blur, seldom five "
-        "times that",
+        "times the noise that a corner's step must have: saddles of noise have 0.3 at this blur, "
+        "seldom five times that",
     )
-    faint: float = constant(0.2, "of the clearest corner's step, that `auto` keeps")
+    faint: float = constant(0.2, "of the clearest corner's step, which corners need with `auto`")
 
 
 CORNERS = CornerRules()
 
 
 def extract_corners(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
-    """Saddle points of the grey values in a window of an image, as `points_in` has them.
+    """Return the saddle points of grey values in a window of an image, as `points_in` does.
 
-    The threshold of the options is "auto", or the least difference of grey between bright and dark
-    fields; corners have neither polarity nor area.
+    The threshold of the options is "auto", or the least difference of grey values between bright
+    and dark fields; corners have neither polarity nor area.
     """
 
     def find(part: Image) -> Floats:
@@ -72,31 +72,31 @@ def extract_corners(image: Image, options: ExtractOptions, window: Window) -> Po
 
 def _find(grey: Grey, threshold: str | float) -> Floats:
     blurred = cv2.GaussianBlur(grey, (0, 0), CORNERS.blur, borderType=cv2.BORDER_REPLICATE)
-    # Rings are sampled with little blur only, as they are thin; single pixels are noisy.
+    # Rings are thin and sampled with little blur only; single pixels would be noisy.
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)
-    rough, steps = _peaks(blurred)
+    starts, steps = _peaks(blurred)
     order = np.argsort(-steps, kind="stable")
     order = order[steps[order] > CORNERS.noise_factor * noise_of(grey)]
     corners, clearest = [np.empty((0, 2))], 0.0
     for first in range(0, len(order), BATCH):
-        # The clearest first: what is too faint beside them need not be looked at.
+        # Beginning with the clearest, those that are too faint beside them need no fit.
         batch = order[first : first + BATCH]
         batch = batch[steps[batch] >= CORNERS.faint * clearest]
-        fitted_corners, fitted = stationary_points(
-            blurred, rough[batch], lambda uu, uv, vv: 4 * uu * vv - uv * uv < 0
+        fitted, is_fitted = stationary_points(
+            blurred, starts[batch], lambda uu, uv, vv: 4 * uu * vv - uv * uv < 0
         )
-        crossed, differences = _four_fields(smooth, fitted_corners)
+        is_corner, differences = _four_fields(smooth, fitted)
         if isinstance(threshold, str):
-            found_steps = steps[batch][fitted][crossed]
-            clearest = max(clearest, found_steps.max(initial=0.0))
-            corners.append(fitted_corners[crossed][found_steps >= CORNERS.faint * clearest])
+            steps_of_corners = steps[batch][is_fitted][is_corner]
+            clearest = max(clearest, steps_of_corners.max(initial=0.0))
+            corners.append(fitted[is_corner][steps_of_corners >= CORNERS.faint * clearest])
         else:
-            corners.append(fitted_corners[crossed & (differences >= threshold)])
+            corners.append(fitted[is_corner & (differences >= threshold)])
     return np.concatenate(corners)
 
 
 def saddle_strength(blurred: Grey) -> Grey:
-    """Determinant of the Hessian with its sign turned: (H, W) float32, positive at saddles."""
+    """Return minus the determinant of the Hessian (H, W), float32: positive at saddles."""
     d_uu = cv2.Sobel(blurred, -1, 2, 0, ksize=3, scale=0.25)
     d_vv = cv2.Sobel(blurred, -1, 0, 2, ksize=3, scale=0.25)
     d_uv = cv2.Sobel(blurred, -1, 1, 1, ksize=3, scale=0.25)
@@ -104,10 +104,10 @@ def saddle_strength(blurred: Grey) -> Grey:
 
 
 def _peaks(blurred: Grey) -> tuple[Floats, Floats]:
-    """Places (n, 2) of the clearest saddles about, away from the border, and their steps (n,).
+    """Return pixels (n, 2) of local maxima of saddles, away from the border, and steps (n,).
 
-    A step is the difference of grey between the fields of a sharp corner that would make such a
-    saddle.  The work is done in bands of rows, which stay in the cache: 1.9 ms of 640 x 512 px,
+    A step is the difference of grey values between the fields of a sharp corner that makes such a
+    saddle.  The work is done in bands of rows, which stay in the cache: 1.9 ms for 640 x 512 px,
     where `skimage.feature.peak_local_max` finds the same in 130 ms.
     """
     margin, spacing = CORNERS.margin, CORNERS.spacing
@@ -132,19 +132,19 @@ def _peaks(blurred: Grey) -> tuple[Floats, Floats]:
 
 
 def _four_fields(smooth: Grey, corners: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Whether four fields meet at corners (n, 2), and the step of grey between them (n,)."""
+    """Test whether four fields meet at corners (n, 2); return that and the step between them."""
     angles = np.arange(RING_SAMPLES) * (2 * np.pi / RING_SAMPLES)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    crossed = np.ones(len(corners), dtype=np.bool_)
+    is_corner = np.ones(len(corners), dtype=np.bool_)
     difference = np.zeros(len(corners))
     for radius in CORNERS.ring_radii:
         samples = sample(smooth, corners[:, None] + radius * ring)
         low, high = samples.min(axis=1, initial=np.inf), samples.max(axis=1, initial=-np.inf)
         bright = samples > ((low + high) / 2)[:, None]
         crossings = np.count_nonzero(bright != np.roll(bright, 1, axis=1), axis=1)
-        around = samples - samples.mean(axis=1, keepdims=True)
-        even = around + np.roll(around, RING_SAMPLES // 2, axis=1)
-        symmetry = (even**2).sum(axis=1) / np.maximum(4 * (around**2).sum(axis=1), 1e-12)
-        crossed &= (crossings == 4) & (symmetry >= CORNERS.symmetry)
+        deviations = samples - samples.mean(axis=1, keepdims=True)
+        sums = deviations + np.roll(deviations, RING_SAMPLES // 2, axis=1)
+        symmetry = (sums**2).sum(axis=1) / np.maximum(4 * (deviations**2).sum(axis=1), 1e-12)
+        is_corner &= (crossings == 4) & (symmetry >= CORNERS.symmetry)
         difference = high - low
-    return crossed, difference
+    return is_corner, difference

@@ -1,8 +1,8 @@
-"""The user's own extraction: a function in a module beside the session file, or installed.
+"""Extraction by a function of the user's, in a module beside the session file or installed.
 
 The function gets the image (H, W) and the `ExtractOptions`, and returns a `PointPattern`, a
 `GridPattern`, or an array of points, (M, 2) for u, v or (M, 3) for u, v, weight.  When only a
-window of the image is asked for, it gets that window, and its points are moved back.
+window of the image is needed, it gets that window, and its points are moved back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ UserFunction = Callable[[Image, ExtractOptions], Any]
 
 @lru_cache(maxsize=32)
 def load_function(method: str, base: Path | None) -> UserFunction:
-    """Import the function that "module:function" names, from the folder `base` before `sys.path`.
+    """Import the function of a method "module:function", from the folder `base` before `sys.path`.
 
     Raises `SessionError` if there is none, or the module cannot be imported.
     """
@@ -60,7 +60,7 @@ def load_function(method: str, base: Path | None) -> UserFunction:
 def extract_custom(
     image: Image, options: ExtractOptions, window: Window, base: Path | None
 ) -> Pattern:
-    """Feature pattern that the user's function finds in a window of an image.
+    """Return the feature pattern of the user's function in a window of an image.
 
     The method is "module:function", and `base` the folder of the session file.  Raises
     `SessionError` if it cannot be imported, fails, or returns something else than a pattern.
@@ -68,26 +68,26 @@ def extract_custom(
     function = load_function(options.method, base)
     u0, v0, u1, v1 = window
     try:
-        found = function(image[v0:v1, u0:u1], options)
+        result = function(image[v0:v1, u0:u1], options)
     except MixposeError:
         raise
     except Exception as error:
         raise SessionError(_failed(options.method, "failed", error)) from error
     corner = np.array([u0, v0], dtype=np.float64)
-    if isinstance(found, GridPattern):
-        return _checked_grid(found, options.method, corner)
-    return _checked_points(found, options.method, corner)
+    if isinstance(result, GridPattern):
+        return _checked_grid(result, options.method, corner)
+    return _checked_points(result, options.method, corner)
 
 
-def _checked_points(found: object, method: str, corner: np.ndarray[Any, Any]) -> PointPattern:
-    if isinstance(found, PointPattern):
-        columns: list[object] = [found.points, found.weights]
+def _checked_points(result: object, method: str, corner: np.ndarray[Any, Any]) -> PointPattern:
+    if isinstance(result, PointPattern):
+        columns: list[object] = [result.points, result.weights]
     else:
-        columns = [found]
+        columns = [result]
     try:
         numbers = [np.asarray(column, dtype=np.float64) for column in columns]
     except (TypeError, ValueError):
-        raise SessionError(_wrong(method, f"returned {type(found).__name__}")) from None
+        raise SessionError(_wrong(method, f"returned {type(result).__name__}")) from None
     points = numbers[0]
     if points.size == 0:
         return PointPattern(np.empty((0, 2)), np.empty(0))
@@ -109,18 +109,18 @@ def _checked_points(found: object, method: str, corner: np.ndarray[Any, Any]) ->
     return PointPattern(points[:, :2] + corner, weights)
 
 
-def _checked_grid(found: GridPattern, method: str, corner: np.ndarray[Any, Any]) -> GridPattern:
-    values = np.asarray(found.values)
+def _checked_grid(grid: GridPattern, method: str, corner: np.ndarray[Any, Any]) -> GridPattern:
+    values = np.asarray(grid.values)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.number):
         raise SessionError(_wrong(method, f"returned grid values of shape {values.shape}"))
-    origin = np.asarray(found.origin, dtype=np.float64)
-    if origin.shape != (2,) or not np.isfinite(origin).all() or not found.step > 0:
+    origin = np.asarray(grid.origin, dtype=np.float64)
+    if origin.shape != (2,) or not np.isfinite(origin).all() or not grid.step > 0:
         raise SessionError(
-            _wrong(method, f"returned a grid of origin {found.origin} and step {found.step}")
+            _wrong(method, f"returned a grid of origin {grid.origin} and step {grid.step}")
         )
     if not np.isfinite(values).all() or values.min(initial=0) < 0:
         raise SessionError(_wrong(method, "returned NaN, infinite or negative grid values"))
-    return GridPattern(values.astype(np.float32), origin + corner, float(found.step))
+    return GridPattern(values.astype(np.float32), origin + corner, float(grid.step))
 
 
 def _wrong(method: str, what: str) -> str:
@@ -144,8 +144,7 @@ def _load_module(name: str, base: Path | None) -> ModuleType:
     try:
         if not file.is_file():
             return importlib.import_module(name)
-        # Not by its bare name, which may be that of an installed module, or of the module of
-        # another session.
+        # Not by its bare name, which an installed module or one of another session may have.
         spec = importlib.util.spec_from_file_location(f"mixpose_user_{name}", file)
         if spec is None or spec.loader is None:
             raise ImportError(f"{file} is not a Python module")

@@ -1,4 +1,4 @@
-"""The grey values themselves as feature pattern: for features without a point to stand for them."""
+"""Grey values as the feature pattern: for features that no point stands for."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from mixpose.records import GridPattern, Image, Pattern, PointPattern
 
 
 def extract_intensity(image: Image, options: ExtractOptions, window: Window) -> Pattern:
-    """Grey values above the threshold, without the background, of a window (u0, v0, u1, v1).
+    """Return the grey values above the threshold in a window (u0, v0, u1, v1), less the background.
 
-    A step of 1 px, zero where no feature is; an empty PointPattern if that is everywhere.  Areas
-    do not matter.
+    The step is 1 px; values are zero where no feature is, and an empty PointPattern stands for
+    zero everywhere.  Areas are not used.
     """
     values = feature_values(image, options, window)
     if not values.any():

@@ -1,4 +1,4 @@
-"""What the user says about feature extraction."""
+"""The options of feature extraction."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ class ExtractOptions:
     """Options of feature extraction; the keys of ``[extract]`` in a session file."""
 
     method: str = "blobs"  # "blobs", "corners", "intensity", "log", or the user's "module:function"
-    polarity: Literal["bright", "dark"] = "bright"  # than what is around features
+    polarity: Literal["bright", "dark"] = "bright"  # compared with the surroundings of features
     # or "otsu", "local", "li", "triangle", "sauvola", or a grey level
     threshold: str | float = "auto"
     min_area: float = 3.0  # of a blob, px
     max_area: float | None = None  # px; None for no limit
     sigma: float = 1.5  # σ_ε, standard deviation of the extraction: px, or length units of ranges
-    # Standard deviation that a feature has already in grey values ("intensity") and in range
-    # profiles, as `sigma`; 0 where it is much smaller. Width of the spots that "log" looks for, px;
-    # 0 for 3.
+    # Standard deviation of a feature itself in grey values ("intensity") and range profiles, in
+    # the unit of `sigma`; 0 if much smaller.  For "log", the width of spots in px; 0 for 3.
     spot_sigma: float = 0.0

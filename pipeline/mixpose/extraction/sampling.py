@@ -15,14 +15,14 @@ from mixpose.records import Floats, Indices, Singles
 # OpenCV takes maps with sides below 32767.
 MOST_ROWS = 30000
 
-# Of parts that are stacked: places in single precision are exact to 1e-4 px there.
+# Height of a stack of parts: coordinates in single precision are exact to 1e-4 px there.
 STACK_ROWS = 2000
 
 
 def sample(grey: Grey, places: Floats) -> Floats:
-    """Bilinear samples (n, k) of an image (H, W) at pixel coordinates u, v (n, k, 2).
+    """Return bilinear samples (n, k) of an image (H, W) at pixel coordinates u, v (n, k, 2).
 
-    Outside of the image, the nearest pixel's value.
+    Outside of the image they have the value of the nearest pixel.
     """
     if places.size == 0:
         return np.empty(places.shape[:2])
@@ -42,53 +42,53 @@ def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
     return cv2.remap(patch, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def parts_of(grey: Grey, shape: tuple[int, int]) -> Grey:
-    """All parts of a shape of an image, by their first pixel, of its memory: not to be written to.
+def patches_of(grey: Grey, shape: tuple[int, int]) -> Grey:
+    """Return a read-only view of all patches of a shape of an image, indexed by the first pixel.
 
-    As `np.lib.stride_tricks.sliding_window_view`, which takes longer than to copy a few.
+    `np.lib.stride_tricks.sliding_window_view` does the same, but takes longer than copying a few.
     """
     rows, columns = (whole - side + 1 for whole, side in zip(grey.shape, shape, strict=True))
     return as_strided(grey, (rows, columns, *shape), grey.strides * 2, writeable=False)
 
 
-def sample_each(
+def sample_lines(
     greys: Sequence[Grey], which: Indices, places: Floats, steps: Floats, offsets: Floats
 ) -> Singles:
-    """As `sample`, of features (B,) `which` image, at so many steps (k,) beside their places.
+    """Sample lines in images `which` (B,), at `offsets` (k,) times `steps` from places.
 
-    Places and steps are (2, B, n), u and v, samples (k, B, n).  Only what is around each feature is
-    turned into single precision, not all between them.
+    Places and steps are (2, B, n), u and v; samples are (k, B, n), as those of `sample`.  Only the
+    part around each feature is converted to single precision, not the image between them.
     """
     samples = np.empty((len(offsets), *places.shape[1:]), np.float32)
     ends = places + steps * offsets.min(), places + steps * offsets.max()
     lower, upper = np.minimum(*ends).min(axis=2).T, np.maximum(*ends).max(axis=2).T
-    beside = offsets.astype(np.float32)[:, None, None]
+    distances = offsets.astype(np.float32)[:, None, None]
     for number in sorted(set(which.tolist())):
-        own, grey = (which == number).nonzero()[0], greys[number]
+        rows, grey = (which == number).nonzero()[0], greys[number]
         last = np.array(grey.shape[::-1]) - 1
-        inside = np.minimum(np.maximum([lower[own], upper[own]], 0.0), last)
+        inside = np.minimum(np.maximum([lower[rows], upper[rows]], 0.0), last)
         first, end = inside.astype(np.intp)
-        # the last pixel's neighbour is not looked at, but has to be there
+        # the last pixel's neighbour has no weight, but must exist
         sides = np.minimum(end - first + 2, last + 1)
         order = np.argsort(sides.max(axis=1))
         while order.size:
-            # parts as large as the largest of them, in a stack that is not too high
+            # parts are as large as the largest of them, in a stack of limited height
             stacked = np.maximum.accumulate(sides[order, 1]) * np.arange(1, order.size + 1)
             count = max(int(np.searchsorted(stacked, STACK_ROWS, side="right")), 1)
             chosen, order = order[:count], order[count:]
-            some, (width, height) = own[chosen], sides[chosen].max(axis=0).tolist()
+            selected, (width, height) = rows[chosen], sides[chosen].max(axis=0).tolist()
             corners = np.minimum(first[chosen], last + 1 - (width, height))
-            parts = parts_of(grey, (height, width))[corners[:, 1], corners[:, 0]]
+            parts = patches_of(grey, (height, width))[corners[:, 1], corners[:, 0]]
             parts = parts.astype(np.float32)
             maps = []
             for axis in (0, 1):
-                near = (places[axis, some] - corners[:, axis, None]).astype(np.float32)
-                maps.append(near + steps[axis, some].astype(np.float32) * beside)
-                if lower[some, axis].min() < 0 or upper[some, axis].max() > last[axis]:
+                on_part = (places[axis, selected] - corners[:, axis, None]).astype(np.float32)
+                maps.append(on_part + steps[axis, selected].astype(np.float32) * distances)
+                if lower[selected, axis].min() < 0 or upper[selected, axis].max() > last[axis]:
                     ends = -corners[:, axis], last[axis] - corners[:, axis]
-                    np.clip(maps[-1], *(one[:, None] for one in ends), out=maps[-1])
+                    np.clip(maps[-1], *(end[:, None] for end in ends), out=maps[-1])
             maps[1] += (np.arange(count, dtype=np.float32) * height)[:, None]
-            u, v = (one.reshape(-1, count * places.shape[2]) for one in maps)
+            u, v = (sampled.reshape(-1, count * places.shape[2]) for sampled in maps)
             stack = parts.reshape(-1, width)
-            samples[:, some] = _remap(stack, u, v).reshape(-1, count, places.shape[2])
+            samples[:, selected] = _remap(stack, u, v).reshape(-1, count, places.shape[2])
     return samples

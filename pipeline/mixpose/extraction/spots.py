@@ -1,4 +1,4 @@
-"""Centres of small blobs: the centroid of their grey values, to hundredths of a pixel."""
+"""Locate small blobs by the centroid of their grey values, to hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -10,109 +10,109 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.contours import Contour, filled, on_border, signal_about
-from mixpose.extraction.shape import areas_at_half, background, centroids
+from mixpose.extraction.contours import Contour, is_on_border, mask_of, signal_about
+from mixpose.extraction.shape import areas_at_half_height, background, centroids
 from mixpose.extraction.threshold import Foreground, above
 
 
 @dataclass(frozen=True)
 class SpotRules:
-    """What a small blob is, and which are several that touch.
+    """Rules for small blobs, and for splitting those that touch.
 
-    Of equal spots, a prominence of 0.2 and a ratio of 1.1 part those that are 3 instead of 4 times
-    their width apart, but 0.14 px off: poses of `data/synthetic/one_camera_video` are none the
-    better (0.0084 to 0.0082 degrees).
+    A prominence of 0.2 and a ratio of 1.1 would split equal spots 3 instead of 4 times their width
+    apart, but 0.14 px off: poses of `data/synthetic/one_camera_video` do not improve (0.0084 to
+    0.0082 degrees).
     """
 
-    margin: int = constant(3, "px around a spot in which its background is looked for")
+    margin: int = constant(3, "px around a spot, whose outermost pixels are its background")
     centroid: float = constant(
         0.1,
-        "of the peak, below which is left out of the centroid as halo, flare and noise: more would "
-        "pull it towards pixels, less lets in more noise",
+        "of the peak: pixels below are halo, flare and noise, and not in the centroid; a higher "
+        "share would pull it towards pixel centres, a lower one lets in more noise",
     )
-    min_step: float = constant(0.4, "at the rim, of the whole signal: tips of soft light have less")
+    min_step: float = constant(0.4, "at the rim, of the peak's signal: soft light has less")
     long: float = constant(1.35, "length by width from which a blob may be several that touch")
-    level_ratio: float = constant(1.25, "from level to level at which they may come apart")
-    max_parts: int = constant(8, "into which a blob comes apart: more are noise")
-    prominence: float = constant(0.3, "of itself, that a part's peak rises above that level")
-    prominence_noise_factor: float = constant(4.0, "the same, of the noise")
+    level_ratio: float = constant(1.25, "from level to level at which they are split")
+    max_parts: int = constant(8, "into which a blob is split: more are noise")
+    prominence: float = constant(0.3, "of a part's peak, by which it must rise above that level")
+    prominence_noise_factor: float = constant(4.0, "the same, in times the noise")
 
 
 SPOTS = SpotRules()
 
 
 class Spot(NamedTuple):
-    """What is found of a small blob."""
+    """The centre of a small blob, its error, and its area."""
 
     u: float  # centre, px of the window
     v: float
-    off: float  # px by which that may be off
-    size: float  # px at half of its height
+    error: float  # px, of the centre
+    size: float  # area in px at half of its height
 
 
 def find_spots(scene: Foreground, contour: Contour, area: float, level: float) -> list[Spot]:
-    """The spot of a small blob, or those of blobs that touch in it.
+    """Return the spot of a small blob, or those of several blobs that touch in it.
 
-    The contour encloses `area` px that are above the level.  There is none if the border of the
-    window cuts the blob or it does not stand out.
+    The contour encloses `area` px above the level.  There is no spot if the border of the window
+    cuts the blob, or it does not stand out.
     """
     box = cv2.boundingRect(contour)
     u, v, width, height = box
-    # First what is cheap: most of the specks of a busy scene are dim.
+    # The cheap test comes first: most specks of a busy scene are dim.
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1] - scene.zero
-    if highest < scene.least_peak or on_border(scene, box):
+    if highest < scene.least_peak or is_on_border(scene, box):
         return []
     patch, corner = signal_about(scene, box, SPOTS.margin)
     base = background(patch)
-    # The usual blob has the patch for itself, and nothing else there needs to be masked.
-    alone = np.count_nonzero(patch > level) == area
-    inside = None if alone else filled(contour, patch.shape, corner)
+    # Mostly nothing else is in the patch, so that it needs no mask.
+    is_alone = np.count_nonzero(patch > level) == area
+    inside = None if is_alone else mask_of(contour, patch.shape, corner)
     peak = cv2.minMaxLoc(patch, inside)[1]
-    if scene.judged and peak - base < SPOTS.min_step * peak:
+    if scene.is_selective and peak - base < SPOTS.min_step * peak:
         return []
-    if scene.judged and peak - level < SPOTS.prominence * peak:
+    if scene.is_selective and peak - level < SPOTS.prominence * peak:
         return []
     base = min(base, level)
-    parts = come_apart(scene, contour, patch, inside, level)
-    own = patch if inside is None else patch * inside
-    size = float(areas_at_half(own[None], np.array([base]), np.array([peak]))[0])
+    parts = split_long(scene, contour, patch, inside, level)
+    own_signal = patch if inside is None else patch * inside
+    size = float(areas_at_half_height(own_signal[None], np.array([base]), np.array([peak]))[0])
     spots = []
-    whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
-    for part, valley in parts or whole:
+    region: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
+    for part, valley in parts or region:
         top = cv2.minMaxLoc(patch, part)[1] if parts else peak
         cut = max(valley, base + SPOTS.centroid * (top - base))
         weights = np.maximum(patch - np.float32(cut), 0)
         if part is not None:
             weights *= part
         if not weights.any():
-            # Nothing but rounding above the cut: all of its pixels alike.
+            # Only rounding errors are above the cut: all of its pixels count alike.
             weights = above(patch, level) if part is None else part
-        (centre,), (off,) = (one.tolist() for one in centroids(weights[None]))
+        (centre,), (error,) = (values.tolist() for values in centroids(weights[None]))
         u, v = corner[0] + centre[0], corner[1] + centre[1]
-        spots.append(Spot(u, v, off, size / max(len(parts), 1)))
+        spots.append(Spot(u, v, error, size / max(len(parts), 1)))
     return spots
 
 
-def come_apart(
+def split_long(
     scene: Foreground,
     contour: Contour,
     patch: NDArray[np.float32],
     inside: NDArray[np.uint8] | None,
     level: float,
 ) -> list[tuple[NDArray[np.uint8], float]]:
-    """Masks (h, w) of the parts of a long blob that come apart at a higher level, with that level.
+    """Split a long blob at a higher level; return masks (h, w) of its parts, with that level.
 
-    `patch` (h, w) is the signal about the blob, `inside` 1 within it, or None where nothing else is
-    above its level.  There are no parts where all that is above the level is asked for.
+    `patch` (h, w) is the signal around the blob, `inside` 1 within it, or None where nothing else
+    is above its level.  A blob is not split if features need not stand out.
 
-    A watershed (`skimage.segmentation`) from peaks as prominent parts no more pairs (6 px apart,
-    one 2.5 times brighter: 16 of 30 to 26) in three times the time, and a photograph of 8
-    megapixels takes it more than a minute.
+    A watershed (`skimage.segmentation`) from peaks as prominent splits fewer pairs (6 px apart,
+    one 2.5 times brighter: 16 of 30 to 26) in three times the time, and takes more than a minute
+    for a photograph of 8 megapixels.
     """
-    if not (scene.judged and is_long(contour)):
+    if not (scene.is_selective and is_long(contour)):
         return []
     signal = patch if inside is None else patch * inside
-    least_rise = SPOTS.prominence_noise_factor * scene.noise
+    min_rise = SPOTS.prominence_noise_factor * scene.noise
     highest = (1 - SPOTS.prominence) * float(signal.max())
     while (level := level * SPOTS.level_ratio) < highest:
         count, labels = cv2.connectedComponents((signal > level).view(np.uint8))
@@ -123,7 +123,7 @@ def come_apart(
         prominent = [
             (part, level)
             for part, top in zip(parts, tops, strict=True)
-            if top >= scene.least_peak and top - level >= max(SPOTS.prominence * top, least_rise)
+            if top >= scene.least_peak and top - level >= max(SPOTS.prominence * top, min_rise)
         ]
         if len(prominent) > 1:
             return prominent
@@ -131,6 +131,6 @@ def come_apart(
 
 
 def is_long(contour: Contour) -> bool:
-    """Whether a blob is so long that it may be several."""
+    """Test whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
     return bool(max(a, b) + 1 > SPOTS.long * (min(a, b) + 1))

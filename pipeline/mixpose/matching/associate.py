@@ -138,7 +138,7 @@ def _observed(observations: tuple[Observation, ...]) -> tuple[Floats, Floats]:
         side[: len(own)] = 0.0
         side[: len(own), : own.shape[1]] = own
         pattern, sigma = one.pattern, one.sigma
-        if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
+        if not isinstance(pattern, PointPattern) or (pattern.is_uniform and not pattern.has_radii):
             continue
         look[: len(own), 0], look[: len(own), 1] = pattern.deviations / sigma, pattern.radii
         if pattern.cut is not None:

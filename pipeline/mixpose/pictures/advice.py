@@ -81,7 +81,7 @@ def _threshold(light: Light) -> str:
         return f"  method {options.method} has a threshold of its own"
     scene = light.scene
     side = "above" if options.polarity == "bright" else "below"
-    if scene.judged:
+    if scene.is_selective:
         heights = scene.level, scene.noise, scene.least_peak
         digits = ".3g" if light.image.dtype == np.float32 else ".1f"
         level, noise, peak = (f"{each:{digits}}" for each in heights)

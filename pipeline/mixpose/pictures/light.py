@@ -63,7 +63,7 @@ class Light:
     def level(self) -> float:
         """The grey level in the image above which, or below, something is a feature."""
         # a background that varies is out of `scene.grey`; its middle stands for it
-        base = float(np.median(self.raw)) if self.scene.judged else 0.0
+        base = float(np.median(self.raw)) if self.scene.is_selective else 0.0
         return float(self.in_image(base + self.scene.level))
 
     @cached_property

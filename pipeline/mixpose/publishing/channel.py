@@ -183,7 +183,7 @@ class Channel:
             self._unheard += not heard
             if message.moment is not None:
                 self._latencies.append(message.late_s)
-                self._stamped_by = message.moment.of
+                self._stamped_by = message.moment.event
 
     def _count_unsent(self, message: Message, error: Exception) -> None:
         """Count a message that no receiver can get, and tell the first of its kind."""

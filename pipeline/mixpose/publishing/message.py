@@ -47,7 +47,7 @@ class Message:
         """The pose line, and in it when the frame was taken, without an end of line."""
         line = pose_line(self.estimate)
         if self.moment is not None:
-            line["stamp_s"], line["stamp_of"] = self.unix_s, self.moment.of
+            line["stamp_s"], line["stamp_of"] = self.unix_s, self.moment.event
         if self.ahead_s:
             line["ahead_s"] = self.ahead_s
         return json.dumps(line, allow_nan=False)

@@ -1,4 +1,4 @@
-"""Search: the first pose from nothing, over all orientations and positions."""
+"""Search of a pose without a start, over all orientations and positions."""
 
 from mixpose.search.copies import (
     Copy as Copy,
@@ -12,8 +12,8 @@ from mixpose.search.from_points import (
 from mixpose.search.poses import (
     Descent as Descent,
     Stage as Stage,
-    spread_turns as spread_turns,
-    unlike as unlike,
+    spread_rotations as spread_rotations,
+    distinct_poses as distinct_poses,
 )
 from mixpose.search.problem import (
     LIVE as LIVE,
@@ -36,5 +36,5 @@ from mixpose.search.three_points import (
 )
 from mixpose.search.triples import (
     far_apart as far_apart,
-    sparse as sparse,
+    thinned as thinned,
 )

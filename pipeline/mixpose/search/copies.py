@@ -1,8 +1,8 @@
-"""Poses of many bodies at once: points in space as features of any of them, shared out.
+"""Search the poses of many bodies together, from points in space that any of them may own.
 
-Points where rays of several cameras meet are those of all bodies.  Triangles of them that are no
-larger than a body are its features', as `from_point_triples` has it; and what is found goes to the
-set of poses of which no two have the same detections, the likelier having what both meet.
+Rays of several cameras meet at points of all bodies.  Triangles of these points that are no larger
+than a body are matched with its features, as in `from_point_triples`.  Of the poses found, a set
+is kept in which few detections are shared; a detection that two poses meet goes to the likelier.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
 from mixpose.search.from_points import (
     TriangulatedPoints,
-    by_promise,
     feature_triangles,
-    of_triples,
+    poses_of_triples,
+    sort_by_support,
     triangulate,
 )
 from mixpose.search.poses import (
     LabelImage,
     count_inliers,
+    distinct_poses,
     label_image,
     matches_of,
     odds_at,
-    unlike,
 )
 from mixpose.search.problem import (
     THOROUGH,
@@ -46,21 +46,21 @@ from mixpose.search.problem import (
 )
 from mixpose.sensors import Rays
 
-_AT_ONCE = 64  # points: where all are near each other 40,000 triples of them
+_AT_ONCE = 64  # points per step: 40,000 triples where all are near each other
 
 
 class _Candidates(NamedTuple):
-    """Poses of one body."""
+    """Candidate poses of one body."""
 
     poses: Floats  # (K, 4, 4)
-    evidence: Floats  # (K,) log odds against clutter, if they had not been chosen to fit
-    gains: Floats  # (K,) nats that what is known before the frame adds to them
-    numbers: Indices  # (K, L N) detections of all cameras that they meet; -1 for none
+    evidence: Floats  # (K,) log odds against clutter, without the price of having been chosen
+    log_priors: Floats  # (K,) nats
+    numbers: Indices  # (K, L N) detections met, numbered over all cameras; -1 for none
 
 
 @dataclass(frozen=True, eq=False)
 class SeenTogether:
-    """What cameras see together, for whichever body: worked out once, when it is asked for."""
+    """Triangulated points of one frame for the search of any body; computed once, on demand."""
 
     views: Sequence[View] = ()
     rules: JudgementRules = JudgementRules()
@@ -68,9 +68,9 @@ class SeenTogether:
     _copies: dict[Body, list[Copy]] = field(default_factory=dict)
 
     def copies_of(self, body: Body, free: Mask) -> list[Copy]:
-        """Poses of a body as `search_copies` finds them, of which nothing is known.
+        """Return the poses that `search_copies` finds of one body without a prior.
 
-        All bodies of a scene have the same free directions.
+        They are kept by body: all bodies of a scene have the same free directions.
         """
         if body not in self._copies:
             self._copies[body] = search_copies(self, [body], free)
@@ -78,19 +78,18 @@ class SeenTogether:
 
     @cached_property
     def detections(self) -> list[SensorDetections]:
-        """Of all views that saw something."""
+        """Detections of all views that are not empty."""
         return sensor_detections(self.views)
 
     @cached_property
     def _cameras(self) -> list[tuple[SensorDetections, Rays, float]]:
-        """Those with lines of sight, and the largest errors of detections."""
-        return [
-            (one, one.rays, largest_error(one, self.rules)) for one in self.detections if one.rays
-        ]
+        """Sensors with lines of sight, and the largest errors of their detections."""
+        reach = partial(largest_error, rules=self.rules)
+        return [(sensor, sensor.rays, reach(sensor)) for sensor in self.detections if sensor.rays]
 
     @cached_property
     def points(self) -> TriangulatedPoints | None:
-        """Where rays of two cameras or more meet; None of fewer."""
+        """Points where rays of two cameras or more meet; None with fewer cameras."""
         if len(self._cameras) < 2:
             return None
         _, rays, reaches = zip(*self._cameras, strict=True)
@@ -98,14 +97,14 @@ class SeenTogether:
 
     @cached_property
     def images(self) -> list[LabelImage]:
-        """The detections of each camera."""
+        """Label images of the detections, one per camera."""
         return [label_image(*camera) for camera in self._cameras]
 
 
 class Copy(NamedTuple):
-    """A pose of one of several bodies, and the next best of it by some of the same detections."""
+    """A pose of one of several bodies, and the body's next best pose that shares detections."""
 
-    kind: int  # which of the bodies
+    kind: int  # index of the body
     T_world_object: Floats  # (4, 4)
     evidence: float
     rival: Floats | None  # (4, 4)
@@ -115,13 +114,12 @@ def search_copies(
     seen: SeenTogether,
     bodies: Sequence[Body],
     free: Mask,
-    known: Callable[[int, Floats], Floats] = lambda kind, poses: np.zeros(len(poses)),
+    log_prior: Callable[[int, Floats], Floats] = lambda kind, poses: np.zeros(len(poses)),
 ) -> list[Copy]:
-    """Find poses of bodies, any number of each, that explain a frame together; most evident first.
+    """Find poses of bodies, any number of each, that explain a frame together; likeliest first.
 
-    By detections of two cameras or more that meet in space; there are none without, nor of a body
-    whose features are no points.  What is `known` of a kind's poses (K, 4, 4) before the frame are
-    nats (K,) that they gain.
+    This needs detections of two cameras or more that meet in space, and bodies whose features are
+    points; other bodies have no poses.  `log_prior` returns nats (K,) of a kind's poses (K, 4, 4).
     """
     kinds = [k for k, body in enumerate(bodies) if is_pointlike(body)]
     points, budget = seen.points, seen.budget
@@ -133,30 +131,30 @@ def search_copies(
     ]
     triangles = [feature_triangles(bodies[k], 6 * budget.sample, budget.min_sine) for k in kinds]
     longest = max(float(tree.data.max(initial=0.0)) for _, tree in triangles)
-    # a point that may be anywhere in a body tells nothing of it
-    points = TriangulatedPoints._make(one[points.tolerance < longest / 2] for one in points)
-    points = by_promise(problems[0], points)
+    # a point that errs by half of a body or more says nothing about its pose
+    points = TriangulatedPoints._make(array[points.tolerance < longest / 2] for array in points)
+    points = sort_by_support(problems[0], points)
     triples = _near_triples(points, longest, budget.batch)
     poses = [
-        of_triples(problem, points, own, triples)
-        for problem, own in zip(problems, triangles, strict=True)
+        poses_of_triples(problem, points, corners, triples)
+        for problem, corners in zip(problems, triangles, strict=True)
     ]
-    found = {
-        k: _candidates(problem, some, seen, partial(known, k))
-        for k, problem, some in zip(kinds, problems, poses, strict=True)
+    candidates = {
+        k: _candidates(problem, guesses, seen, partial(log_prior, k))
+        for k, problem, guesses in zip(kinds, problems, poses, strict=True)
     }
-    return _shared_out(found, bodies, budget)
+    return _resolve_shared(candidates, bodies, budget)
 
 
 def _candidates(
     problem: SearchProblem,
     poses: Floats,
     seen: SeenTogether,
-    known: Callable[[Floats], Floats],
+    log_prior: Callable[[Floats], Floats],
 ) -> _Candidates:
-    """Of poses (K, 4, 4) of one body those that may be, and what they meet."""
+    """Return the possible ones among poses (K, 4, 4) of one body, with the detections they meet."""
     body, budget = problem.body, problem.budget
-    poses = poses[unlike(body, poses, budget.alike)]
+    poses = poses[distinct_poses(body, poses, budget.alike)]
     if not len(poses):
         return _Candidates(poses, np.zeros(0), np.zeros(0), np.zeros((0, 1), dtype=np.intp))
     if len(poses) > budget.shortlist:
@@ -164,68 +162,68 @@ def _candidates(
         ranks = counts.sum(axis=0) + 0.1 * near
         poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]
     matches = matches_of(problem, poses)
-    begins = np.cumsum([0, *(len(sensor.points) for sensor, _ in problem.cameras)])
-    met = matches.detections >= 0
-    numbers = np.where(met, matches.detections + begins[:-1, None], -1).reshape(len(poses), -1)
+    first = np.cumsum([0, *(len(sensor.points) for sensor, _ in problem.cameras)])
+    is_met = matches.detections >= 0
+    numbers = np.where(is_met, matches.detections + first[:-1, None], -1).reshape(len(poses), -1)
     odds = odds_at(problem, matches)
-    # against each other they are as free to fit
-    possible = paid_by_count(odds, matches, problem.free) > budget.hopeless
-    poses, evidence = poses[possible], (odds[0] + odds[1])[possible]
-    return _Candidates(poses, evidence, known(poses), numbers[possible])
+    # candidates are compared with each other without the price, which all of them pay
+    kept = paid_by_count(odds, matches, problem.free) > budget.hopeless
+    poses, evidence = poses[kept], (odds[0] + odds[1])[kept]
+    return _Candidates(poses, evidence, log_prior(poses), numbers[kept])
 
 
-def _near_triples(points: TriangulatedPoints, longest: float, most: int) -> Indices:
-    """Triples (K, 3) of points that share no ray and are as near to each other as features are.
+def _near_triples(points: TriangulatedPoints, longest: float, limit: int) -> Indices:
+    """Return triples (K, 3) of points that share no ray and may be within `longest` of each other.
 
-    The most promising first, so many at most.
+    The most promising come first; there are `limit` at most.
     """
     pairs = cKDTree(points.points).query_pairs(2 * longest, output_type="ndarray")
-    away = np.linalg.norm(np.subtract(*points.points[pairs.T]), axis=1)
-    pairs = pairs[away < longest + points.tolerance[pairs].sum(axis=1)]
+    distances = np.linalg.norm(np.subtract(*points.points[pairs.T]), axis=1)
+    pairs = pairs[distances < longest + points.tolerance[pairs].sum(axis=1)]
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
     pairs = pairs[(rays[pairs[:, 0], :, None] != rays[pairs[:, 1], None]).all(axis=(1, 2))]
     are_near = np.zeros((len(rays), len(rays)), dtype=np.bool_)
     are_near[pairs[:, 0], pairs[:, 1]] = True
-    found, count = [np.zeros((0, 3), dtype=np.intp)], 0
+    triples, count = [np.zeros((0, 3), dtype=np.intp)], 0
     for start in range(0, len(rays), _AT_ONCE):
-        # i < j < k, each pair of them near, k of the next points
-        some, block = pairs[pairs[:, 1] < start + _AT_ONCE], slice(start, start + _AT_ONCE)
-        pair, third = np.nonzero(are_near[some[:, 0], block] & are_near[some[:, 1], block])
+        # i < j < k, all three pairs near, k in the next block of points
+        near, block = pairs[pairs[:, 1] < start + _AT_ONCE], slice(start, start + _AT_ONCE)
+        pair, third = np.nonzero(are_near[near[:, 0], block] & are_near[near[:, 1], block])
         order = np.argsort(third, kind="stable")
-        found.append(np.column_stack([some[pair], start + third])[order])
-        if (count := count + len(order)) >= most:
+        triples.append(np.column_stack([near[pair], start + third])[order])
+        if (count := count + len(order)) >= limit:
             break
-    return np.concatenate(found)[:most]
+    return np.concatenate(triples)[:limit]
 
 
 def _are_alike(body: Body, a: Floats, b: Floats, budget: SearchBudget) -> bool:
-    """Whether two poses (4, 4) put the body, symmetries aside, into the same place."""
-    away = transform(a @ body.symmetries, body.means) - transform(b, body.means)
-    return bool(np.linalg.norm(away, axis=-1).max(axis=-1).min() < budget.alike * body.radius)
+    """Test whether two poses (4, 4) are the same for the body, symmetries aside."""
+    offsets = transform(a @ body.symmetries, body.means) - transform(b, body.means)
+    return bool(np.linalg.norm(offsets, axis=-1).max(axis=-1).min() < budget.alike * body.radius)
 
 
-def _shared_out(
-    found: Mapping[int, _Candidates], bodies: Sequence[Body], budget: SearchBudget
+def _resolve_shared(
+    candidates: Mapping[int, _Candidates], bodies: Sequence[Body], budget: SearchBudget
 ) -> list[Copy]:
-    """The poses of which no two have the same detections, the likeliest first."""
-    some = list(found.values())
-    kinds = np.repeat(list(found), [len(one.poses) for one in some]).tolist()
-    poses = np.concatenate([one.poses for one in some])
-    evidence = np.concatenate([one.evidence for one in some])
-    likely = evidence + np.concatenate([one.gains for one in some])
-    rows = [row[row >= 0].tolist() for one in some for row in one.numbers]
+    """Keep poses, likeliest first, most of whose detections no likelier pose has taken."""
+    groups = list(candidates.values())
+    kinds = np.repeat(list(candidates), [len(group.poses) for group in groups]).tolist()
+    poses = np.concatenate([group.poses for group in groups])
+    evidence = np.concatenate([group.evidence for group in groups])
+    scores = evidence + np.concatenate([group.log_priors for group in groups])
+    rows = [row[row >= 0].tolist() for group in groups for row in group.numbers]
     owners, rivals = dict[int, int](), dict[int, int]()
-    order = np.argsort(-likely, kind="stable")
+    order = np.argsort(-scores, kind="stable")
     kept = list[int]()
     for k in order.tolist():
-        others = [owners[number] for number in rows[k] if number in owners]
-        if len(others) <= (1 - budget.convincing) * len(rows[k]):
+        taken = [owners[number] for number in rows[k] if number in owners]
+        if len(taken) <= (1 - budget.convincing) * len(rows[k]):
             kept.append(k)
             owners = dict.fromkeys(rows[k], k) | owners
             continue
-        for j in set(others) - set(rivals):
-            is_near = kinds[j] == kinds[k] and likely[k] > likely[j] - budget.outdone
-            if is_near and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
+        for j in set(taken) - set(rivals):
+            is_rival = kinds[j] == kinds[k] and scores[k] > scores[j] - budget.outdone
+            if is_rival and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
                 rivals[j] = k
     return [
         Copy(kinds[k], poses[k], float(evidence[k]), poses[rivals[k]] if k in rivals else None)

@@ -1,8 +1,8 @@
-"""Guesses of several cameras: points in space where their rays meet, as features of the body.
+"""Make guesses from several cameras: points where their rays meet are taken as features.
 
-Three points find triangles of features by the lengths of their sides.  Where cameras see different
-features, few points are known: seen from one of them, a feature at a known distance lies where its
-ray cuts a sphere, and two such features must be as far apart as they are on the body.
+Three points are matched with triangles of features by the lengths of their sides.  Where cameras
+see different features, few points are known: a feature at a known distance from one of them lies
+where its ray cuts a sphere, and two such features must be as far apart as they are on the body.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from mixpose.search.three_points import (
     SECOND,
     Guesses,
     align_triples,
+    corners_of,
     from_three_rays,
-    gathered,
 )
 from mixpose.search.triples import far_apart
 from mixpose.sensors import Rays
 
-_AT_ONCE = 40_000  # pairs of rays: their numbers stay in the cache of a processor
+_AT_ONCE = 40_000  # pairs of rays: their numbers stay in the cache
 
 
 class TriangulatedPoints(NamedTuple):
     """Points where a ray of one sensor comes close to a ray of another."""
 
     points: Floats  # (P, 3) in the world
-    tolerance: Floats  # (P,) how far off the point may be, in length units
-    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
-    sensors: Indices  # (P, 2) the two sensors, first before second
-    rays: Indices  # (P, 2) the ray of either sensor
+    tolerance: Floats  # (P,) largest error of the point, length units
+    gap: Floats  # (P,) distance between the two rays as a share of what the gates allow, 0 to 1
+    sensors: Indices  # (P, 2) the two sensors, ascending
+    rays: Indices  # (P, 2) the ray of each of the two
 
 
 def generators_of(problem: SearchProblem) -> list[Guesses]:
-    """Ways to make guesses from rays, the quickest first.
+    """Return the generators of guesses from rays, the quickest first.
 
-    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
+    Triples of points in space; a point and two rays, or in crowds last; three rays of one camera.
     """
     budget, rays = problem.budget, [rays for _, rays in problem.cameras]
     reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
     generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
     if len(rays) < 2:
         return generators
-    points = by_promise(problem, triangulate(rays, reaches, budget))
+    points = sort_by_support(problem, triangulate(rays, reaches, budget))
     crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
-    # of the points tried in a crowd, and of the rays near them, few are right
+    # in a crowd few of the points tried, and of the rays near them, are right
     place = len(generators) if crowded else 0
     generators.insert(place, from_point_and_rays(problem, points))
     return [from_point_triples(problem, points), *generators]
@@ -65,10 +65,10 @@ def generators_of(problem: SearchProblem) -> list[Guesses]:
 def triangulate(
     rays: Sequence[Rays], gates: Sequence[float], budget: SearchBudget = THOROUGH
 ) -> TriangulatedPoints:
-    """All pairs of rays of two sensors or more that meet within the error of the detections.
+    """Return a point for each pair of rays of two sensors that meet within the detections' errors.
 
-    That is a gate in px, one per sensor, which most are far from erring by: rays that meet more
-    closely put a point more exactly.
+    `gates` are the largest errors in px, one per sensor.  Most errors are far smaller, so that the
+    error of a point is estimated by the gap between its rays.
     """
     meetings = [
         met._replace(sensors=np.broadcast_to([first, second], met.rays.shape))
@@ -81,82 +81,82 @@ def triangulate(
 def _meetings(
     a: Rays, b: Rays, gates: tuple[float, float], budget: SearchBudget
 ) -> Iterator[TriangulatedPoints]:
-    """Points where rays of sensors 0 and 1 meet, for some rays of the first after the other.
+    """Yield points where rays of sensors 0 and 1 meet, in chunks of the rays of the first.
 
-    Lines a and b pass at |(o_b - o_a) . (d_a x d_b)| / |d_a x d_b|; the numerator is a product of
-    their Pluecker coordinates, so that only pairs that meet have to be looked at in space.
+    The distance of lines a and b is |(o_b - o_a) . (d_a x d_b)| / |d_a x d_b|; the numerator is a
+    product of their Pluecker coordinates, so that points are computed only of pairs that meet.
     """
     step = max(_AT_ONCE // max(len(b), 1), 1)
-    one = np.ones((len(b), 1))
-    origins_b = b.origins - a.origins[:1].sum(axis=0)  # near zero, lest products lose digits
-    of_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
+    ones = np.ones((len(b), 1))
+    origins_b = b.origins - a.origins[:1].sum(axis=0)  # near zero, as products would lose digits
+    moments_b = np.hstack([np.cross(b.directions, origins_b), -b.directions])
     along_b = np.hstack([(origins_b * b.directions).sum(axis=1, keepdims=True), -b.directions])
     for start in range(0, max(len(a), 1), step):
         u = a.directions[start : start + step]
         o = a.origins[start : start + step] - a.origins[:1].sum(axis=0)
         cosine = u @ b.directions.T
         sine2 = np.maximum(1 - cosine**2, 1e-300)
-        to_a = np.hstack([u, -(o * u).sum(axis=1, keepdims=True)]) @ np.hstack([origins_b, one]).T
+        to_a = np.hstack([u, -(o * u).sum(axis=1, keepdims=True)]) @ np.hstack([origins_b, ones]).T
         to_b = np.hstack([np.ones((len(o), 1)), o]) @ along_b.T
         s = (to_a - cosine * to_b) / sine2
         t = (cosine * to_a - to_b) / sine2
-        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ of_b.T) / np.sqrt(sine2)
+        gap = np.abs(np.hstack([u, np.cross(o, u)]) @ moments_b.T) / np.sqrt(sine2)
         tolerance = np.hypot(
             gates[0] * (a.offset + a.slope * np.abs(s)), gates[1] * (b.offset + b.slope * np.abs(t))
         )
         good = (gap <= tolerance) & (sine2 > budget.min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
-        if a.cloud is not None and a.cloud is b.cloud:  # which belong together is known
+        if a.cloud is not None and a.cloud is b.cloud:  # rays of one cloud point are known pairs
             good &= np.eye(len(u), len(b), k=start, dtype=np.bool_)
         pairs, allowed = np.argwhere(good) + np.array([start, 0]), tolerance[good]
         i, j = pairs.T
         on_a = a.origins[i] + s[good][:, None] * a.directions[i]
         on_b = b.origins[j] + t[good][:, None] * b.directions[j]
-        apart = gap[good] / allowed
-        off = np.clip(budget.by_gap * apart, budget.least_off, 1.0) * allowed / np.sqrt(sine2[good])
+        share = gap[good] / allowed
+        off = np.clip(budget.by_gap * share, budget.least_off, 1.0) * allowed / np.sqrt(sine2[good])
         sensors = np.broadcast_to([0, 1], pairs.shape)
-        yield TriangulatedPoints((on_a + on_b) / 2, off, apart, sensors, pairs)
+        yield TriangulatedPoints((on_a + on_b) / 2, off, share, sensors, pairs)
 
 
-def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
-    """The points that most sensors confirm, the closest first, each place once.
+def sort_by_support(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
+    """Sort points by the number of sensors that confirm them, then by errors; drop duplicates.
 
-    They are combined in this order (PROSAC, Chum and Matas, CVPR 2005).
+    Guesses combine them in this order (PROSAC, Chum and Matas, CVPR 2005).
     """
-    places, most = points.points, problem.budget.max_triples // 40  # the first of forty triples
+    places, most = points.points, problem.budget.max_triples // 40  # one of 40 triples
     first = np.argsort(points.gap, kind="stable")[:most]
-    if len(problem.cameras) > 2:  # else every feature is there once
-        (support, error), kept = np.zeros((2, len(places))), list[int]()
+    if len(problem.cameras) > 2:  # two cameras give no duplicates
+        (support, error), chosen = np.zeros((2, len(places))), list[int]()
         for sensor, _ in problem.cameras:
             y, seen = sensor.view.sensor.project(places)
-            away, _ = cKDTree(sensor.points).query(y)
-            met = seen & (away < problem.reach(sensor))
-            support += met
-            error[met] += away[met] / problem.reach(sensor)
-        left = np.ones(len(places), dtype=np.bool_)
-        beside = cKDTree(places).query_ball_point(places, points.tolerance, p=np.inf)
+            distances, _ = cKDTree(sensor.points).query(y)
+            is_met = seen & (distances < problem.reach(sensor))
+            support += is_met
+            error[is_met] += distances[is_met] / problem.reach(sensor)
+        is_unused = np.ones(len(places), dtype=np.bool_)
+        duplicates = cKDTree(places).query_ball_point(places, points.tolerance, p=np.inf)
         for k in np.lexsort((error, -support)):
-            if left[k] and len(kept) < most:
-                kept.append(k)
-                left[beside[k]] = False
-        first = np.array(kept, dtype=np.intp)
+            if is_unused[k] and len(chosen) < most:
+                chosen.append(k)
+                is_unused[duplicates[k]] = False
+        first = np.array(chosen, dtype=np.intp)
     return TriangulatedPoints._make(array[first] for array in points)
 
 
 def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
-    """Poses of triples of points, the most promising first."""
+    """Yield batches of poses from triples of points, the most promising first."""
     budget = problem.budget
     triangles = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
     for triples in point_triples(problem, points) if len(triangles[0]) else ():
-        yield partial(of_triples, problem, points, triangles, triples)
+        yield partial(poses_of_triples, problem, points, triangles, triples)
 
 
 @lru_cache(maxsize=16)
 def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices, cKDTree]:
-    """Ordered triples (K, 3) of features that span a triangle, and a tree of their sides (K, 3).
+    """Return ordered triples (K, 3) of features that span a triangle, and a tree of their sides.
 
-    Of `count` features far apart.  Left out are triangles whose height is a smaller share of the
-    longest side than `min_sine`, and all but the first of those that symmetries map to each other.
+    They are of `count` features far apart.  Left out are triangles of less height over longest
+    side than `min_sine`, and all but the first of those that symmetries map to each other.
     """
     few = np.sort(far_apart(body.means, count))
     corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -170,13 +170,13 @@ def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices,
 
 
 def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterator[Indices]:
-    """Batches of triples (K, 3) of points that share no ray, the most promising first."""
+    """Yield batches of triples (K, 3) of points that share no ray, the most promising first."""
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
-    # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
-    most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
-    k, i, j = np.ogrid[(slice(min(len(rays), most)),) * 3]
+    # so that n (n - 1) (n - 2) / 6 triples are about `max_triples`
+    limit = int(np.cbrt(6 * problem.budget.max_triples)) + 1
+    k, i, j = np.ogrid[(slice(min(len(rays), limit)),) * 3]
     triples = np.argwhere((i < j) & (j < k))[:, [1, 2, 0]]
-    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
+    # each triple leads to `2 * sample` triangles at most; batches grow to eight times the first
     size, end = problem.budget.batch // 32, 0
     while end < len(triples):
         start, end = end, end + min(max(end, size), 8 * size)
@@ -185,38 +185,38 @@ def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterato
         yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 
 
-def of_triples(
+def poses_of_triples(
     problem: SearchProblem,
     points: TriangulatedPoints,
     triangles: tuple[Indices, cKDTree],
     triples: Indices,
 ) -> Floats:
-    """Poses that bring triangles of features onto those of triples (K, 3) of points."""
+    """Return poses that bring triangles of features onto those of triples (K, 3) of points."""
     budget, body, (corners, tree) = problem.budget, problem.body, triangles
     if not (len(triples) and len(corners)):  # features on a line have no triangles
         return np.zeros((0, 4, 4))
-    # of a side between two features that give way
-    bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
+    # error of a side between two features that give way
+    bending = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
     sides, is_wide = _sides(points.points, triples, budget.min_sine)
-    slack = 2 * points.tolerance[triples].max(axis=1) + bent
-    possible = is_wide & (sides.max(axis=1) < tree.data.max() + slack)
-    triples, sides = triples[possible], sides[possible]
+    slack = 2 * points.tolerance[triples].max(axis=1) + bending
+    is_possible = is_wide & (sides.max(axis=1) < tree.data.max() + slack)
+    triples, sides = triples[is_possible], sides[is_possible]
     squares = points.tolerance[triples] ** 2
-    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bent**2)
-    away, index = tree.query(
+    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bending**2)
+    distances, index = tree.query(
         sides,
         k=np.arange(1, min(2 * budget.sample, len(corners)) + 1),
         distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
     )
-    which, rank = np.nonzero(np.isfinite(away))
+    which, rank = np.nonzero(np.isfinite(distances))
     chosen = index[which, rank]
-    alike = (np.abs(sides[which] - tree.data[chosen]) <= allowed[which]).all(axis=1)
-    features, world = corners[chosen[alike]], triples[which[alike]]
-    return align_triples(gathered(body.means, features.T), gathered(points.points, world.T))
+    is_alike = (np.abs(sides[which] - tree.data[chosen]) <= allowed[which]).all(axis=1)
+    features, world = corners[chosen[is_alike]], triples[which[is_alike]]
+    return align_triples(corners_of(body.means, features.T), corners_of(points.points, world.T))
 
 
 def _sides(points: Floats, triples: Indices, min_sine: float) -> tuple[Floats, Mask]:
-    """Sides (K, 3) of triangles, and whether their heights are such a share of the longest."""
+    """Return sides (K, 3) of triangles, and whether height over longest side exceeds `min_sine`."""
     sides = np.linalg.norm(points[triples[:, FIRST]] - points[triples[:, SECOND]], axis=2)
     a, b, c = np.sort(sides, axis=1).T
     # Heron's formula; twice the area is height times longest side
@@ -225,18 +225,18 @@ def _sides(points: Floats, triples: Indices, min_sine: float) -> tuple[Floats, M
 
 
 def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
-    """Poses with one point in space as each feature, point by point, the most promising first."""
+    """Yield batches of poses with one point in space as a feature, the most promising first."""
     for p in range(min(len(points.points), 2 * problem.budget.sample)):
-        yield partial(_of_point, problem, points, p)
+        yield partial(_poses_of_point, problem, points, p)
 
 
-def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
-    """For a point as each feature, where rays cut the spheres on which the others lie."""
+def _poses_of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
+    """Return poses with a point as each feature and two others where rays cut their spheres."""
     means, budget = problem.body.means, problem.budget
     features = means[far_apart(means, budget.sample)]
     distances = np.linalg.norm(features[:, None] - features, axis=-1)
     origins, directions, across, along, error, start = _rays_near(problem, points, p)
-    most, body, world = budget.batch // len(features), [], []
+    limit, body, world = budget.batch // len(features), [], []
     for i, distance in enumerate(distances):
         half2 = distance**2 - across[:, None] ** 2
         cuts = (half2 >= 0) | (np.abs(across[:, None] - distance) <= error[:, None])
@@ -247,35 +247,36 @@ def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Flo
         ahead = depth > start[ray]
         ray, feature, depth = ray[ahead], feature[ahead], depth[ahead]
         places = origins[ray] + depth[:, None] * directions[ray]
-        off = np.abs(cdist(places, places) - distances[np.ix_(feature, feature)])
+        errors = np.abs(cdist(places, places) - distances[np.ix_(feature, feature)])
         allowed = np.sqrt(0.5) * error[ray]
-        a, b = np.nonzero(off <= allowed + allowed[:, None])
-        apart = (a < b) & (ray[a] != ray[b]) & (feature[a] != feature[b])
-        a, b = a[apart], b[apart]
-        best = np.argsort(off[a, b], kind="stable")[:most]
+        a, b = np.nonzero(errors <= allowed + allowed[:, None])
+        is_distinct = (a < b) & (ray[a] != ray[b]) & (feature[a] != feature[b])
+        a, b = a[is_distinct], b[is_distinct]
+        best = np.argsort(errors[a, b], kind="stable")[:limit]
         a, b = a[best], b[best]
         body.append(features[np.stack([np.full(len(a), i), feature[a], feature[b]])])
         world.append(np.stack([np.full((len(a), 3), points.points[p]), places[a], places[b]]))
-    return align_triples(*(np.concatenate(one, axis=1).swapaxes(1, 2) for one in (body, world)))
+    return align_triples(*(np.concatenate(parts, axis=1).swapaxes(1, 2) for parts in (body, world)))
 
 
 def _rays_near(problem: SearchProblem, points: TriangulatedPoints, p: int) -> tuple[Floats, ...]:
-    """Rays that pass nearest to a point, without those that made it.
+    """Return the rays that pass nearest to a point, without those that made it.
 
-    Origins (R, 3), directions (R, 3), distances of the point across and along them, by how much a
-    place on them may be off, and where they start (R,).
+    The arrays are origins (R, 3), directions (R, 3), and (R,) each: distances of the point across
+    and along the ray, the largest error of a place on it, and where it starts.
     """
     parts = []
     for k, (sensor, rays) in enumerate(problem.cameras):
-        rest = rays.select(np.delete(np.arange(len(rays)), points.rays[p, points.sensors[p] == k]))
-        away = points.points[p] - rest.origins
-        along = (away * rest.directions).sum(axis=1)
-        across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
+        made_by = points.rays[p, points.sensors[p] == k]
+        other = rays.select(np.delete(np.arange(len(rays)), made_by))
+        arm = points.points[p] - other.origins
+        along = (arm * other.directions).sum(axis=1)
+        across = np.linalg.norm(arm - along[:, None] * other.directions, axis=1)
         error = np.hypot(
-            problem.reach(sensor) * (rest.offset + rest.slope * np.abs(along)), points.tolerance[p]
+            problem.reach(sensor) * (other.offset + other.slope * abs(along)), points.tolerance[p]
         )
-        start = np.full(len(rest), 0.0 if rest.central else -np.inf)
-        parts.append((rest.origins, rest.directions, across, along, error, start))
+        start = np.full(len(other), 0.0 if other.central else -np.inf)
+        parts.append((other.origins, other.directions, across, along, error, start))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     nearest = np.argsort(columns[2], kind="stable")[: 3 * problem.budget.sample]
     return tuple(column[nearest] for column in columns)

@@ -29,7 +29,7 @@ from mixpose.search import (
     SearchState,
     is_pointlike,
     search_frame,
-    sparse,
+    thinned,
 )
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.ranges import are_associated
@@ -173,7 +173,7 @@ def _around(frame: Frame, T_world_object: Floats, wide: Floats, kept: int) -> li
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    sparse_body = sparse(frame.body, 8 * frame.rules.search.sample)  # some features, far apart
+    sparse_body = thinned(frame.body, 8 * frame.rules.search.sample)  # some features, far apart
     descent = Descent(frame.views, sparse_body, frame.free, frame.rules.search)
     poses = np.concatenate([T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, kept), *stages])
@@ -210,7 +210,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         T_reference=frame.T_reference,
         rules=frame.rules.judgement,
         seed=frame.options.seed,
-        known=frame.gains,
+        log_prior=frame.gains,
     )
     among_moving, spent = list[Candidate](), SearchReport()
     moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)

@@ -29,7 +29,7 @@ from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
-from mixpose.search import is_pointlike, unlike
+from mixpose.search import distinct_poses, is_pointlike
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.rules import RangeRules
 
@@ -228,7 +228,7 @@ class AssociationLikelihood:
         frame, (ends, values, levels) = self.frame, self._climb(all_starts)
         order = np.argsort(-values, kind="stable")
         cell = 0.1 * min(frame.sigmas) / frame.body.radius
-        for k in order[unlike(frame.body, ends[order], cell, whole=True)]:
+        for k in order[distinct_poses(frame.body, ends[order], cell, whole=True)]:
             if values[k] > values[order[0]] - frame.rules.ranges.behind:
                 widths = np.outer(levels[k], frame.sigmas).tolist()
                 yield all_starts[k], Fit(ends[k], blurs_by_view(frame.views, widths))

@@ -131,7 +131,7 @@ def weighed_by_size(
         chances = sizes.cut(off, rules)
         deviations = np.where(chances > 0.5, moved, 0.0)
         cut = np.array([chances, moved]).T
-        known = pattern.erring(np.maximum(pattern.deviations, deviations), cut)
+        known = pattern.with_errors(np.maximum(pattern.deviations, deviations), cut)
         seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
 

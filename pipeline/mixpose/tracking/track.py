@@ -21,7 +21,7 @@ from mixpose.judgement import (
     nearest_alike,
 )
 from mixpose.objective import View
-from mixpose.records import DelaySeen, Floats, Mask
+from mixpose.records import DelayEstimate, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Distances, MotionFilter, MotionRules, RandomWalk, per_kind
@@ -85,11 +85,11 @@ class DelayEvidence:
     unknown_s: float = constant(0.1, "standard deviation of a delay of which nothing is known")
 
     @cached_property
-    def seconds(self) -> Mapping[str, DelaySeen]:
+    def seconds(self) -> Mapping[str, DelayEstimate]:
         """Return the estimated delay of each sensor with its standard deviation."""
         inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / self.unknown_s**2)
         delays, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
-        return dict(zip(self.names, map(DelaySeen, delays.tolist(), deviations.tolist())))
+        return dict(zip(self.names, map(DelayEstimate, delays.tolist(), deviations.tolist())))
 
     def applied(self, views: Sequence[View], time_s: float | None) -> list[View]:
         """Return views with their estimated delays; without any where the frame has no time."""
@@ -98,7 +98,7 @@ class DelayEvidence:
         applied = list(views)
         for k, view in enumerate(views):
             if view.unsure is not None:
-                delay = self.seconds.get(view.name, DelaySeen(0.0, self.unknown_s))
+                delay = self.seconds.get(view.name, DelayEstimate(0.0, self.unknown_s))
                 applied[k] = replace(
                     view,
                     delay=view.delay + delay.seconds,
