@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +13,8 @@ from mixpose.cli import app_after
 from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
 from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, option, taking
+from mixpose.cli.request import RunRequest, Sources
+from mixpose.cli.words import AllowCode, Recordings, SessionFile, option, taking
 
 app = typer.Typer(
     name="mixpose",
@@ -43,119 +44,6 @@ def _common(
     pass
 
 
-Sources = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=PATH",
-        help="Another recording of a sensor, relative to the working folder, or the number of a "
-        "camera; repeatable.",
-    ),
-]
-
-
-@dataclass(frozen=True)
-class RunWords:
-    """Estimate a pose per frame."""
-
-    context: typer.Context
-    sessions: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SESSION.toml...",
-            help="One session file or several, patterns such as 'day*/session.toml', or text files "
-            "(.txt) with one to a line.",
-        ),
-    ]
-    output: Path | None = option(
-        None,
-        "Write poses here, not to stdout (-), in the format that the suffix tells. With "
-        "several sessions, a folder in which each gets its own for poses, log and status; what "
-        "is done there already is not done again.",
-        "-o",
-        "--output",
-    )
-    format: Format | None = option(
-        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
-    )
-    source: Sources = None
-    start: int | None = option(None, "First frame number.")
-    stop: int | None = option(None, "Frame number to stop before.")
-    step: int = option(1, "Take every N-th frame number.", min=1)
-    resume: bool = option(False, "Go on after the last frame in the output.")
-    workers: int = option(1, "How many sessions are run at a time.", min=1)
-    overlay: Path | None = option(
-        None, "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
-    )
-    view: str | None = option(
-        None,
-        "Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
-        "opens it to others who have the address with its token.",
-        metavar="[PORT]",
-    )
-    pause: bool = option(False, "With --view, on files: begin paused, to go on from the page.")
-    scheduler: str | None = option(
-        None,
-        "Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
-        "local for one on this machine.",
-        metavar="ADDRESS",
-    )
-    labels: bool = option(
-        False,
-        "Say in each pose line which detection is which feature, and where features are in "
-        "space by these alone; .jsonl only.",
-    )
-    publish: list[str] | None = option(
-        None,
-        "Send each pose to another program too: udp://host:port, tcp://host:port, "
-        "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
-        "'?only=ok' none but those that are ok; repeatable.",
-        metavar="URL",
-    )
-    predict: float | None = option(
-        None, "Publish where the body will be so much after each frame.", metavar="SECONDS"
-    )
-    allow_code: AllowCode = False
-
-
-def run(words: RunWords) -> None:
-    """Run one session here, or many in processes of their own, as was asked for."""
-    from mixpose.cli.request import RunRequest, format_of, output_of  # noqa: PLC0415
-    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
-    from mixpose.errors import SessionError  # noqa: PLC0415
-    from mixpose.selection import Selection  # noqa: PLC0415
-
-    sessions, output = words.sessions, output_of(words.output)
-    many = are_many(sessions, words.scheduler)
-    # of many: a folder
-    written = (words.format or "jsonl") if many else format_of(output, words.format)
-    shared = {one.name for one in fields(RunRequest)}
-    given = {
-        **{name: value for name, value in vars(words).items() if name in shared},
-        "output": output,
-        "format": written,
-        "sources": tuple(words.source or ()),
-        "selection": Selection(words.start, words.stop, words.step),
-        "publish": tuple(words.publish or ()),
-        "debug": bool(words.context.obj),
-    }
-    request = RunRequest(**given)
-    if words.labels and written != "jsonl":
-        raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
-    if many and (words.publish or words.predict is not None):
-        raise SessionError(
-            "--publish: found several sessions; allowed is one, whose poses receivers take for one "
-            "recording"
-        )
-    if many:
-        raise typer.Exit(run_sessions(sessions_of(sessions), request, words.workers))
-    from mixpose.cli.notices import warn  # noqa: PLC0415
-    from mixpose.cli.run import run_session  # noqa: PLC0415
-
-    if words.workers > 1:
-        warn(f"--workers {words.workers}: one session is one process, frames follow each other")
-    run_session(Path(sessions[0]), request)
-
-
 @dataclass(frozen=True)
 class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
@@ -181,7 +69,7 @@ class InspectRequest:
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "run": taking(RunWords, run),
+    "run": taking(RunRequest, "several:run"),
     "check": taking(CheckRequest, "check:check_session"),
     "inspect": taking(InspectRequest, "inspect:inspect_frame"),
     "import": taking(ImportRequest, "importing:import_files"),

@@ -101,8 +101,8 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
                 f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
                 "and name another file with -o"
             )
-    poses, wanted = request.output, request.selection
-    if poses is None or request.format != "jsonl":
+    poses, wanted = request.poses, request.selection
+    if poses is None or request.format_name != "jsonl":
         raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
     if not poses.is_file():
         return Continuation(None, wanted)

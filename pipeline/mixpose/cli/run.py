@@ -27,22 +27,22 @@ from mixpose.tracking import Foreseen
 from mixpose.tracking.proposers import predicted
 
 
-def run_session(path: Path, request: RunRequest) -> None:
+def run_session(request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 
     Raises SessionError if the session or the options are wrong. Raises RecordingError if the
     recording cannot be read; frames already estimated stay written.
     """
     with ExitStack() as pages:  # what outlives the poses
-        _run_session(path, request, pages)
+        _run_session(request, pages)
 
 
-def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
-    session = load_session(path, allow_code=request.allow_code)
-    replaced = named_sources(request.sources)
+def _run_session(request: RunRequest, pages: ExitStack) -> None:
+    session = load_session(request.sessions[0], allow_code=request.allow_code)
+    replaced = named_sources(request.source or ())
     header = header_of(session, replaced, request.options)
     opened = open_sources(session, replaced)
-    outputs = written_paths(request.output, request.format, header.labels)
+    outputs = written_paths(request.poses, request.format_name, header.labels)
     for each in outputs:
         if not _is_device(each):
             refuse_to_overwrite(each, _inputs(session))
@@ -50,12 +50,14 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     if request.resume:
         go_on = continuation(request, header, opened)
     if go_on.is_done:
-        say(f"nothing left to do: {request.output} has all frames asked for already")
+        say(f"nothing left to do: {request.poses} has all frames asked for already")
         return
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = pose_output(request.output, request.format, header, header.labels, goes_on=go_on.file)
+    output = pose_output(
+        request.poses, request.format_name, header, header.labels, goes_on=go_on.file
+    )
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, go_on.there)
         watch = _each(
@@ -77,7 +79,7 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
         )
         stack.enter_context(closing(estimates))
         notes = stack.enter_context(_notes(request))
-        shown = _with_progress(estimates, session, quiet=request.output is None)
+        shown = _with_progress(estimates, session, quiet=request.poses is None)
         for estimate in filter(is_new, shown):
             output.write(estimate)
             is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
@@ -93,10 +95,11 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
 @contextmanager
 def _notes(request: RunRequest) -> Iterator[Notes | None]:
     """What writes down where the run could go on; gone when the recording is done."""
-    if request.output is None or request.format != "jsonl" or _is_device(request.output):
+    poses = request.poses
+    if poses is None or request.format_name != "jsonl" or _is_device(poses):
         yield None
         return
-    notes = Notes(request.output, __version__)
+    notes = Notes(poses, __version__)
     try:
         yield notes
     except BaseException:

@@ -39,10 +39,11 @@ def option(default: Any, meaning: str, *names: str, panel: str | None = None, **
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
-def taking(request: type, work: Callable[[Any], None] | str) -> Callable[..., None]:
+def taking(request: type, work: str) -> Callable[..., None]:
     """A command whose arguments and options are the fields of a record, and its docstring the help.
 
-    The record goes to `work`, or to that ``module:function`` of this room, imported when called.
+    The record goes to that ``module:function`` of this room, imported when called. A field `debug`
+    is whether all that is known of errors is wanted, which may be asked of any command.
     """
     hints: dict[str, Any] = get_type_hints(request, include_extras=True)
     for one in fields(request):
@@ -52,14 +53,15 @@ def taking(request: type, work: Callable[[Any], None] | str) -> Callable[..., No
                 names = (f"--{one.name.replace('_', '-')}",)
             hints[one.name] = Annotated[kind, typer.Option(*names, **one.metadata["settings"])]
     form = signature(request)
+    if "debug" in hints:
+        hints["debug"] = typer.Context  # which has it
     typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
 
     def called(**given: Any) -> None:
-        function = work
-        if isinstance(function, str):
-            module, _, name = function.partition(":")
-            function = getattr(import_module(f"mixpose.cli.{module}"), name)
-        function(request(**given))
+        module, _, name = work.partition(":")
+        if "debug" in given:
+            given["debug"] = bool(given["debug"].obj)
+        getattr(import_module(f"mixpose.cli.{module}"), name)(request(**given))
 
     called.__doc__, called.__annotations__ = request.__doc__, hints
     called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
