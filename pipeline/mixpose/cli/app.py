@@ -11,10 +11,13 @@ import typer
 
 from mixpose.cli import app_after
 from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
-from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
 from mixpose.cli.request import RunRequest, Sources
 from mixpose.cli.words import AllowCode, Recordings, SessionFile, option, taking
+
+MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
+IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
+"""Groups of the options of ``mixpose simulate``."""
 
 app = typer.Typer(
     name="mixpose",
@@ -66,6 +69,73 @@ class InspectRequest:
     )
     source: Recordings = None
     allow_code: AllowCode = False
+
+
+@dataclass(frozen=True)
+class SimulateRequest:
+    """Render a recording with truth.jsonl that `run` can play."""
+
+    session: SessionFile
+    output: Path = option(..., "New folder for the recording.", "-o", "--output")
+    frames: int = option(..., "Number of frames.", min=1)
+    seed: int = option(0, "Same seed, same recording.", min=0)
+    fps: float | None = option(
+        None, "Frames per second; for poses with times put fps into the session.", panel=TIME
+    )
+    noise: float = option(2.0, "Camera noise, grey levels.", panel=IMAGES)
+    clutter: float = option(0.0, "False features per frame and sensor.", panel=IN_VIEW)
+    hidden: float = option(0.0, "Chance that a feature is hidden.", panel=IN_VIEW)
+    missing: float = option(0.0, "Chance that a sensor has no frame.", panel=TIME)
+    brightness: float = option(170.0, "Peak of a spot, grey levels.", panel=IMAGES)
+    brightness_spread: float = option(
+        0.1, "Spread of the brightness over the features, as a share.", panel=IMAGES
+    )
+    amplitude_translation: float | None = option(
+        None, "Largest displacement along each axis, length units.", "--translation", panel=MOTION
+    )
+    amplitude_rotation_deg: float = option(
+        20.0, "Largest turn about each axis, degrees.", "--rotation", panel=MOTION
+    )
+    period_s: float = option(
+        4.0, "Seconds in which the motion comes round.", "--period", panel=MOTION
+    )
+    pixel_noise: float = option(0.1, "Error of detections in a camera's table, px.", panel=TABLES)
+    range_noise: float | None = option(
+        None, "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
+    )
+    range_snr: float = option(30.0, "Height of a profile's peak over its noise.", panel=TABLES)
+    deform: bool = option(
+        False, "Displace features by the spread the object states.", panel=IN_VIEW
+    )
+    readout: float | None = option(
+        None, "Seconds from a camera's first row to its last; else the session's.", panel=TIME
+    )
+    exposure: float | None = option(
+        None, "Seconds for which a row is lit; else the session's.", panel=TIME
+    )
+    delay: list[str] | None = option(
+        None, "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
+    )
+    out_of_step: float = option(
+        0.0, "Seconds from the first sensor to the last, in their times.", panel=TIME
+    )
+    lamps: int = option(0, "Lamps behind the body.", min=0, panel=IN_VIEW)
+    mirror: float = option(
+        0.0, "Brightness of mirror images in a table below, as a share.", panel=IN_VIEW
+    )
+    others: int = option(
+        0, "Other bodies with as many markers, beside this one.", min=0, panel=IN_VIEW
+    )
+    occluder: int = option(0, "Dark bars that swing before it.", min=0, panel=IN_VIEW)
+    jpeg: int | None = option(None, "Quality of lossy compression.", min=1, max=100, panel=IMAGES)
+    bayer: bool = option(False, "Images of a colour sensor, interpolated.", panel=IMAGES)
+    turned_camera_deg: float = option(
+        0.0, "Degrees by which the last camera was turned meanwhile.", "--turned-camera", panel=TIME
+    )
+    away_from: int | None = option(
+        None, "Frames after which the body is gone.", min=0, panel=MOTION
+    )
+    overwrite: bool = option(False, "Replace a recording in the folder.")
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {

@@ -6,7 +6,7 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-from mixpose.cli.cut import cut_message
+from mixpose.cli import cut_message
 from mixpose.errors import SessionError
 
 GROUPS = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import fields
 
-from mixpose.cli.app_simulate import SimulateRequest
+from mixpose.cli.app import SimulateRequest
 from mixpose.cli.notices import bar, warn
 from mixpose.cli.output import refuse_stdout
 from mixpose.errors import SessionError
