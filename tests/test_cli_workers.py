@@ -182,7 +182,7 @@ def test_a_pattern_names_sessions_and_one_that_matches_none_is_told(tmp_path: Pa
 
 @pytest.mark.usefixtures("done_at_once")
 def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
-    job = Job(str(CAMERAS), "ab", str(tmp_path), "beams", "poses.jsonl", ("--stop=1",), "0", True)
+    job = Job("beams", str(CAMERAS), "ab", ("--stop=1",), "0", str(tmp_path), "poses.jsonl", True)
     first, second = run_job(job), run_job(replace(job, mixpose="1"))
     assert first.state == second.state == "done"
     assert finished(job) is None  # of another version: done again
@@ -194,7 +194,7 @@ def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
-    job = Job(str(tmp_path / "no.toml"), "", str(tmp_path), "no", "poses.jsonl", (), "0", True)
+    job = Job("no", str(tmp_path / "no.toml"), "", (), "0", str(tmp_path), "poses.jsonl", True)
     outcome = run_job(job)
     assert outcome.state == "failed"
     assert "a folder that all workers see under the same name" in str(outcome.reason)
@@ -343,7 +343,7 @@ def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
 
 
 def job_of(folder: Path, *options: str) -> Job:
-    return Job(str(RANGES), "ab", str(folder), "ranges", "poses.jsonl", options, "0")
+    return Job("ranges", str(RANGES), "ab", options, "0", str(folder), "poses.jsonl")
 
 
 def begun(folder: Path, job: Job) -> Path:

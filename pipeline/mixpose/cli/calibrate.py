@@ -17,7 +17,7 @@ from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.writing import MARK, calibrated_text
-from mixpose.cli.app_before import CalibrateRequest
+from mixpose.cli.app import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
 from mixpose.cli.output import (
     is_stdout,
@@ -57,7 +57,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
         refuse_lost_code(session, output)
         if request.world is not None:
             refuse_held(session)
-    inputs = [path] if request.poses is None else [path, request.poses]
+    inputs = path, request.poses
     for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
             refuse_to_overwrite_but(written, inputs, mark, option)
@@ -76,7 +76,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
 
 @contextmanager
 def _calibrated(
-    session: Session, request: CalibrateRequest, inputs: Sequence[Path]
+    session: Session, request: CalibrateRequest, inputs: Sequence[Path | None]
 ) -> Iterator[Calibration]:
     """Calibrate, for as long as what comes of it is written."""
     rules = CalibrationRules()

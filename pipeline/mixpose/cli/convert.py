@@ -10,7 +10,7 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
@@ -70,7 +70,7 @@ def convert_poses(request: ConvertRequest) -> None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
         many = len(lines) if name in ("jsonl", "csv", "rerun") else posed
-        say(f"{many} pose{'s' * (many != 1)} -> {', '.join(map(str, outputs))}")
+        say(f"{counted(many, 'pose')} -> {', '.join(map(str, outputs))}")
 
 
 def _write(
@@ -217,6 +217,6 @@ def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseL
     answers = Counter((line.frame, line.label) for line in lines)
     several = sum(count > 1 for count in answers.values())
     if several:
-        count = f"{several} frame{'s' * (several != 1)}"
-        warn(f"{poses.path}: several right answers in {count}; the first is written")
+        frames = counted(several, "frame")
+        warn(f"{poses.path}: several right answers in {frames}; the first is written")
     return first_answers(lines)

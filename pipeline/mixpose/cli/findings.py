@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
-from mixpose.cli.body_size import BodySize, size_warnings
-from mixpose.cli.marker_offsets import MOVED, Marker, add_markers, marker_lines
+from mixpose.cli import marker_offsets as offsets
+from mixpose.cli.marker_offsets import BodySize, Marker
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
@@ -151,7 +151,7 @@ class Findings:
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
-            add_markers(self._markers.setdefault(estimate.label, {}), estimate)
+            offsets.add_markers(self._markers.setdefault(estimate.label, {}), estimate)
             if estimate.label in self._sizes:
                 self._sizes[estimate.label].add(estimate)
 
@@ -179,7 +179,7 @@ class Findings:
 
     def causes(self) -> list[str]:
         """What of the session or the bodies is most likely at fault, a line each."""
-        sizes = size_warnings(self._sizes)
+        sizes = offsets.size_warnings(self._sizes)
         # a body of another size is met off at all of its markers
         return [*self._of_doubts(), *(sizes or self._of_markers())]
 
@@ -212,7 +212,7 @@ class Findings:
                     "which contradicts the others: frozen, or frames doubled?"
                 )
         far = {name: each for name, each in self._far.items() if each.longest >= _LONG}
-        if far and any(line.endswith(MOVED) for line in self._of_markers()):
+        if far and any(line.endswith(offsets.MOVED) for line in self._of_markers()):
             far = {}  # what one marker makes is said of it
         for name, each in far.items():
             lines.append(
@@ -295,5 +295,5 @@ class Findings:
             if label not in bodies:
                 continue
             of = f" of {label!r}" if len(self._session.labels) > 1 else ""
-            lines += marker_lines(markers, bodies[label].labels, of, self._session.unit)
+            lines += offsets.marker_lines(markers, bodies[label].labels, of, self._session.unit)
         return lines

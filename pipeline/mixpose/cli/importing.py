@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mixpose.checking import key_warnings, with_image_sizes
-from mixpose.cli.app_before import ImportRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.app import ImportRequest
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import is_stdout, shown, write_text
 from mixpose.errors import SessionError
 from mixpose.importing import Imported, gather, session_text
@@ -30,10 +30,10 @@ def import_files(request: ImportRequest) -> None:
         warn(warning)
     if not imported.bodies:
         warn("no file of a body is among them: [object] is an example, put in your markers")
-    count = len(imported.cameras)
+    cameras = counted(len(imported.cameras), "camera")
     names = ", ".join(camera.name for camera in imported.cameras)
     say(
-        f"{count} camera{'s' * (count != 1)} ({names}), lengths in {unit} -> {shown(output)}; now "
+        f"{cameras} ({names}), lengths in {unit} -> {shown(output)}; now "
         "add the source of each sensor"
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mixpose.cli.app_before import LearnRequest
+from mixpose.cli.app import LearnRequest
 from mixpose.cli.notices import say, warn, watched
 from mixpose.cli.output import (
     is_stdout,
@@ -33,7 +33,7 @@ def learn_session(request: LearnRequest) -> None:
     """
     path = request.session
     session = load_scene(path, allow_code=request.allow_code)
-    inputs = [path] if request.like is None else [path, request.like]
+    inputs = path, request.like
     refuse_to_overwrite_but(request.output, inputs, MARK)
     refuse_suffix(request.output, "-o", (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)

@@ -63,13 +63,18 @@ def warn_of_sources(
             warn(f"sensor {name!r}: {caution}")
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something, in words."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
     """How many frames there were, and how many poses of theirs came to which status."""
     count = sum(statuses.values()) // bodies
     of = f" of {bodies} bodies" if bodies > 1 else ""
     words = ("ok", "ambiguous", "lost")
     parts = [f"{statuses[word]} {word}" for word in words if statuses.get(word)]
-    return f"{count} frame{'s' * (count != 1)}{of}: {', '.join(parts) or 'none'}"
+    return f"{counted(count, 'frame')}{of}: {', '.join(parts) or 'none'}"
 
 
 def told_frames(line: str) -> tuple[dict[str, int], int] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -95,31 +95,13 @@ class Output(ExitStack):
 
 
 class OutputPerBody(ExitStack):
-    """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
-
-    ``poses.tum`` stands for ``poses.<body>.tum``, whose output `start` makes. Raises SessionError
-    if there is no path.
-    """
+    """Writes the poses of each body, by its label, to an output of its own."""
 
     file: LineFile | None = None
 
-    def __init__(
-        self,
-        path: Path | None,
-        format_name: str,
-        labels: Sequence[str],
-        start: Callable[[Path], Output],
-    ) -> None:
+    def __init__(self, outputs: Mapping[str, Output]) -> None:
         super().__init__()
-        if path is None:
-            raise SessionError(
-                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
-                "with -o: each body gets one with its own name in it"
-            )
-        self._outputs = {
-            label: self.enter_context(start(own))
-            for label, own in zip(labels, _body_paths(path, labels), strict=True)
-        }
+        self._outputs = {label: self.enter_context(each) for label, each in outputs.items()}
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame of one body, at once."""
@@ -142,11 +124,21 @@ def pose_output(
     options: Mapping[str, int | str] | None = None,
     whole: bool = False,
 ) -> Output | OutputPerBody:
-    """Where the poses of bodies go, as `Output` says; to a file each where the format needs it."""
+    """Where the poses of bodies go, as `Output` says.
+
+    Where the format needs a file for each, ``poses.tum`` stands for ``poses.<body>.tum``. Raises
+    SessionError if there is no path then.
+    """
     start = partial(Output, format_name=format_name, header=header, options=options, whole=whole)
-    if _is_apart(format_name, labels):
-        return OutputPerBody(path, format_name, labels, start)
-    return start(path, goes_on=goes_on)
+    if not _is_apart(format_name, labels):
+        return start(path, goes_on=goes_on)
+    if path is None:
+        raise SessionError(
+            f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
+            "with -o: each body gets one with its own name in it"
+        )
+    own = zip(labels, _body_paths(path, labels), strict=True)
+    return OutputPerBody({label: start(each) for label, each in own})
 
 
 def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
@@ -176,7 +168,7 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def refuse_to_overwrite_but(
-    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o", *, begins: str = ""
+    path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
     """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
     it; standard output is.
@@ -191,7 +183,7 @@ def refuse_to_overwrite_but(
         raise _foreign(path, option)
 
 
-def _beginning(path: Path, inputs: Iterable[Path], option: str = "-o") -> str:
+def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") -> str:
     """The first characters of a file that may be in the way; none where no file is."""
     if not path.parent.is_dir():
         raise SessionError(f"{option} {path}: there is no folder {path.parent}")
@@ -199,7 +191,7 @@ def _beginning(path: Path, inputs: Iterable[Path], option: str = "-o") -> str:
         raise SessionError(f"{option} {path}: is a folder; name a file")
     if not path.is_file():
         return ""
-    if any(each.exists() and path.samefile(each) for each in inputs):
+    if any(each is not None and each.exists() and path.samefile(each) for each in inputs):
         raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")

@@ -13,7 +13,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.cli.app_after import ConvertRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError, require_package
 from mixpose.frames import Source
@@ -69,7 +69,7 @@ def write_markers(
     frames, markers = told.is_known.shape
     known, found = told.is_known.sum(), told.is_measured.sum()
     say(
-        f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
+        f"{counted(markers, 'marker')} in {counted(frames, 'frame')}: "
         f"{found} places measured, {known - found} by the pose, "
         f"{told.is_known.size - known} gaps -> {output}"
     )

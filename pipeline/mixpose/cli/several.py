@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import glob
 import hashlib
-import json
 import os
 import shutil
 from collections import Counter
@@ -23,7 +22,7 @@ import typer
 
 from mixpose import __version__
 from mixpose.cli import recording_job
-from mixpose.cli.notices import frames_text, say, warn
+from mixpose.cli.notices import counted, frames_text, say, warn
 from mixpose.cli.recording_job import DONE, FAILED, INTERRUPTED, UNFINISHED, Job, Outcome, run_job
 from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError, reporting
@@ -170,7 +169,7 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-    return replace(recording_job.outcome_of(job, FAILED, 3), reason=reason, host="")
+    return replace(recording_job.outcome_of(job, FAILED, 3, reason), host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
@@ -236,7 +235,7 @@ def _beginning(path: Path) -> bytes:
 def _folder(folder: Path | None, count: int) -> Path:
     if folder is None:
         raise SessionError(f"-o DIR: missing; {count} sessions need a folder for the poses")
-    sessions = f"{count} session{'s' * (count != 1)}"
+    sessions = counted(count, "session")
     if folder.exists() and not folder.is_dir():
         raise SessionError(f"-o {folder}: is a file; {sessions} need a folder for the poses")
     if not folder.exists() and folder.name.casefold().endswith((*SUFFIXES, ".rrd")):
@@ -266,8 +265,8 @@ def _line(outcome: Outcome) -> str:
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
     text = frames_text(outcome.frames, outcome.bodies)
-    many = outcome.warnings
-    return f"{text}; {many} warning{'s' * (many != 1)} in its log" if many else text
+    warnings = f"; {counted(outcome.warnings, 'warning')} in its log" if outcome.warnings else ""
+    return text + warnings
 
 
 def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> None:
@@ -279,9 +278,7 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> Non
         "not_done": asked - states[DONE] - states[FAILED],
         "results": [asdict(outcome) for outcome in outcomes],
     }
-    with appearing_whole(folder / SUMMARY) as part:
-        text = json.dumps(summary, indent=1, ensure_ascii=False)
-        part.write_text(text + "\n", encoding="utf-8")
+    recording_job.write_json(folder / SUMMARY, summary)
     with appearing_whole(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as f:
         table = csv.writer(f, lineterminator="\n")
         table.writerow(_COLUMNS)
@@ -293,10 +290,9 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> Non
 def _say_all(folder: Path, outcomes: Sequence[Outcome]) -> int:
     """Say how many are done, and once more which failed; the largest exit status."""
     failed = [outcome for outcome in outcomes if outcome.state == FAILED]
-    count = f"{len(outcomes)} recording{'s' * (len(outcomes) != 1)}"
     done = sum(outcome.state == DONE for outcome in outcomes)
     parts = f"{done} done" + (f", {len(failed)} failed" if failed else "")
-    say(f"{count}: {parts} -> {folder / TABLE}")
+    say(f"{counted(len(outcomes), 'recording')}: {parts} -> {folder / TABLE}")
     if any(outcome.state == INTERRUPTED for outcome in outcomes):
         raise KeyboardInterrupt
     return max((outcome.exit_status for outcome in outcomes), default=0)

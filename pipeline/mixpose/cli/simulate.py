@@ -6,7 +6,7 @@ import sys
 from dataclasses import fields
 
 from mixpose.cli.app import SimulateRequest
-from mixpose.cli.notices import bar, warn
+from mixpose.cli.notices import bar, counted, warn
 from mixpose.cli.output import refuse_stdout
 from mixpose.errors import SessionError
 from mixpose.session import load_session
@@ -52,7 +52,7 @@ def simulate_session(request: SimulateRequest) -> None:
         typed = {one.name: one.metadata.get("names", ()) for one in fields(SimulateRequest)}
         told = [next(iter(typed[name]), f"--{name.replace('_', '-')}") for name in unused]
         warn(f"{', '.join(told)}: no sensor or body of this session has what that is about")
-    count = f"{options.frames} frame{'s' * (options.frames != 1)}"
+    count = counted(options.frames, "frame")
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr
     )

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.publishing.address import Address
-from mixpose.publishing.message import Message, Sender
+from mixpose.publishing.message import Address, Message, Sender
 
 if TYPE_CHECKING:
     from pylsl import StreamOutlet

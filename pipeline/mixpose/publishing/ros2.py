@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mixpose.poses.header import Header
 from mixpose.poses.ros import pose_message
-from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, path_word, path_words
+from mixpose.publishing.message import Address, Message, Sender, path_word, path_words
 from mixpose.publishing.sockets import connected, force_down
 
 if TYPE_CHECKING:
