@@ -171,17 +171,14 @@ def marker_lines(
         typical = float(np.median(others)) if i in means and len(others) > 1 else np.inf
         if text := marker.oddness(typical, unit):
             told.setdefault(text, []).append(i)
-    return [_of_some(text, some, labels, of) for text, some in told.items()]
-
-
-def _of_some(text: str, numbers: Sequence[int], labels: Sequence[str], of: str) -> str:
-    """What is odd about markers (their numbers, rising) that have it in common."""
-    names = [labels[i] for i in numbers]
-    if len(names) == 1:
-        return f"marker {names[0]}{of} is {text}"
-    in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
-    called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
-    return f"markers {called}{of} are each {text}"
+    lines = []
+    for text, numbers in told.items():  # which rise
+        names = [labels[i] for i in numbers]
+        in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
+        called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
+        several = len(names) > 1
+        lines.append(f"marker{'s' * several} {called}{of} {'are each' if several else 'is'} {text}")
+    return lines
 
 
 class BodySize:
