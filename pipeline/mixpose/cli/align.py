@@ -29,8 +29,8 @@ MARK = "# Aligned by mixpose"
 def align_session(request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
-    Raises SessionError if the session or the options are wrong, or directions of the world are
-    held in it. Raises RecordingError if the poses tell no floor.
+    Raises SessionError if directions of the world are held in it, and RecordingError if the poses
+    tell no floor.
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)

@@ -59,13 +59,9 @@ class ImportRequest:
             "and bodies: .csv, .rom, .vsk or .obj.",
         ),
     ]
-    output: Path = option(
-        ..., "The session file, which must be new; or stdout (-).", "-o", "--output"
-    )
-    unit: Unit = option("mm", "Unit of lengths in the session.")
-    lengths: Unit | None = option(
-        None, "Unit of translations in files whose format does not fix it."
-    )
+    output: Path = option("The session file, which must be new; or stdout (-).", ...)
+    unit: Unit = option("Unit of lengths in the session.", "mm")
+    lengths: Unit | None = option("Unit of translations in files whose format does not fix it.")
 
 
 @dataclass(frozen=True)
@@ -74,13 +70,12 @@ class CalibrateRequest:
 
     session: SessionFile
     output: Path | None = option(
-        None, "The calibrated session; or stdout (-).", "-o", "--output", metavar="CALIBRATED.toml"
+        "The calibrated session; or stdout (-).", metavar="CALIBRATED.toml"
     )
     poses: Path | None = option(
-        None, "Known poses of the body; else none is known.", metavar="POSES.jsonl"
+        "Known poses of the body; else none is known.", metavar="POSES.jsonl"
     )
     free: list[str] | None = option(
-        None,
         "What is sought: pose, focal, principal_point, distortion, delay, drift, "
         "position, range_bias, of a sensor or, without its name, of all; or body, the marker "
         "coordinates. Repeatable. Else the poses of all cameras but the first and the "
@@ -88,13 +83,13 @@ class CalibrateRequest:
         metavar="SENSOR:WHAT",
     )
     length: str | None = option(
-        None, "A known distance, which gives scale.", metavar="SENSOR:SENSOR=LENGTH"
+        "A known distance, which gives scale.", metavar="SENSOR:SENSOR=LENGTH"
     )
     world: str | None = option(
-        None, "Whose frame becomes the world; else it stays.", metavar="SENSOR|body@FRAME"
+        "Whose frame becomes the world; else it stays.", metavar="SENSOR|body@FRAME"
     )
-    check: bool = option(False, "Only say whether the calibration still holds.")
-    report: Path | None = option(None, "A page with pictures; or stdout (-).", metavar="FILE.html")
+    check: bool = option("Only say whether the calibration still holds.", False)
+    report: Path | None = option("A page with pictures; or stdout (-).", metavar="FILE.html")
     source: Recordings = None
     allow_code: AllowCode = False
 
@@ -105,21 +100,17 @@ class LearnRequest:
 
     session: SessionFile
     output: Path = option(
-        ...,
         "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
         "one may go to stdout (-).",
-        "-o",
-        "--output",
+        ...,
         metavar="BODY.csv",
     )
     axes: str | None = option(
-        None,
         "Three markers by name: the origin, one on the x axis, one in the x-y plane. Else "
         "the middle of all markers and their principal axes.",
         metavar="ORIGIN,X,Y",
     )
     like: Path | None = option(
-        None,
         "An older or measured table of the same markers, whose axes and names are kept.",
         metavar="OLD.csv",
     )
@@ -137,40 +128,30 @@ class DesignRequest:
             metavar="SESSION.toml", help="One system or several; others are held to the first."
         ),
     ]
-    poses: Path | None = option(
-        None, "Judge at these poses, not over a volume.", metavar="POSES.jsonl"
-    )
-    count: int = option(24, "Number of poses in the volume.", min=1, max=2000)
+    poses: Path | None = option("Judge at these poses, not over a volume.", metavar="POSES.jsonl")
+    count: int = option("Number of poses in the volume.", 24, min=1, max=2000)
     volume: str | None = option(
-        None,
         "Sides of the box around [start] or the middle of the view; else twice the body's radius.",
         metavar="X,Y,Z",
     )
     turn: float | None = option(
-        None, "Turn the body by up to so many degrees; else 20 about [start], or 180."
+        "Turn the body by up to so many degrees; else 20 about [start], or 180."
     )
-    tip: str | None = option(
-        None, "Judge a point of the body, in its coordinates.", metavar="X,Y,Z"
-    )
+    tip: str | None = option("Judge a point of the body, in its coordinates.", metavar="X,Y,Z")
     noise: list[str] | None = option(
-        None,
         "What features err by, px or length; SYSTEM:SENSOR=NUMBER for one system, * for "
         "every sensor; else 0.2 of sigma for cameras, sigma for ranges.",
         metavar="SENSOR=NUMBER",
     )
-    monte_carlo: int = option(0, "Simulate and estimate so many frames of each system.", min=0)
-    seed: int = option(0, "Same seed, same study.", min=0)
+    monte_carlo: int = option("Simulate and estimate so many frames of each system.", 0, min=0)
+    seed: int = option("Same seed, same study.", 0, min=0)
     tolerance: float | None = option(
-        None,
-        "Markers of two bodies lie alike within this; else 10 % of the radius.",
-        min=0,
-        max=1e9,
+        "Markers of two bodies lie alike within this; else 10 % of the radius.", min=0, max=1e9
     )
-    json: Path | None = option(None, "Write all numbers here; or to stdout (-).")
-    plot: Path | None = option(None, "Draw it: .png, .svg or .pdf.")
-    workers: int = option(1, "How many poses are simulated at a time.", min=1)
+    json: Path | None = option("Write all numbers here; or to stdout (-).")
+    plot: Path | None = option("Draw it: .png, .svg or .pdf.")
+    workers: int = option("How many poses are simulated at a time.", 1, min=1)
     scheduler: str | None = option(
-        None,
         "Simulate on a dask.distributed cluster: the address of its scheduler, or local "
         "for one on this machine.",
         metavar="ADDRESS",
@@ -182,7 +163,7 @@ class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
 
     session: SessionFile
-    quick: bool = option(False, "Look at a few frames of each sensor only.")
+    quick: bool = option("Look at a few frames of each sensor only.", False)
     source: Sources = None
     allow_code: AllowCode = False
 
@@ -192,10 +173,10 @@ class InspectRequest:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
     session: SessionFile
-    output: Path = option(..., "Folder for the pictures.", "-o", "--output")
-    frame: int | None = option(None, "Number of the frame; else the recording's first.")
+    output: Path = option("Folder for the pictures.", ...)
+    frame: int | None = option("Number of the frame; else the recording's first.")
     poses: Path | None = option(
-        None, "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
+        "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
     )
     source: Recordings = None
     allow_code: AllowCode = False
@@ -206,66 +187,67 @@ class SimulateRequest:
     """Render a recording with truth.jsonl that `run` can play."""
 
     session: SessionFile
-    output: Path = option(..., "New folder for the recording.", "-o", "--output")
-    frames: int = option(..., "Number of frames.", min=1)
-    seed: int = option(0, "Same seed, same recording.", min=0)
+    output: Path = option("New folder for the recording.", ...)
+    frames: int = option("Number of frames.", ..., min=1)
+    seed: int = option("Same seed, same recording.", 0, min=0)
     fps: float | None = option(
-        None, "Frames per second; for poses with times put fps into the session.", panel=TIME
+        "Frames per second; for poses with times put fps into the session.", panel=TIME
     )
-    noise: float = option(2.0, "Camera noise, grey levels.", panel=IMAGES)
-    clutter: float = option(0.0, "False features per frame and sensor.", panel=IN_VIEW)
-    hidden: float = option(0.0, "Chance that a feature is hidden.", panel=IN_VIEW)
-    missing: float = option(0.0, "Chance that a sensor has no frame.", panel=TIME)
-    brightness: float = option(170.0, "Peak of a spot, grey levels.", panel=IMAGES)
+    noise: float = option("Camera noise, grey levels.", 2.0, panel=IMAGES)
+    clutter: float = option("False features per frame and sensor.", 0.0, panel=IN_VIEW)
+    hidden: float = option("Chance that a feature is hidden.", 0.0, panel=IN_VIEW)
+    missing: float = option("Chance that a sensor has no frame.", 0.0, panel=TIME)
+    brightness: float = option("Peak of a spot, grey levels.", 170.0, panel=IMAGES)
     brightness_spread: float = option(
-        0.1, "Spread of the brightness over the features, as a share.", panel=IMAGES
+        "Spread of the brightness over the features, as a share.", 0.1, panel=IMAGES
     )
     amplitude_translation: float | None = option(
-        None, "Largest displacement along each axis, length units.", "--translation", panel=MOTION
+        "Largest displacement along each axis, length units.", name="--translation", panel=MOTION
     )
     amplitude_rotation_deg: float = option(
-        20.0, "Largest turn about each axis, degrees.", "--rotation", panel=MOTION
+        "Largest turn about each axis, degrees.", 20.0, name="--rotation", panel=MOTION
     )
     period_s: float = option(
-        4.0, "Seconds in which the motion comes round.", "--period", panel=MOTION
+        "Seconds in which the motion comes round.", 4.0, name="--period", panel=MOTION
     )
-    pixel_noise: float = option(0.1, "Error of detections in a camera's table, px.", panel=TABLES)
+    pixel_noise: float = option("Error of detections in a camera's table, px.", 0.1, panel=TABLES)
     range_noise: float | None = option(
-        None, "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
+        "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
     )
-    range_snr: float = option(30.0, "Height of a profile's peak over its noise.", panel=TABLES)
+    range_snr: float = option("Height of a profile's peak over its noise.", 30.0, panel=TABLES)
     deform: bool = option(
-        False, "Displace features by the spread the object states.", panel=IN_VIEW
+        "Displace features by the spread the object states.", False, panel=IN_VIEW
     )
     readout: float | None = option(
-        None, "Seconds from a camera's first row to its last; else the session's.", panel=TIME
+        "Seconds from a camera's first row to its last; else the session's.", panel=TIME
     )
     exposure: float | None = option(
-        None, "Seconds for which a row is lit; else the session's.", panel=TIME
+        "Seconds for which a row is lit; else the session's.", panel=TIME
     )
     delay: list[str] | None = option(
-        None, "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
+        "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
     )
     out_of_step: float = option(
-        0.0, "Seconds from the first sensor to the last, in their times.", panel=TIME
+        "Seconds from the first sensor to the last, in their times.", 0.0, panel=TIME
     )
-    lamps: int = option(0, "Lamps behind the body.", min=0, panel=IN_VIEW)
+    lamps: int = option("Lamps behind the body.", 0, min=0, panel=IN_VIEW)
     mirror: float = option(
-        0.0, "Brightness of mirror images in a table below, as a share.", panel=IN_VIEW
+        "Brightness of mirror images in a table below, as a share.", 0.0, panel=IN_VIEW
     )
     others: int = option(
-        0, "Other bodies with as many markers, beside this one.", min=0, panel=IN_VIEW
+        "Other bodies with as many markers, beside this one.", 0, min=0, panel=IN_VIEW
     )
-    occluder: int = option(0, "Dark bars that swing before it.", min=0, panel=IN_VIEW)
-    jpeg: int | None = option(None, "Quality of lossy compression.", min=1, max=100, panel=IMAGES)
-    bayer: bool = option(False, "Images of a colour sensor, interpolated.", panel=IMAGES)
+    occluder: int = option("Dark bars that swing before it.", 0, min=0, panel=IN_VIEW)
+    jpeg: int | None = option("Quality of lossy compression.", min=1, max=100, panel=IMAGES)
+    bayer: bool = option("Images of a colour sensor, interpolated.", False, panel=IMAGES)
     turned_camera_deg: float = option(
-        0.0, "Degrees by which the last camera was turned meanwhile.", "--turned-camera", panel=TIME
+        "Degrees by which the last camera was turned meanwhile.",
+        0.0,
+        name="--turned-camera",
+        panel=TIME,
     )
-    away_from: int | None = option(
-        None, "Frames after which the body is gone.", min=0, panel=MOTION
-    )
-    overwrite: bool = option(False, "Replace a recording in the folder.")
+    away_from: int | None = option("Frames after which the body is gone.", min=0, panel=MOTION)
+    overwrite: bool = option("Replace a recording in the folder.", False)
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {

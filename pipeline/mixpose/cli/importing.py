@@ -15,10 +15,7 @@ from mixpose.session import Session, load_session
 
 
 def import_files(request: ImportRequest) -> None:
-    """Write a session file, and say on standard error what is in it.
-
-    Raises SessionError if a file cannot be read, or the output is there already.
-    """
+    """Write a session file, which must be new, and say on standard error what is in it."""
     output, unit = request.output, request.unit
     if output.exists() and not is_stdout(output):
         raise SessionError(f"-o {output}: is there already; name a new file")

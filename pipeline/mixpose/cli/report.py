@@ -13,11 +13,7 @@ _PAGES = (".html", ".htm")
 
 
 def write_report(request: ReportRequest) -> None:
-    """Write the report of a run to a page of its own, or to standard output.
-
-    Raises SessionError if the output would overwrite something else, or a library is missing.
-    Raises RecordingError if the poses or the truth cannot be read or compared.
-    """
+    """Write the report of a run to a page of its own, or to standard output."""
     output = request.output
     poses, cut = read_unfinished_poses(request.poses)
     truth = None if request.truth is None else read_poses(request.truth)

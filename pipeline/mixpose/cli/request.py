@@ -53,52 +53,46 @@ class RunRequest:
         ),
     ]
     output: Path | None = option(
-        None,
         "Write poses here, not to stdout (-), in the format that the suffix tells. With "
         "several sessions, a folder in which each gets its own for poses, log and status; what "
-        "is done there already is not done again.",
-        "-o",
-        "--output",
+        "is done there already is not done again."
     )
     format: Format | None = option(
-        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
+        "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
     )
     source: Sources = None
-    start: int | None = option(None, "First frame number.")
-    stop: int | None = option(None, "Frame number to stop before.")
-    step: int = option(1, "Take every N-th frame number.", min=1)
-    resume: bool = option(False, "Go on after the last frame in the output.")
-    workers: int = option(1, "How many sessions are run at a time.", min=1)
+    start: int | None = option("First frame number.")
+    stop: int | None = option("Frame number to stop before.")
+    step: int = option("Take every N-th frame number.", 1, min=1)
+    resume: bool = option("Go on after the last frame in the output.", False)
+    workers: int = option("How many sessions are run at a time.", 1, min=1)
     overlay: Path | None = option(
-        None, "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
+        "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
     )
     view: str | None = option(
-        None,
         "Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
         "opens it to others who have the address with its token.",
         metavar="[PORT]",
     )
-    pause: bool = option(False, "With --view, on files: begin paused, to go on from the page.")
+    pause: bool = option("With --view, on files: begin paused, to go on from the page.", False)
     scheduler: str | None = option(
-        None,
         "Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
         "local for one on this machine.",
         metavar="ADDRESS",
     )
     labels: bool = option(
-        False,
         "Say in each pose line which detection is which feature, and where features are in "
         "space by these alone; .jsonl only.",
+        False,
     )
     publish: list[str] | None = option(
-        None,
         "Send each pose to another program too: udp://host:port, tcp://host:port, "
         "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
         "'?only=ok' none but those that are ok; repeatable.",
         metavar="URL",
     )
     predict: float | None = option(
-        None, "Publish where the body will be so much after each frame.", metavar="SECONDS"
+        "Publish where the body will be so much after each frame.", metavar="SECONDS"
     )
     allow_code: AllowCode = False
     debug: bool = False
@@ -110,11 +104,10 @@ class RunRequest:
 
     @property
     def format_name(self) -> str:
-        """The format of poses: the one that is named, else that of the file's suffix.
+        """The format of poses: the one named, else that of the file's suffix, else JSON lines.
 
-        Without either, poses are JSON lines: to standard output, a pipe, a name without a suffix,
-        or of many sessions. Raises SessionError if the suffix is that of no format, or of one that
-        is not written while poses are estimated.
+        Raises SessionError if the suffix is that of no format, or of one that is not written while
+        poses are estimated.
         """
         return self.format or ("jsonl" if self.are_many else _by_its_suffix(self.poses))
 
@@ -139,11 +132,7 @@ class RunRequest:
 
     @property
     def ahead_s(self) -> float:
-        """How far poses that are published are foretold.
-
-        Raises SessionError if nothing is published, or the time is not one that can be looked
-        ahead.
-        """
+        """How far poses that are published are foretold; a SessionError where they cannot be."""
         seconds = self.predict
         if seconds is None:
             return 0.0

@@ -23,8 +23,7 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 def smooth_poses(request: SmoothRequest) -> None:
     """Smooth the poses of a file and write them.
 
-    Raises SessionError if the output would overwrite something else. Raises RecordingError if the
-    poses cannot be read, were smoothed before, or say too little.
+    Raises RecordingError if they were smoothed before, were foretold, or say too little.
     """
     path, output = request.poses, output_of(request.output)
     poses = read_poses(path)
