@@ -14,6 +14,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mixpose import __version__
 from mixpose.cli.lines import LineFile, note_path
 from mixpose.cli.notices import say
 from mixpose.cli.request import RunRequest
@@ -47,8 +48,8 @@ class Note:
 class Notes:
     """Writes down every now and then what a run knows."""
 
-    def __init__(self, poses: Path, version: str) -> None:
-        self._path, self._version = note_path(poses), version
+    def __init__(self, poses: Path) -> None:
+        self._path = note_path(poses)
         self._last: tuple[int, LineFile, Memory] | None = None
         self._written_at = -INTERVAL_S
 
@@ -63,7 +64,7 @@ class Notes:
         if self._last is None:
             return
         frame, file, memory = self._last
-        note = Note(self._version, frame, file.size, file.checksum, memory)
+        note = Note(__version__, frame, file.size, file.checksum, memory)
         # without it, as on a full disk, frames are estimated again
         with suppress(OSError), appearing_whole(self._path) as part:
             part.write_text(json.dumps(encode(note)), encoding="ascii")
@@ -118,7 +119,7 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         with closing(pair(opened, after.start, after.stop, after.step)) as frames:
             if next(frames, None) is None:
                 return Continuation(file, after, is_done=True)
-        note = _note(poses, header.mixpose)
+        note = _note(poses)
         if note is not None:
             file.rewind(note.size, note.checksum)
             return Continuation(file, _after(wanted, note.frame), note.memory)
@@ -157,12 +158,12 @@ def _after(wanted: Selection, last: int) -> Selection:
     return replace(wanted, start=begin)
 
 
-def _note(poses: Path, version: str) -> Note | None:
+def _note(poses: Path) -> Note | None:
     """The note about a poses file, if there is one that fits it."""
     try:
         note = decode(Note, json.loads(note_path(poses).read_bytes()))
     except (OSError, ValueError, RecursionError):
         return None
     beginning = poses.read_bytes()[: note.size]
-    fits = note.mixpose == version and len(beginning) == note.size > 0
+    fits = note.mixpose == __version__ and len(beginning) == note.size > 0
     return note if fits and zlib.crc32(beginning) == note.checksum else None

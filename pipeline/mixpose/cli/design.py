@@ -145,13 +145,14 @@ def _noises(
             )
         if system and system not in names:
             raise SessionError(f"--noise: found no system {system!r}; systems: {', '.join(names)}")
-        matched = False
-        for k, (name, session) in enumerate(zip(names, sessions, strict=True)):
-            for setup in session.sensors:
-                if system in ("", name) and sensor in ("*", setup.name):
-                    noises[k, setup.name] = value
-                    matched = True
-        if not matched:
+        meant = [
+            (k, setup.name)
+            for k, (name, session) in enumerate(zip(names, sessions, strict=True))
+            for setup in session.sensors
+            if system in ("", name) and sensor in ("*", setup.name)
+        ]
+        noises |= dict.fromkeys(meant, value)
+        if not meant:
             known = sorted({setup.name for session in sessions for setup in session.sensors})
             raise SessionError(f"--noise: found no sensor {sensor!r}; sensors: {', '.join(known)}")
     return noises

@@ -12,22 +12,18 @@ from typing import Self, TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
-from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
 from mixpose.naming import distinct
-from mixpose.poses.benchmarks import BOP_COLUMNS, TUM_COLUMNS
-from mixpose.poses.csvtable import FRAME_COLUMNS
-from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
+from mixpose.poses import benchmarks, csvtable, formats, jsonl, writing
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import JsonlWriter
-from mixpose.poses.writing import NO_TIMES, PoseWriter
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
 _HEADER = '{"type": "header"'
+_WHOLE_LINES = map(re.escape, (benchmarks.BOP_COLUMNS, benchmarks.TUM_COLUMNS, writing.NO_TIMES))
 _FIRST_LINES = re.compile(
-    rf"{re.escape(_HEADER)}.*|{','.join(FRAME_COLUMNS[:3])},.*|{re.escape(BOP_COLUMNS)}"
-    rf"|{re.escape(TUM_COLUMNS)}|{re.escape(NO_TIMES)}|# frame -?\d+, (ok|ambiguous)"
+    rf"{re.escape(_HEADER)}.*|{','.join(csvtable.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
+    r"|# frame -?\d+, (ok|ambiguous)"
 )
 """Of files of poses, whole as they are written."""
 
@@ -54,10 +50,10 @@ class Output(ExitStack):
         self._called = self._path = path
         self._format, self._header = format_name, header
         self._options, self._is_whole = options or {}, whole
-        self._writer: PoseWriter | None = None
+        self._writer: writing.PoseWriter | None = None
         self.file = goes_on
         if goes_on is not None:
-            self._writer = JsonlWriter(cast(TextIO, goes_on), header, resume=True)
+            self._writer = jsonl.JsonlWriter(cast(TextIO, goes_on), header, resume=True)
 
     def __enter__(self) -> Self:
         if self._is_whole and self._called is not None:
@@ -85,12 +81,12 @@ class Output(ExitStack):
         writer = self._writer or self._open()
         writer.write(estimate)
 
-    def _open(self) -> PoseWriter:
+    def _open(self) -> writing.PoseWriter:
         if self._path is not None:
             self.file = LineFile(self._path, called=self._called)
         # the writers only ever write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
-        self._writer = FORMATS[self._format](stream, self._header, **self._options)
+        self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
@@ -143,7 +139,7 @@ def pose_output(
 
 def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
     """Whether a format needs a file for each of the bodies."""
-    return format_name in ONE_TRAJECTORY and len(labels) > 1
+    return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
 
 
 def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
@@ -154,10 +150,7 @@ def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) ->
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
-    """Make sure that a file about to be written is new, or holds poses that mixpose wrote.
-
-    Raises SessionError if it is an input of the run, or holds something else.
-    """
+    """Raise SessionError unless a file to be written is new, or holds poses that mixpose wrote."""
     beginning = _beginning(path, inputs)
     first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
@@ -170,11 +163,9 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
-    """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
-    it; standard output is.
+    """Raise SessionError unless a file to be written is new, empty, or has a mark near its begin.
 
-    `begins` is what the very first characters have to be. Raises SessionError if it is one of the
-    inputs, or holds something else; `option` named it.
+    `begins` is what the very first characters have to be, `option` what named the file.
     """
     if is_stdout(path):
         return
@@ -205,7 +196,7 @@ def _foreign(path: Path, option: str = "-o") -> SessionError:
 
 def is_stdout(named: Path | None) -> bool:
     """Whether what an option names is standard output."""
-    return named is not None and output_of(named) is None
+    return named == Path("-")
 
 
 def refuse_suffix(named: Path, option: str, allowed: Sequence[str], what: str) -> None:
@@ -241,10 +232,7 @@ def print_lines(lines: Iterable[str], *written: Path | None) -> None:
 
 
 def write_text(path: Path, text: str, option: str) -> None:
-    """Write a text to the file that an option names, or to standard output.
-
-    Raises SessionError if it cannot be written.
-    """
+    """Write a text to the file that an option names, or to standard output, or SessionError."""
     if is_stdout(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(text.encode("utf-8"))  # the same bytes on every system

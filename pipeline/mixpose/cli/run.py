@@ -30,8 +30,7 @@ from mixpose.tracking.proposers import predicted
 def run_session(request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 
-    Raises SessionError if the session or the options are wrong. Raises RecordingError if the
-    recording cannot be read; frames already estimated stay written.
+    Whatever is raised, frames already estimated stay written.
     """
     with ExitStack() as pages:  # what outlives the poses
         _run_session(request, pages)
@@ -60,19 +59,13 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     )
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, go_on.there)
-        watch = _each(
-            is_new,
-            _publishing(stack, session, request, header),
-            summary.findings.watch,
-            _overlay(stack, session, request),
-            view,
-        )
+        watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
             opened=opened,
             selection=go_on.selection,
-            watch=watch,
+            watch=partial(_each, is_new, watches),
             memory=go_on.memory,
             remember=memories.append,
             labels=request.labels,
@@ -99,7 +92,7 @@ def _notes(request: RunRequest) -> Iterator[Notes | None]:
     if poses is None or request.format_name != "jsonl" or _is_device(poses):
         yield None
         return
-    notes = Notes(poses, __version__)
+    notes = Notes(poses)
     try:
         yield notes
     except BaseException:
@@ -117,30 +110,25 @@ def _is_new(labels: Sequence[str], there: ResumePoint | None, estimate: Estimate
     return there is None or (estimate.frame, place) > (there.frame, there.lines)
 
 
-def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
-    """What draws each frame, finished with the stack; None where nothing is to be drawn."""
-    if request.overlay is None:
-        return None
-    instead = "a folder or a video, as --overlay run.mp4"
-    refuse_stdout(request.overlay, "--overlay", "pictures", instead)
-    from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
-
-    return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
-
-
-def _publishing(
+def _watches(
     stack: ExitStack, session: Session, request: RunRequest, header: Header
-) -> Watch | None:
-    """What sends each pose on, finished with the stack; None where nothing is published."""
+) -> Iterator[Watch]:
+    """What sends each pose on and draws its frame, where asked for; finished with the stack."""
     ahead_s = request.ahead_s
-    if not request.publish:
-        return None
-    from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
+    if request.publish:
+        from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
-    each = [(label, one.body) for one in session.objects for label in one.labels]
-    foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
-    publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
-    return stack.enter_context(publishing).watch
+        each = [(label, one.body) for one in session.objects for label in one.labels]
+        foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
+        publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
+        yield stack.enter_context(publishing).watch
+    if request.overlay is not None:
+        instead = "a folder or a video, as --overlay run.mp4"
+        refuse_stdout(request.overlay, "--overlay", "pictures", instead)
+        from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
+
+        overlay = Overlay(session, request.overlay, resume=request.resume)
+        yield stack.enter_context(overlay).watch
 
 
 def _foresee(known: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
@@ -156,29 +144,30 @@ def _foresee(known: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
 
 def _view(
     stack: ExitStack, session: Session, request: RunRequest, opened: Mapping[str, Source]
-) -> Watch | None:
-    """What shows each frame on a page, gone with the stack; None where nothing is to be shown."""
+) -> list[Watch]:
+    """What shows each frame on a page, gone with the stack; nothing where none is to be shown."""
     if request.view is None:
         if request.pause:
             raise SessionError("--pause: nothing to go on with; add --view")
-        return None
+        return []
     from mixpose.viewing import Viewer  # noqa: PLC0415 - only where it is shown
 
     waits = all(source.kind != "live" for source in opened.values())
     viewer = Viewer(session, request.view, say, on_files=waits, paused=request.pause)
     stack.enter_context(viewer).announce()
-    return viewer.watch
+    return [viewer.watch]
 
 
-def _each(is_new: Callable[[Estimate], bool], *watches: Watch | None) -> Watch:
-    """Several that look at each new frame, one after the other."""
-    there = [one for one in watches if one is not None]
-
-    def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        for one in there if is_new(estimate) else ():
-            one(frame_set, views, estimate)
-
-    return watch
+def _each(
+    is_new: Callable[[Estimate], bool],
+    watches: Sequence[Watch],
+    frame_set: FrameSet,
+    views: Sequence[View],
+    estimate: Estimate,
+) -> None:
+    """Let several look at each new frame, one after the other."""
+    for watch in watches if is_new(estimate) else ():
+        watch(frame_set, views, estimate)
 
 
 def _is_device(path: Path) -> bool:

@@ -114,12 +114,10 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
-    """Estimate many recordings, say in the end how each of them went, and return the worst exit
-    status.
+    """Estimate many recordings that are not done yet; say how each went, return the worst status.
 
-    What is done already, with the same session and options, is not done again. The folder of the
-    output is made if it is not there; workers count on a cluster only where it is a local one.
-    Raises SessionError if there is no folder for the poses, or an option serves a single recording.
+    Workers count on a cluster only where it is a local one. Raises SessionError if there is no
+    folder for the poses, or an option serves a single recording.
     """
     _refuse_alone(sessions, request)
     folder = _folder(request.poses, len(sessions))

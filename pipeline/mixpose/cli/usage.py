@@ -40,7 +40,11 @@ def usage_message(error: typer.TyperException, arguments: Sequence[str]) -> str:
 
 
 def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
-    message = _reworded(error.message)
+    message = error.message
+    for pattern, wording in _WORDINGS:
+        if re.fullmatch(pattern, message):
+            message = re.sub(f"^{pattern}$", wording, message)
+            break
     option = getattr(error, "option_name", None)
     if option is not None and hasattr(error, "possibilities"):
         near = difflib.get_close_matches(option, error.possibilities or (), n=1, cutoff=0.5)
@@ -55,13 +59,6 @@ def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
         return f"{name}: missing"
     found = _typed(names, arguments) if is_option else None
     return f"{name}: " + (f"found {found}; " if found is not None else "") + message
-
-
-def _reworded(message: str) -> str:
-    for pattern, wording in _WORDINGS:
-        if re.fullmatch(pattern, message):
-            return re.sub(f"^{pattern}$", wording, message)
-    return message
 
 
 def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:

@@ -140,7 +140,7 @@ class Scene:
         scene.add_label(
             f"/sensors/{k}/name",
             outline.name,
-            position=self._scale * outline.middle,
+            position=self._scale * outline.places.mean(axis=0),
             font_screen_scale=_SMALL,
         )
 
@@ -171,13 +171,15 @@ class Scene:
         return _BodyNodes(pose, markers, trail, ellipsoid)
 
     def _draw_ground(self, places: Floats, up: Floats, radius: float) -> None:
-        """The world's axes, and a grid below all that is there, of cells of a round length."""
+        """The world's axes, and a grid below all that is there, of about a tenth of it a cell."""
         self._server.scene.set_up_direction(tuple(up.tolist()))
         length = self._scale * radius
         self._server.scene.add_frame("/world", axes_length=length, axes_radius=0.02 * length)
         middle, lowest = places.mean(axis=0), float((places @ up).min())
         below = middle + (lowest - radius - middle @ up) * up
-        cell = self._scale * self.cell
+        wanted = 0.1 * _SIZE / self._scale  # rounded down to 1, 2 or 5 times a power of ten
+        power = 10.0 ** np.floor(np.log10(wanted))
+        cell = self._scale * float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
         turn, _ = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])
         self._server.scene.add_grid(
             "/grid",
@@ -190,15 +192,6 @@ class Scene:
             wxyz=tuple(np.roll(turn.as_quat(), 1).tolist()),
             position=self._scale * below,
         )
-
-    @property
-    def cell(self) -> float:
-        """Length of a grid's cell: 1, 2 or 5 times a power of ten, about a tenth of the scene."""
-        if not self._scale:
-            return 0.0
-        wanted = 0.1 * _SIZE / self._scale
-        power = 10.0 ** np.floor(np.log10(wanted))
-        return float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
 
     def _look(self, bodies: Floats, radius: float, sensors: Floats, up: Floats) -> None:
         """Look at all that is there, over the shoulders of the sensors."""
@@ -258,11 +251,6 @@ class Outline:
     places: Floats
     # lines of sight around the edge of the image, in order; None of a range sensor
     border: Rays | None
-
-    @property
-    def middle(self) -> Floats:
-        """Where its name is written."""
-        return np.asarray(self.places.mean(axis=0))
 
     def segments(self, size: float) -> Floats:
         """Lines (n, 2, 3) to draw, in a scene of a size."""
