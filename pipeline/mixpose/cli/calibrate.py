@@ -43,7 +43,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     output.refuse_one_for_two(request.report, "--report", target, "-o")
     if target is not None:
-        output.refuse_suffix(target, "-o", (".toml",), "it is a session that is written")
+        output.refuse_suffix(target, (".toml",), "it is a session that is written")
         refuse_lost_code(session, target)
         if request.world is not None:
             refuse_held(session)

@@ -13,6 +13,7 @@ import zlib
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 from mixpose import __version__
 from mixpose.cli.lines import LineFile, note_path
@@ -46,22 +47,38 @@ class Note:
 
 
 class Notes:
-    """Writes down every now and then what a run knows."""
+    """Writes down every now and then what a run knows; gone when the recording is done.
 
-    def __init__(self, poses: Path) -> None:
-        self._path = note_path(poses)
+    A context; of poses that cannot be gone on with nothing is written.
+    """
+
+    def __init__(self, request: RunRequest) -> None:
+        poses, format_name = request.poses, request.format_name
+        can_go_on = poses is not None and format_name == "jsonl" and not is_device(poses)
+        self._path = note_path(poses) if poses is not None and can_go_on else None
+        self._is_all = request.stop is None
         self._last: tuple[int, LineFile, Memory] | None = None
         self._written_at = -INTERVAL_S
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is not None or not self._is_all:
+            self._write()
+        elif self._path is not None:
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
 
     def remember(self, frame: int, file: LineFile, memory: Memory) -> None:
         """Take what is known after a frame whose lines are written."""
         self._last = frame, file, memory
         if time.monotonic() - self._written_at >= INTERVAL_S:
-            self.write()
+            self._write()
 
-    def write(self) -> None:
+    def _write(self) -> None:
         """Write down what was taken last, where there is room: poses are worth more than notes."""
-        if self._last is None:
+        if self._last is None or self._path is None:
             return
         frame, file, memory = self._last
         note = Note(__version__, frame, file.size, file.checksum, memory)
@@ -70,11 +87,10 @@ class Notes:
             part.write_text(json.dumps(encode(note)), encoding="ascii")
         self._last, self._written_at = None, time.monotonic()
 
-    def drop(self) -> None:
-        """Forget everything: the recording is done."""
-        self._last = None
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
+
+def is_device(path: Path) -> bool:
+    """Whether a path is a pipe or a device, which holds nothing that could be lost."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
 from mixpose.cli.notices import counted, say, warn
-from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
+from mixpose.cli.output import Output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
@@ -77,7 +77,7 @@ def _write(
     if name != "bop" or (request.object is not None and request.obj_id is not None):
         header = replace(header, objects=estimates.objects_of(lines))
     labels = tuple(dict.fromkeys(line.label for line in lines))
-    with pose_output(request.output, name, header, labels, options=options, whole=True) as output:
+    with Output(request.output, name, header, labels, options=options, whole=True) as output:
         for line in lines:
             output.write(estimates.relative_to(T_sensor_world, line))
 

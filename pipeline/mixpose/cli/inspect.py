@@ -42,9 +42,9 @@ def inspect_frame(request: InspectRequest) -> None:
     frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
+    tracked = scene_of(session)
     if file is None:
-        bodies_seen = scene_of(session)
-        _, estimates = bodies_seen.advance(bodies_seen.begin(), number, frame_set.time_s, views)
+        _, estimates = tracked.advance(tracked.begin(), number, frame_set.time_s, views)
     else:
         estimates = _from_file(file, session, number)
     bodies = [one.body for one in session.objects for _ in one.instances]

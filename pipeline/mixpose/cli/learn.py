@@ -23,7 +23,7 @@ def learn_session(request: LearnRequest) -> None:
     session = load_scene(path, allow_code=request.allow_code)
     inputs = path, request.like
     output.refuse_to_overwrite_but(request.output, inputs, MARK)
-    output.refuse_suffix(request.output, "-o", (".csv", ".txt"), "a body is a table of markers")
+    output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
     if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")

@@ -31,9 +31,11 @@ _FIRST_LINES = re.compile(
 class Output(ExitStack):
     """Writes poses; a file is opened with the first of them, so that no failure empties it.
 
-    Without a path poses go to standard output. `goes_on` is a file of JSON lines that has its
-    header already, in place of opening `path`; `options` are what the writer of the format takes
-    besides; a `whole` file appears when all is written.
+    Without a path poses go to standard output. Of several bodies (their `labels`) each gets a file
+    of its own where the format needs that, ``poses.<body>.tum`` for ``poses.tum``; a SessionError
+    if there is no path then. `goes_on` is a file of JSON lines that has its header already, in
+    place of opening `path`; `options` are what the writer of the format takes besides; a `whole`
+    file appears when all is written.
     """
 
     def __init__(
@@ -41,6 +43,7 @@ class Output(ExitStack):
         path: Path | None,
         format_name: str,
         header: Header,
+        labels: Sequence[str] = (),
         *,
         goes_on: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
@@ -54,11 +57,24 @@ class Output(ExitStack):
         self.file = goes_on
         if goes_on is not None:
             self._writer = jsonl.JsonlWriter(cast(TextIO, goes_on), header, resume=True)
+        self._apart: dict[str, Output] = {}  # by label
+        if not _are_apart(format_name, labels):
+            return
+        if path is None:
+            raise SessionError(
+                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
+                "with -o: each body gets one with its own name in it"
+            )
+        for label, own in zip(labels, _body_paths(path, labels), strict=True):
+            self._apart[label] = Output(own, format_name, header, options=options, whole=whole)
 
     def __enter__(self) -> Self:
-        if self._is_whole and self._called is not None:
-            self._path = self.enter_context(appearing_whole(self._called))
-        self.push(self._end)
+        for each in self._apart.values():
+            self.enter_context(each)
+        if not self._apart:
+            if self._is_whole and self._called is not None:
+                self._path = self.enter_context(appearing_whole(self._called))
+            self.push(self._end)
         return super().__enter__()
 
     def _end(self, kind: object, error: object, trace: object) -> None:
@@ -72,7 +88,10 @@ class Output(ExitStack):
                 self.file.close()
 
     def write(self, estimate: Estimate) -> None:
-        """Write one frame, at once."""
+        """Write one frame of one body, at once."""
+        if self._apart:
+            self._apart[estimate.label].write(estimate)
+            return
         if self._writer is None and self._format == "tum" and estimate.time_s is None:
             warn(
                 f"{self._called or 'standard output'}: poses have no times, so that frame numbers "
@@ -90,55 +109,14 @@ class Output(ExitStack):
         return self._writer
 
 
-class OutputPerBody(ExitStack):
-    """Writes the poses of each body, by its label, to an output of its own."""
-
-    file: LineFile | None = None
-
-    def __init__(self, outputs: Mapping[str, Output]) -> None:
-        super().__init__()
-        self._outputs = {label: self.enter_context(each) for label, each in outputs.items()}
-
-    def write(self, estimate: Estimate) -> None:
-        """Write one frame of one body, at once."""
-        self._outputs[estimate.label].write(estimate)
-
-
 def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
     """Where the poses of several bodies go: ``poses.tum`` → ``poses.tool.tum``; no two alike."""
     words = distinct(labels, partial(re.sub, r"[^\w\- ]", "_"), str.casefold)
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
-def pose_output(
-    path: Path | None,
-    format_name: str,
-    header: Header,
-    labels: Sequence[str],
-    *,
-    goes_on: LineFile | None = None,
-    options: Mapping[str, int | str] | None = None,
-    whole: bool = False,
-) -> Output | OutputPerBody:
-    """Where the poses of bodies go, as `Output` says.
-
-    Where the format needs a file for each, ``poses.tum`` stands for ``poses.<body>.tum``. Raises
-    SessionError if there is no path then.
-    """
-    start = partial(Output, format_name=format_name, header=header, options=options, whole=whole)
-    if not _is_apart(format_name, labels):
-        return start(path, goes_on=goes_on)
-    if path is None:
-        raise SessionError(
-            f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
-            "with -o: each body gets one with its own name in it"
-        )
-    own = zip(labels, _body_paths(path, labels), strict=True)
-    return OutputPerBody({label: start(each) for label, each in own})
-
-
-def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
-    """Whether a format needs a file for each of the bodies."""
+def _are_apart(format_name: str, labels: Sequence[str]) -> bool:
+    """Whether a format needs a file for each of some bodies."""
     return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
 
 
@@ -146,7 +124,7 @@ def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) ->
     """The files that poses go to; none where that is standard output."""
     if path is None:
         return []
-    return _body_paths(path, labels) if _is_apart(format_name, labels) else [path]
+    return _body_paths(path, labels) if _are_apart(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
@@ -199,11 +177,11 @@ def is_stdout(named: Path | None) -> bool:
     return named == Path("-")
 
 
-def refuse_suffix(named: Path, option: str, allowed: Sequence[str], what: str) -> None:
+def refuse_suffix(named: Path, allowed: Sequence[str], what: str) -> None:
     """Raise a SessionError where a name ends as files do that are something else than `what`."""
     if named.suffix and named.suffix.casefold() not in allowed:
         raise SessionError(
-            f"{option} {named}: found the suffix {named.suffix}; {what}: name it "
+            f"-o {named}: found the suffix {named.suffix}; {what}: name it "
             f"{named.with_suffix(allowed[0]).name}"
         )
 

@@ -18,7 +18,7 @@ def write_report(request: ReportRequest) -> None:
     poses, cut = read_unfinished_poses(request.poses)
     truth = None if request.truth is None else read_poses(request.truth)
     refuse_to_overwrite_but(output, (request.poses, request.truth, find_session(poses).path), MARK)
-    refuse_suffix(output, "-o", _PAGES, "a report is a page for a browser, which prints a PDF")
+    refuse_suffix(output, _PAGES, "a report is a page for a browser, which prints a PDF")
     write_text(output, render(poses, truth, cut=cut, version=__version__), "-o")
     frames = {line.frame for line in poses.poses}
     say(f"{counted(len(frames), 'frame')} -> {shown(output)}")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import glob
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, continuation
+from mixpose.cli.continuation import Continuation, Notes, continuation, is_device
 from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
-from mixpose.cli.output import pose_output, refuse_stdout, refuse_to_overwrite, written_paths
+from mixpose.cli.output import Output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -43,7 +43,7 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     opened = open_sources(session, replaced)
     outputs = written_paths(request.poses, request.format_name, header.labels)
     for each in outputs:
-        if not _is_device(each):
+        if not is_device(each):
             refuse_to_overwrite(each, _inputs(session))
     go_on = Continuation(None, request.selection)
     if request.resume:
@@ -54,9 +54,7 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = pose_output(
-        request.poses, request.format_name, header, header.labels, goes_on=go_on.file
-    )
+    output = Output(request.poses, request.format_name, header, header.labels, goes_on=go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, go_on.there)
         watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]
@@ -71,37 +69,18 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
             labels=request.labels,
         )
         stack.enter_context(closing(estimates))
-        notes = stack.enter_context(_notes(request))
+        notes = stack.enter_context(Notes(request))
         shown = _with_progress(estimates, session, quiet=request.poses is None)
         for estimate in filter(is_new, shown):
             output.write(estimate)
             is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
-            if notes is not None and output.file is not None and is_whole:
+            if output.file is not None and is_whole:
                 notes.remember(estimate.frame, output.file, memories[-1])
             summary.add(estimate)
             if request.debug and estimate.proposer != predicted.__name__:
                 say(f"frame {estimate.frame}: {origin_of(estimate)}")
     names = [str(path) for path in (*outputs, request.overlay) if path is not None]
     summary.say(f" -> {', '.join(names)}" if names else "")
-
-
-@contextmanager
-def _notes(request: RunRequest) -> Iterator[Notes | None]:
-    """What writes down where the run could go on; gone when the recording is done."""
-    poses = request.poses
-    if poses is None or request.format_name != "jsonl" or _is_device(poses):
-        yield None
-        return
-    notes = Notes(poses)
-    try:
-        yield notes
-    except BaseException:
-        notes.write()
-        raise
-    if request.selection.stop is None:
-        notes.drop()
-    else:
-        notes.write()
 
 
 def _is_new(labels: Sequence[str], there: ResumePoint | None, estimate: Estimate) -> bool:
@@ -168,11 +147,6 @@ def _each(
     """Let several look at each new frame, one after the other."""
     for watch in watches if is_new(estimate) else ():
         watch(frame_set, views, estimate)
-
-
-def _is_device(path: Path) -> bool:
-    """Whether a path is a pipe or a device, which holds nothing that could be lost."""
-    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _inputs(session: Session) -> Iterator[Path]:

@@ -45,7 +45,7 @@ def smooth_poses(request: SmoothRequest) -> None:
     if output is not None:
         refuse_to_overwrite(output, [path])
         told = "smoothed poses are JSON lines, of which mixpose convert makes other formats"
-        refuse_suffix(output, "-o", (".jsonl", ".json", ".ndjson"), told)
+        refuse_suffix(output, (".jsonl", ".json", ".ndjson"), told)
     bodies = {}
     for label in dict.fromkeys(line.label for line in poses.poses):
         own = [line for line in poses.poses if line.label == label]

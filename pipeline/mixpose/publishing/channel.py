@@ -99,7 +99,7 @@ class Channel:
         address: Address,
         sender: Sender,
         tell: Callable[[str], None],
-        rules: PublishingRules = PublishingRules(),
+        rules: PublishingRules,
     ) -> None:
         self._address, self._sender, self._tell, self._rules = address, sender, tell, rules
         self._backlog = Backlog(rules.waiting)
