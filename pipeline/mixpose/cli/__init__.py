@@ -77,7 +77,7 @@ def _status(arguments: list[str]) -> int:
     import typer  # noqa: PLC0415
 
     from mixpose.cli.app import app  # noqa: PLC0415
-    from mixpose.cli.usage import usage_message, with_values  # noqa: PLC0415
+    from mixpose.cli.help import usage_message, with_values  # noqa: PLC0415
     from mixpose.errors import MixposeError  # noqa: PLC0415
 
     debug = "--debug" in arguments
