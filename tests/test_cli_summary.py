@@ -148,8 +148,8 @@ def test_that_no_frame_is_ok_is_said_long_before_the_end(
 
 def test_a_run_names_all_that_it_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     poses, pictures = tmp_path / "poses.jsonl", tmp_path / "seen"
-    request = RunRequest(poses, "jsonl", (), Selection(0, 1), False, pictures)
-    run_session(SYNTHETIC / "two_cameras" / "session.toml", request)
+    session = SYNTHETIC / "two_cameras" / "session.toml"
+    run_session(RunRequest([str(session)], poses, start=0, stop=1, overlay=pictures))
     assert capsys.readouterr().err == f"mixpose: 1 frame: 1 ok -> {poses}, {pictures}\n"
 
 

@@ -24,7 +24,6 @@ from mixpose.cli.recording_job import Job, Running, finished, outcome_of, run_jo
 from mixpose.cli.request import RunRequest
 from mixpose.cli.several import names_of, run_sessions, sessions_of
 from mixpose.errors import SessionError
-from mixpose.selection import Selection
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
@@ -44,9 +43,9 @@ def poses_of(path: Path) -> list[dict[str, Any]]:
 
 def refusal(*sessions: Path, output: Path | None, sources: tuple[str, ...] = ()) -> str:
     """Why several sessions are not even begun."""
-    request = RunRequest(output, "jsonl", sources, Selection(), resume=False)
+    request = RunRequest([], output, "jsonl", list(sources), workers=2)
     with pytest.raises(SessionError) as caught:
-        run_sessions(sessions, request, workers=2)
+        run_sessions(sessions, request)
     return str(caught.value)
 
 
@@ -183,7 +182,7 @@ def test_a_pattern_names_sessions_and_one_that_matches_none_is_told(tmp_path: Pa
 
 @pytest.mark.usefixtures("done_at_once")
 def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
-    job = Job(str(CAMERAS), "ab", str(tmp_path), "beams", "poses.jsonl", ("--stop=1",), "0", True)
+    job = Job("beams", str(CAMERAS), "ab", ("--stop=1",), "0", str(tmp_path), "poses.jsonl", True)
     first, second = run_job(job), run_job(replace(job, mixpose="1"))
     assert first.state == second.state == "done"
     assert finished(job) is None  # of another version: done again
@@ -195,7 +194,7 @@ def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
-    job = Job(str(tmp_path / "no.toml"), "", str(tmp_path), "no", "poses.jsonl", (), "0", True)
+    job = Job("no", str(tmp_path / "no.toml"), "", (), "0", str(tmp_path), "poses.jsonl", True)
     outcome = run_job(job)
     assert outcome.state == "failed"
     assert "a folder that all workers see under the same name" in str(outcome.reason)
@@ -246,8 +245,8 @@ def test_a_second_run_into_the_folder_leaves_alone_what_the_first_one_does(
     begun = folder / ".a.unfinished" / "poses.jsonl"
     with started(words, stderr=subprocess.DEVNULL) as process:
         wait_until(lambda: has_written(begun), by=process)
-        request = RunRequest(folder, "jsonl", (), Selection(), resume=False)
-        assert run_sessions(sessions[:1], request, workers=1) == 2
+        request = RunRequest([], folder, "jsonl")
+        assert run_sessions(sessions[:1], request) == 2
         assert begun.exists()
         assert not (folder / "a").exists()
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -263,8 +262,8 @@ def test_an_unfinished_recording_stays_when_one_whose_name_begins_its_own_is_don
     for folder in (begun.parent, left):
         folder.mkdir()
     begun.touch()
-    request = RunRequest(tmp_path, "jsonl", (), Selection(stop=1), resume=False)
-    assert run_sessions([RANGES], request, workers=1) == 0
+    request = RunRequest([], tmp_path, "jsonl", stop=1)
+    assert run_sessions([RANGES], request) == 0
     assert begun.exists()
     assert not left.exists()
 
@@ -277,8 +276,8 @@ def test_recordings_of_another_place_and_the_same_name_are_neither_taken_nor_rep
     for session in days:
         shutil.copytree(RANGES.parent, session.parent)
     folder = tmp_path / "poses"
-    request = RunRequest(folder, "jsonl", (), Selection(stop=1), resume=False)
-    assert run_sessions(days[:1], request, workers=1) == 0
+    request = RunRequest([], folder, "jsonl", stop=1)
+    assert run_sessions(days[:1], request) == 0
     told = refusal(days[1], output=folder)
     assert told.startswith(f"-o {folder}: ranges in it is of {days[0]}, not of {days[1]}")
     (folder / "ranges").rename(folder / ".ranges.unfinished")  # as after an interrupt
@@ -286,7 +285,7 @@ def test_recordings_of_another_place_and_the_same_name_are_neither_taken_nor_rep
     (folder / ".ranges.unfinished").rename(folder / "ranges")
     assert status_of(folder / "ranges")["session"] == str(days[0])
     roundabout = tmp_path / "poses" / ".." / "monday" / "ranges" / "session.toml"
-    assert run_sessions([roundabout], request, workers=1) == 0
+    assert run_sessions([roundabout], request) == 0
 
 
 def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None:
@@ -302,10 +301,10 @@ def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None
 
 
 def test_several_sessions_cannot_be_paused(tmp_path: Path) -> None:
-    request = RunRequest(tmp_path, "jsonl", (), Selection(), resume=False, pause=True)
+    request = RunRequest([], tmp_path, "jsonl", pause=True, workers=2)
     found = re.escape(f"--pause: found 2 sessions ({RANGES}, {CAMERAS}), allowed with one only")
     with pytest.raises(SessionError, match=f"^{found}$"):
-        run_sessions((RANGES, CAMERAS), request, workers=2)
+        run_sessions((RANGES, CAMERAS), request)
 
 
 def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:
@@ -344,7 +343,7 @@ def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
 
 
 def job_of(folder: Path, *options: str) -> Job:
-    return Job(str(RANGES), "ab", str(folder), "ranges", "poses.jsonl", options, "0")
+    return Job("ranges", str(RANGES), "ab", options, "0", str(folder), "poses.jsonl")
 
 
 def begun(folder: Path, job: Job) -> Path:

@@ -19,7 +19,6 @@ from mixpose.frames.source import SensorKind, SourceSpec
 from mixpose.frames.times import FrameTimes, clock_of, read_times
 from mixpose.frames.video import open_video
 from mixpose.runner import open_sources
-from mixpose.selection import Selection
 from mixpose.session import load_session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
@@ -142,7 +141,7 @@ def test_a_run_without_a_row_leaves_the_poses_of_the_last_one(tmp_path: Path) ->
     before = '{"type": "header", "mixpose": "0.1"}\n'
     poses.write_text(before)
     with pytest.raises(RecordingError, match=r"times\.csv: no row for frame 57; allowed"):
-        run_session(session, RunRequest(poses, "jsonl", (), Selection(), resume=False))
+        run_session(RunRequest([str(session)], poses))
     assert poses.read_text() == before
 
 

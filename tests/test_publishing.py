@@ -16,10 +16,9 @@ from published_pose import ESTIMATE, HEADER, POSE
 
 from mixpose.cli import main
 from mixpose.errors import SessionError
-from mixpose.publishing import SENDERS, Publishing
-from mixpose.publishing.address import parse
+from mixpose.publishing import Publishing
 from mixpose.publishing.channel import Backlog
-from mixpose.publishing.message import Message
+from mixpose.publishing.message import Message, parse
 from mixpose.records import Estimate, Hypothesis, MeasuredPoint, Moment
 from mixpose.rigid import perturb, twist_between
 from mixpose.session import load_session
@@ -88,7 +87,7 @@ def test_protocol_whose_package_is_not_there_names_its_extra(
 
 
 def test_password_of_a_broker_is_not_said() -> None:
-    parsed = parse("mqtt://me:s%2Fecret@host:1884/rig/one?only=ok", SENDERS)
+    parsed = parse("mqtt://me:s%2Fecret@host:1884/rig/one?only=ok")
     assert (parsed.user, parsed.password) == ("me", "s/ecret")
     assert parsed.text == "mqtt://host:1884/rig/one?only=ok"
     assert (parsed.place(""), parsed.path) == (("host", 1884), "rig/one")

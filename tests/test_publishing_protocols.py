@@ -15,11 +15,9 @@ import pytest
 from command_line import wait_until
 from published_pose import ESTIMATE, HEADER
 
-from mixpose.publishing import SENDERS
-from mixpose.publishing.address import parse
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.lsl import LslSender
-from mixpose.publishing.message import Message
+from mixpose.publishing.message import Message, parse
 from mixpose.publishing.mqtt import MqttSender
 from mixpose.publishing.ros2 import RosNodeSender, ros_messages, topics
 from mixpose.publishing.sockets import OscSender
@@ -30,7 +28,7 @@ def test_pages_count_as_receivers_from_when_one_is_there() -> None:
     client = pytest.importorskip("websockets.sync.client")
     with socket.create_server(("127.0.0.1", 0)) as free:
         url = f"ws://127.0.0.1:{free.getsockname()[1]}/poses"
-    sender = WebSocketSender(parse(url, SENDERS), HEADER)
+    sender = WebSocketSender(parse(url), HEADER)
     try:
         assert not sender.send(Message(ESTIMATE))  # nobody has got it, so it is not counted
         with client.connect(url) as page:
@@ -55,7 +53,7 @@ def test_who_connects_and_speaks_no_http_is_not_worth_a_word(
     pytest.importorskip("websockets")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    sender = WebSocketSender(parse(f"ws://127.0.0.1:{port}", SENDERS), HEADER)
+    sender = WebSocketSender(parse(f"ws://127.0.0.1:{port}"), HEADER)
     try:
         with socket.create_connection(("127.0.0.1", port)) as stranger:
             stranger.sendall(b"GET /a b HTTP/1.1\r\n\r\n")
@@ -71,7 +69,7 @@ def test_a_message_of_open_sound_control_counts_as_sent_and_names_its_body() -> 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiving:
         receiving.bind(("127.0.0.1", 0))
         url = f"osc://127.0.0.1:{receiving.getsockname()[1]}/rig"
-        sender = OscSender(parse(url, SENDERS), HEADER)
+        sender = OscSender(parse(url), HEADER)
         sender.connect()
         assert sender.send(Message(ESTIMATE))
         sender.close()
@@ -99,7 +97,7 @@ def broker(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
 
 
 def test_a_broker_is_looked_for_at_the_port_of_its_protocol(broker: MagicMock) -> None:
-    sender = MqttSender(parse("mqtt://there/rig", SENDERS), HEADER)
+    sender = MqttSender(parse("mqtt://there/rig"), HEADER)
     sender.connect()
     broker.connect.assert_called_once_with("there", 1883)
     assert sender.send(Message(ESTIMATE))
@@ -112,7 +110,7 @@ def test_a_broker_is_looked_for_at_the_port_of_its_protocol(broker: MagicMock) -
 
 
 def test_a_body_that_is_called_header_does_not_replace_that_of_the_run(broker: MagicMock) -> None:
-    sender = MqttSender(parse("mqtt://there/rig", SENDERS), replace(HEADER, objects={"header": 1}))
+    sender = MqttSender(parse("mqtt://there/rig"), replace(HEADER, objects={"header": 1}))
     sender.connect()
     assert sender.send(Message(replace(ESTIMATE, object="header")))
     topics = [call.args[0] for call in broker.publish.call_args_list]
@@ -122,7 +120,7 @@ def test_a_body_that_is_called_header_does_not_replace_that_of_the_run(broker: M
 def test_a_broker_that_refuses_or_is_silent_is_away(
     broker: MagicMock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sender = MqttSender(parse("mqtt://there:9/rig", SENDERS), HEADER)
+    sender = MqttSender(parse("mqtt://there:9/rig"), HEADER)
     refusal = MagicMock(is_failure=True, __str__=lambda _: "Not authorized")
     broker.loop_start.side_effect = lambda: broker.on_connect(None, None, None, refusal, None)
     with pytest.raises(ConnectionError, match="Not authorized"):
@@ -136,7 +134,7 @@ def test_a_broker_that_refuses_or_is_silent_is_away(
 
 def test_several_bodies_have_topics_of_their_own() -> None:
     header = replace(HEADER, objects={"left hand": 1, "cup": 2, "\u5de6": 1, "\u53f3": 1})
-    found = topics(parse("ros2://rig/poses", SENDERS), header)
+    found = topics(parse("ros2://rig/poses"), header)
     # of names that no topic can have no two become one
     words = ["left_hand", "cup_0", "cup_1", "_", "__2"]
     assert list(found.poses.values()) == [f"/rig/poses/{word}" for word in words]
@@ -152,7 +150,7 @@ def test_the_stream_of_a_lost_frame_has_no_numbers_for_a_pose(
     pylsl.local_clock.return_value = 50.0
     monkeypatch.setitem(sys.modules, "pylsl", pylsl)
     monkeypatch.setattr("mixpose.errors.find_spec", lambda _: True)
-    sender = LslSender(parse("lsl://rig", SENDERS), HEADER)
+    sender = LslSender(parse("lsl://rig"), HEADER)
     _, _, channels, *_ = pylsl.StreamInfo.call_args.args
     lost = replace(ESTIMATE, status="lost", T_world_object=None, covariance=None)
     for estimate, status in ((lost, 0.0), (ESTIMATE, 2.0)):
@@ -210,7 +208,7 @@ def test_node_of_ros_publishes_a_pose_and_its_transform(monkeypatch: pytest.Monk
         return Messages()
 
     monkeypatch.setattr("importlib.import_module", module)
-    sender = RosNodeSender(parse("ros2://tool?frame=lab", SENDERS), HEADER)
+    sender = RosNodeSender(parse("ros2://tool?frame=lab"), HEADER)
     assert sender.send(Message(ESTIMATE))
     (topic, pose), (tf, transforms) = ros.published
     assert (topic, tf) == ("/tool", "/tf")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import command
 
-from mixpose.cli.app_simulate import SimulateRequest
+from mixpose.cli.app import SimulateRequest
 from mixpose.errors import SessionError
 from mixpose.simulation import SimulationOptions
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line, mixpose
 
-from mixpose.cli.usage import with_values
+from mixpose.cli.help import with_values
 from mixpose.errors import SessionError
 from mixpose.viewing.address import Guard, Place, listen
 

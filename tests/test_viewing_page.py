@@ -29,8 +29,8 @@ from websockets.exceptions import InvalidStatus
 
 from mixpose.viewing.address import listen
 from mixpose.viewing.moment import PACE, Moment, Shown, row_of
-from mixpose.viewing.outlines import outlines_of, up_of
 from mixpose.viewing.page import Page, status_text
+from mixpose.viewing.scene import outlines_of, up_of
 from mixpose.viewing.server import started
 
 

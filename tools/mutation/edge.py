@@ -356,7 +356,7 @@ _PUBLISHING = (
     ),
     Mutant(
         "publishing-password-told",
-        "publishing/address.py",
+        "publishing/message.py",
         'text = re.sub(r"//[^/]*@", "//", url)',
         "text = url",
         "a broker's password is in every message",

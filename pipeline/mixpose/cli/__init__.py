@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,18 +18,8 @@ from mixpose.threads import ask_for_one_blas_thread
 WRONG_USAGE = 2
 INTERRUPTED = 130
 
-# commands that write what they found when they have all of it
-_AT_ONCE = {
-    "align",
-    "check",
-    "convert",
-    "design",
-    "evaluate",
-    "inspect",
-    "learn",
-    "pivot",
-    "smooth",
-}
+AT_ONCE = {"align", "check", "convert", "design", "evaluate", "inspect", "learn", "pivot", "smooth"}
+"""Commands that write what they found when they have all of it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -46,8 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:  # while the commands were being imported
         status = _interrupted(words)
     except EOFError as error:  # likewise
-        from mixpose.cli.cut import cut_message  # noqa: PLC0415
-
         status = _fail(cut_message(error), WRONG_USAGE)
     sys.exit(status)
 
@@ -88,24 +77,19 @@ def _status(arguments: list[str]) -> int:
     import typer  # noqa: PLC0415
 
     from mixpose.cli.app import app  # noqa: PLC0415
-    from mixpose.cli.usage import with_values  # noqa: PLC0415
+    from mixpose.cli.help import usage_message, with_values  # noqa: PLC0415
     from mixpose.errors import MixposeError  # noqa: PLC0415
 
     debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"] or ["--help"]
-    arguments = with_values(arguments)
+    arguments = with_values([one for one in arguments if one != "--debug"] or ["--help"])
     try:
         outcome = typer.main.get_command(app).main(
             args=arguments, prog_name="mixpose", standalone_mode=False, obj=debug
         )
     except MixposeError as error:
-        _show_traceback(debug)
-        return _fail(str(error), error.exit_status)
+        return _fail(str(error), error.exit_status, debug=debug)
     except typer.TyperException as error:
-        _show_traceback(debug)
-        from mixpose.cli.usage import usage_message  # noqa: PLC0415
-
-        return _fail(usage_message(error, arguments), WRONG_USAGE)
+        return _fail(usage_message(error, arguments), WRONG_USAGE, debug=debug)
     except (KeyboardInterrupt, typer.Abort):
         outcome = INTERRUPTED
     except SystemExit as error:
@@ -115,11 +99,9 @@ def _status(arguments: list[str]) -> int:
         _drop_standard_output()
         return 0
     except OSError as error:
-        _show_traceback(debug)
         _drop_standard_output()
-        place = f"{error.filename}: " if error.filename else "output: "
-        reason = error.strerror or str(error)
-        return _fail(f"{place}cannot be written or read: {reason}", WRONG_USAGE)
+        told = f"{error.filename or 'output'}: cannot be written or read: "
+        return _fail(told + (error.strerror or str(error)), WRONG_USAGE, debug=debug)
     if outcome == INTERRUPTED:  # which is also what typer makes of a keyboard interrupt
         return _interrupted(arguments)
     return outcome if isinstance(outcome, int) else 0
@@ -129,15 +111,8 @@ def _interrupted(arguments: list[str]) -> int:
     # where the interrupt fell into an `exec`, as of a dataclass that was being imported, Python
     # would end by the signal whatever the status; the next `exec` makes it forget that
     exec("")
-    written = "" if _AT_ONCE & {*arguments[:1]} else "; everything so far is written"
+    written = "" if AT_ONCE & {*arguments[:1]} else "; everything so far is written"
     return _fail(f"interrupted{written}", INTERRUPTED)
-
-
-def _show_traceback(wanted: bool) -> None:
-    if wanted:
-        import traceback  # noqa: PLC0415
-
-        traceback.print_exc()
 
 
 def _drop_standard_output() -> None:
@@ -145,8 +120,22 @@ def _drop_standard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _fail(message: str, status: int) -> int:
+def cut_message(error: EOFError) -> str:
+    """One line: which compiled module ends too early, where it was one that was imported.
+
+    No command reads what is typed, so that a file must be cut.
+    """
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        path = frame.f_locals.get("bytecode_path")  # as importlib calls it
+        if isinstance(path, str):
+            return f"{path}: is damaged: {error}; remove this file, Python makes it anew"
+    return f"a file ends too early: {error or 'EOFError'}; --debug shows where it was read"
+
+
+def _fail(message: str, status: int, *, debug: bool = False) -> int:
     from mixpose.cli.notices import say  # noqa: PLC0415
 
+    if debug:
+        traceback.print_exc()
     say(" ".join(message.split()))
     return status

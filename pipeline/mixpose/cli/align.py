@@ -29,8 +29,8 @@ MARK = "# Aligned by mixpose"
 def align_session(request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
-    Raises SessionError if the session or the options are wrong, or directions of the world are
-    held in it. Raises RecordingError if the poses tell no floor.
+    Raises SessionError if directions of the world are held in it, and RecordingError if the poses
+    tell no floor.
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
@@ -38,7 +38,7 @@ def align_session(request: AlignRequest) -> None:
     rewriting.refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
-    refuse_suffix(request.output, "-o", (".toml",), "it is a session that is written")
+    refuse_suffix(request.output, (".toml",), "it is a session that is written")
     sources = request.source or ()
     estimates = [one for each in request.floor for one in _told(each, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from mixpose.cli import app_after
-from mixpose.cli.app_before import CalibrateRequest, DesignRequest, ImportRequest, LearnRequest
-from mixpose.cli.app_simulate import SimulateRequest
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.words import AllowCode, Format, Recordings, SessionFile, option, taking
+from mixpose.cli.request import RunRequest, Sources
+from mixpose.cli.words import AllowCode, Recordings, SessionFile, option, taking
+from mixpose.units import Unit
+
+MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
+IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
+"""Groups of the options of ``mixpose simulate``."""
 
 app = typer.Typer(
     name="mixpose",
@@ -43,117 +47,115 @@ def _common(
     pass
 
 
-Sources = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=PATH",
-        help="Another recording of a sensor, relative to the working folder, or the number of a "
-        "camera; repeatable.",
-    ),
-]
+@dataclass(frozen=True)
+class ImportRequest:
+    """Make a session of the calibration files of other programs."""
+
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
+            "and bodies: .csv, .rom, .vsk or .obj.",
+        ),
+    ]
+    output: Path = option("The session file, which must be new; or stdout (-).", ...)
+    unit: Unit = option("Unit of lengths in the session.", "mm")
+    lengths: Unit | None = option("Unit of translations in files whose format does not fix it.")
 
 
 @dataclass(frozen=True)
-class RunWords:
-    """Estimate a pose per frame."""
+class CalibrateRequest:
+    """Calibrate sensors from a recording of the body, without matching markers."""
 
-    context: typer.Context
-    sessions: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SESSION.toml...",
-            help="One session file or several, patterns such as 'day*/session.toml', or text files "
-            "(.txt) with one to a line.",
-        ),
-    ]
+    session: SessionFile
     output: Path | None = option(
-        None,
-        "Write poses here, not to stdout (-), in the format that the suffix tells. With "
-        "several sessions, a folder in which each gets its own for poses, log and status; what "
-        "is done there already is not done again.",
-        "-o",
-        "--output",
+        "The calibrated session; or stdout (-).", metavar="CALIBRATED.toml"
     )
-    format: Format | None = option(
-        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
+    poses: Path | None = option(
+        "Known poses of the body; else none is known.", metavar="POSES.jsonl"
     )
-    source: Sources = None
-    start: int | None = option(None, "First frame number.")
-    stop: int | None = option(None, "Frame number to stop before.")
-    step: int = option(1, "Take every N-th frame number.", min=1)
-    resume: bool = option(False, "Go on after the last frame in the output.")
-    workers: int = option(1, "How many sessions are run at a time.", min=1)
-    overlay: Path | None = option(
-        None, "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
+    free: list[str] | None = option(
+        "What is sought: pose, focal, principal_point, distortion, delay, drift, "
+        "position, range_bias, of a sensor or, without its name, of all; or body, the marker "
+        "coordinates. Repeatable. Else the poses of all cameras but the first and the "
+        "positions of range sensors.",
+        metavar="SENSOR:WHAT",
     )
-    view: str | None = option(
-        None,
-        "Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
-        "opens it to others who have the address with its token.",
-        metavar="[PORT]",
+    length: str | None = option(
+        "A known distance, which gives scale.", metavar="SENSOR:SENSOR=LENGTH"
     )
-    pause: bool = option(False, "With --view, on files: begin paused, to go on from the page.")
-    scheduler: str | None = option(
-        None,
-        "Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
-        "local for one on this machine.",
-        metavar="ADDRESS",
+    world: str | None = option(
+        "Whose frame becomes the world; else it stays.", metavar="SENSOR|body@FRAME"
     )
-    labels: bool = option(
-        False,
-        "Say in each pose line which detection is which feature, and where features are in "
-        "space by these alone; .jsonl only.",
-    )
-    publish: list[str] | None = option(
-        None,
-        "Send each pose to another program too: udp://host:port, tcp://host:port, "
-        "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
-        "'?only=ok' none but those that are ok; repeatable.",
-        metavar="URL",
-    )
-    predict: float | None = option(
-        None, "Publish where the body will be so much after each frame.", metavar="SECONDS"
-    )
+    check: bool = option("Only say whether the calibration still holds.", False)
+    report: Path | None = option("A page with pictures; or stdout (-).", metavar="FILE.html")
+    source: Recordings = None
     allow_code: AllowCode = False
 
 
-def run(words: RunWords) -> None:
-    """Run one session here, or many in processes of their own, as was asked for."""
-    from mixpose.cli.request import RunRequest, format_of, output_of  # noqa: PLC0415
-    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
-    from mixpose.errors import SessionError  # noqa: PLC0415
-    from mixpose.selection import Selection  # noqa: PLC0415
+@dataclass(frozen=True)
+class LearnRequest:
+    """Learn the markers of bodies from a recording in which they move."""
 
-    sessions, output = words.sessions, output_of(words.output)
-    many = are_many(sessions, words.scheduler)
-    # of many: a folder
-    written = (words.format or "jsonl") if many else format_of(output, words.format)
-    shared = {one.name for one in fields(RunRequest)}
-    given = {
-        **{name: value for name, value in vars(words).items() if name in shared},
-        "output": output,
-        "format": written,
-        "sources": tuple(words.source or ()),
-        "selection": Selection(words.start, words.stop, words.step),
-        "publish": tuple(words.publish or ()),
-        "debug": bool(words.context.obj),
-    }
-    request = RunRequest(**given)
-    if words.labels and written != "jsonl":
-        raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
-    if many and (words.publish or words.predict is not None):
-        raise SessionError(
-            "--publish: found several sessions; allowed is one, whose poses receivers take for one "
-            "recording"
-        )
-    if many:
-        raise typer.Exit(run_sessions(sessions_of(sessions), request, words.workers))
-    from mixpose.cli.notices import warn  # noqa: PLC0415
-    from mixpose.cli.run import run_session  # noqa: PLC0415
+    session: SessionFile
+    output: Path = option(
+        "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
+        "one may go to stdout (-).",
+        ...,
+        metavar="BODY.csv",
+    )
+    axes: str | None = option(
+        "Three markers by name: the origin, one on the x axis, one in the x-y plane. Else "
+        "the middle of all markers and their principal axes.",
+        metavar="ORIGIN,X,Y",
+    )
+    like: Path | None = option(
+        "An older or measured table of the same markers, whose axes and names are kept.",
+        metavar="OLD.csv",
+    )
+    source: Recordings = None
+    allow_code: AllowCode = False
 
-    if words.workers > 1:
-        warn(f"--workers {words.workers}: one session is one process, frames follow each other")
-    run_session(Path(sessions[0]), request)
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Predict the accuracy of planned systems, side by side, and what would improve them."""
+
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION.toml", help="One system or several; others are held to the first."
+        ),
+    ]
+    poses: Path | None = option("Judge at these poses, not over a volume.", metavar="POSES.jsonl")
+    count: int = option("Number of poses in the volume.", 24, min=1, max=2000)
+    volume: str | None = option(
+        "Sides of the box around [start] or the middle of the view; else twice the body's radius.",
+        metavar="X,Y,Z",
+    )
+    turn: float | None = option(
+        "Turn the body by up to so many degrees; else 20 about [start], or 180."
+    )
+    tip: str | None = option("Judge a point of the body, in its coordinates.", metavar="X,Y,Z")
+    noise: list[str] | None = option(
+        "What features err by, px or length; SYSTEM:SENSOR=NUMBER for one system, * for "
+        "every sensor; else 0.2 of sigma for cameras, sigma for ranges.",
+        metavar="SENSOR=NUMBER",
+    )
+    monte_carlo: int = option("Simulate and estimate so many frames of each system.", 0, min=0)
+    seed: int = option("Same seed, same study.", 0, min=0)
+    tolerance: float | None = option(
+        "Markers of two bodies lie alike within this; else 10 % of the radius.", min=0, max=1e9
+    )
+    json: Path | None = option("Write all numbers here; or to stdout (-).")
+    plot: Path | None = option("Draw it: .png, .svg or .pdf.")
+    workers: int = option("How many poses are simulated at a time.", 1, min=1)
+    scheduler: str | None = option(
+        "Simulate on a dask.distributed cluster: the address of its scheduler, or local "
+        "for one on this machine.",
+        metavar="ADDRESS",
+    )
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
 
     session: SessionFile
-    quick: bool = option(False, "Look at a few frames of each sensor only.")
+    quick: bool = option("Look at a few frames of each sensor only.", False)
     source: Sources = None
     allow_code: AllowCode = False
 
@@ -171,17 +173,85 @@ class InspectRequest:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
     session: SessionFile
-    output: Path = option(..., "Folder for the pictures.", "-o", "--output")
-    frame: int | None = option(None, "Number of the frame; else the recording's first.")
+    output: Path = option("Folder for the pictures.", ...)
+    frame: int | None = option("Number of the frame; else the recording's first.")
     poses: Path | None = option(
-        None, "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
+        "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
     )
     source: Recordings = None
     allow_code: AllowCode = False
 
 
+@dataclass(frozen=True)
+class SimulateRequest:
+    """Render a recording with truth.jsonl that `run` can play."""
+
+    session: SessionFile
+    output: Path = option("New folder for the recording.", ...)
+    frames: int = option("Number of frames.", ..., min=1)
+    seed: int = option("Same seed, same recording.", 0, min=0)
+    fps: float | None = option(
+        "Frames per second; for poses with times put fps into the session.", panel=TIME
+    )
+    noise: float = option("Camera noise, grey levels.", 2.0, panel=IMAGES)
+    clutter: float = option("False features per frame and sensor.", 0.0, panel=IN_VIEW)
+    hidden: float = option("Chance that a feature is hidden.", 0.0, panel=IN_VIEW)
+    missing: float = option("Chance that a sensor has no frame.", 0.0, panel=TIME)
+    brightness: float = option("Peak of a spot, grey levels.", 170.0, panel=IMAGES)
+    brightness_spread: float = option(
+        "Spread of the brightness over the features, as a share.", 0.1, panel=IMAGES
+    )
+    amplitude_translation: float | None = option(
+        "Largest displacement along each axis, length units.", name="--translation", panel=MOTION
+    )
+    amplitude_rotation_deg: float = option(
+        "Largest turn about each axis, degrees.", 20.0, name="--rotation", panel=MOTION
+    )
+    period_s: float = option(
+        "Seconds in which the motion comes round.", 4.0, name="--period", panel=MOTION
+    )
+    pixel_noise: float = option("Error of detections in a camera's table, px.", 0.1, panel=TABLES)
+    range_noise: float | None = option(
+        "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
+    )
+    range_snr: float = option("Height of a profile's peak over its noise.", 30.0, panel=TABLES)
+    deform: bool = option(
+        "Displace features by the spread the object states.", False, panel=IN_VIEW
+    )
+    readout: float | None = option(
+        "Seconds from a camera's first row to its last; else the session's.", panel=TIME
+    )
+    exposure: float | None = option(
+        "Seconds for which a row is lit; else the session's.", panel=TIME
+    )
+    delay: list[str] | None = option(
+        "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
+    )
+    out_of_step: float = option(
+        "Seconds from the first sensor to the last, in their times.", 0.0, panel=TIME
+    )
+    lamps: int = option("Lamps behind the body.", 0, min=0, panel=IN_VIEW)
+    mirror: float = option(
+        "Brightness of mirror images in a table below, as a share.", 0.0, panel=IN_VIEW
+    )
+    others: int = option(
+        "Other bodies with as many markers, beside this one.", 0, min=0, panel=IN_VIEW
+    )
+    occluder: int = option("Dark bars that swing before it.", 0, min=0, panel=IN_VIEW)
+    jpeg: int | None = option("Quality of lossy compression.", min=1, max=100, panel=IMAGES)
+    bayer: bool = option("Images of a colour sensor, interpolated.", False, panel=IMAGES)
+    turned_camera_deg: float = option(
+        "Degrees by which the last camera was turned meanwhile.",
+        0.0,
+        name="--turned-camera",
+        panel=TIME,
+    )
+    away_from: int | None = option("Frames after which the body is gone.", min=0, panel=MOTION)
+    overwrite: bool = option("Replace a recording in the folder.", False)
+
+
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "run": taking(RunWords, run),
+    "run": taking(RunRequest, "several:run"),
     "check": taking(CheckRequest, "check:check_session"),
     "inspect": taking(InspectRequest, "inspect:inspect_frame"),
     "import": taking(ImportRequest, "importing:import_files"),

@@ -41,7 +41,7 @@ class ReportRequest:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
 
     poses: PosesFile
-    output: Path = option(..., "The page, as report.html; or stdout (-).", "-o", "--output")
+    output: Path = option("The page, as report.html; or stdout (-).", ...)
     truth: Annotated[Path | None, TRUTH] = None
 
 
@@ -57,30 +57,27 @@ class ConvertRequest:
     """Write poses in the format of another program."""
 
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
-    output: Path | None = option(None, "Write here, not to stdout (-).", "-o", "--output")
+    output: Path | None = option("Write here, not to stdout (-).")
     format: ConvertFormat | None = option(
-        None, "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
+        "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
     )
-    unit: str | None = option(None, "Unit of lengths where POSES does not say: m, cm, mm, um.")
-    object: str | None = option(None, "Only the poses of this object.")
-    only_ok: bool = option(False, "Leave out ambiguous frames too.")
-    scene_id: int | None = option(None, "bop: the scene; 0.", min=0)
-    obj_id: int | None = option(None, "bop: the object; 1.", min=0)
+    unit: str | None = option("Unit of lengths where POSES does not say: m, cm, mm, um.")
+    object: str | None = option("Only the poses of this object.")
+    only_ok: bool = option("Leave out ambiguous frames too.", False)
+    scene_id: int | None = option("bop: the scene; 0.", min=0)
+    obj_id: int | None = option("bop: the object; 1.", min=0)
     relative_to: str | None = option(
-        None,
         "bop, csv, ros, tum: relative to a camera, or another body of POSES, not the world.",
         metavar="NAME",
     )
-    session: Path | None = option(None, "The session of the poses, where they do not lead to it.")
+    session: Path | None = option("The session of the poses, where they do not lead to it.")
     source: list[str] | None = option(
-        None, "rerun: as for run, else that of the run.", metavar="NAME=PATH"
+        "rerun: as for run, else that of the run.", metavar="NAME=PATH"
     )
     measured: bool = option(
-        False, "c3d, trc: leave gaps where a marker was not measured by itself."
+        "c3d, trc: leave gaps where a marker was not measured by itself.", False
     )
-    fps: float | None = option(
-        None, "c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6
-    )
+    fps: float | None = option("c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6)
     allow_code: AllowCode = False
 
 
@@ -89,14 +86,12 @@ class SmoothRequest:
     """Smooth the poses of a recording, each by all that came before and after."""
 
     poses: PosesFile
-    output: Path | None = option(
-        None, "Write here, not to stdout (-).", "-o", "--output", metavar="SMOOTH.jsonl"
-    )
+    output: Path | None = option("Write here, not to stdout (-).", metavar="SMOOTH.jsonl")
     fill: float = option(
-        0.0, "Fill gaps of at most so long, marked; else none.", min=0, metavar="SECONDS"
+        "Fill gaps of at most so long, marked; else none.", 0.0, min=0, metavar="SECONDS"
     )
     motion: Literal["acceleration", "jerk", "snap", "crackle"] | None = option(
-        None, "Which derivative of the motion takes white noise; else the likeliest."
+        "Which derivative of the motion takes white noise; else the likeliest."
     )
 
 
@@ -105,11 +100,11 @@ class PivotRequest:
     """The tip of a tool, from poses while it turns about its tip."""
 
     poses: PosesFile
-    object: str | None = option(None, "The tool, where there are several bodies.", metavar="OBJECT")
+    object: str | None = option("The tool, where there are several bodies.", metavar="OBJECT")
     reference: str | None = option(
-        None, "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
+        "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
     )
-    into: Path | None = option(None, "Write the tip into this session.", metavar="SESSION.toml")
+    into: Path | None = option("Write the tip into this session.", metavar="SESSION.toml")
 
 
 @dataclass(frozen=True)
@@ -118,13 +113,11 @@ class AlignRequest:
 
     session: SessionFile
     floor: list[str] = option(
-        ...,
         "What lies on the floor: poses, or a body in a frame. Repeatable.",
+        ...,
         metavar="POSES.jsonl|OBJECT@FRAME",
     )
-    output: Path = option(
-        ..., "The aligned session; or stdout (-).", "-o", "--output", metavar="ALIGNED.toml"
-    )
-    up: Literal["x", "y", "z"] = option("z", "The axis that points up.")
+    output: Path = option("The aligned session; or stdout (-).", ..., metavar="ALIGNED.toml")
+    up: Literal["x", "y", "z"] = option("The axis that points up.", "z")
     source: Recordings = None
     allow_code: AllowCode = False

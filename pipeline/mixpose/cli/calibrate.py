@@ -17,17 +17,9 @@ from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.writing import MARK, calibrated_text
-from mixpose.cli.app_before import CalibrateRequest
+from mixpose.cli import output
+from mixpose.cli.app import CalibrateRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import (
-    is_stdout,
-    print_lines,
-    refuse_one_for_two,
-    refuse_suffix,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -42,41 +34,39 @@ from mixpose.session.rewriting import refuse_held, refuse_lost_code
 def calibrate_session(request: CalibrateRequest) -> None:
     """Calibrate a session and write what was found.
 
-    Raises SessionError if the session or an option is wrong, or the output would overwrite
-    something else. Raises RecordingError if the recording or the poses cannot be read, or do not
-    show the body.
+    Raises RecordingError if the recording or the poses do not show the body.
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
-    output = request.output
-    if (output is None) is not request.check:
+    target = request.output
+    if (target is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
-    refuse_one_for_two(request.report, "--report", output, "-o")
-    if output is not None:
-        refuse_suffix(output, "-o", (".toml",), "it is a session that is written")
-        refuse_lost_code(session, output)
+    output.refuse_one_for_two(request.report, "--report", target, "-o")
+    if target is not None:
+        output.refuse_suffix(target, (".toml",), "it is a session that is written")
+        refuse_lost_code(session, target)
         if request.world is not None:
             refuse_held(session)
-    inputs = [path] if request.poses is None else [path, request.poses]
-    for written, mark, option in ((output, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
+    inputs = path, request.poses
+    for written, mark, option in ((target, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
-            refuse_to_overwrite_but(written, inputs, mark, option)
+            output.refuse_to_overwrite_but(written, inputs, mark, option)
     with _calibrated(session, request, inputs) as found:
-        if output is not None:
-            write_text(output, calibrated_text(session, found, output, __version__), "-o")
+        if target is not None:
+            output.write_text(target, calibrated_text(session, found, target, __version__), "-o")
         if request.report is not None:
             page = render_calibration(found, path.name, session.unit, __version__)
-            write_text(request.report, page, "--report")
-    told = (check_lines if output is None else lines_of)(found, session.unit)
-    print_lines(told, output, request.report)
+            output.write_text(request.report, page, "--report")
+    told = (check_lines if target is None else lines_of)(found, session.unit)
+    output.print_lines(told, target, request.report)
     _warn(found, session.unit)
-    if output is not None:
-        say(f"calibrated from {len(found.used)} frames -> {shown(output)}")
+    if target is not None:
+        say(f"calibrated from {len(found.used)} frames -> {output.shown(target)}")
 
 
 @contextmanager
 def _calibrated(
-    session: Session, request: CalibrateRequest, inputs: Sequence[Path]
+    session: Session, request: CalibrateRequest, inputs: Sequence[Path | None]
 ) -> Iterator[Calibration]:
     """Calibrate, for as long as what comes of it is written."""
     rules = CalibrationRules()
@@ -87,9 +77,9 @@ def _calibrated(
             if len(session.objects) > 1:
                 say(f"of {len(session.objects)} bodies {session.body.name!r} is looked at")
             saved = None
-            if request.output is not None and not is_stdout(request.output):
+            if request.output is not None and not output.is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")
-                refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
+                output.refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
                 saved = kept.enter_context(Saved(partial, _key_of(session, task)))
                 if saved.resumed:
                     say(f"going on: {saved.resumed} frames of cameras were searched before")
@@ -106,8 +96,7 @@ def task_of(
     require_points(session.body)
     setups, rig = session.sensors, rig_of(session)
     known = None if request.poses is None else known_poses(request.poses, session)
-    # one word of --free may hold several
-    free_words = [part for word in request.free or () for part in word.split()]
+    free_words = " ".join(request.free or ()).split()  # one of --free may hold several
     is_known = known is not None
     free, body = words.free_parameters(rig, free_words, poses_known=is_known, world=request.world)
     pair = None if request.length is None else words.known_length(rig, request.length)[0]
@@ -145,10 +134,7 @@ def task_of(
 
 
 def known_poses(path: Path, session: Session) -> dict[int, Floats]:
-    """Poses of the session's body by frame number.
-
-    Raises RecordingError if the file holds none, or its unit is another.
-    """
+    """Poses (4, 4) of the session's body by frame number; RecordingError if there is none."""
     poses = read_poses(path)
     poses.require_unit(session.unit, RecordingError)
     found = {
@@ -183,12 +169,10 @@ def _warn(found: Calibration, unit: str) -> None:
             f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
             "was: record the body where both see it"
         )
-    refused = (
-        f"not determined: {direction}: what is written of it tells nothing"
-        for direction in found.refused
-    )
-    for doubt in (*doubts_of(found, unit), *refused):
+    for doubt in doubts_of(found, unit):
         warn(doubt)
+    for direction in found.refused:
+        warn(f"not determined: {direction}: what is written of it tells nothing")
     if found.bad:
         numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
         warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,6 +14,7 @@ from mixpose.body import default_tolerance, is_on_a_line
 from mixpose.checking import geometry, keys, lookalikes, placement, recordings
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.notices import bar
+from mixpose.cli.output import print_lines
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
@@ -52,15 +52,14 @@ class _Report:
             self.say("warning", warning)
         if not self.warnings:
             self.say("warnings", f"none{beside}; {tried}")
-        sys.stdout.write("\n".join(self.lines) + "\n")
+        print_lines(self.lines)
 
 
 def check_session(request: CheckRequest) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
-    Raises SessionError as ``mixpose run`` would before its first frame, and RecordingError if a
-    recording cannot be opened or its table of times lacks rows, or, after all has been printed, if
-    a frame is damaged.
+    Raises RecordingError if a table of times lacks rows or, after all has been printed, if a frame
+    is damaged.
     """
     session, quick = load_session(request.session, allow_code=request.allow_code), request.quick
     replaced = named_sources(request.source or ())
@@ -162,26 +161,14 @@ def _say_sensor(
     report.say("", f"{source.describe()}; {read}" if not found.damage or found.numbers else read)
     for text in found.damage[: recordings.LISTED]:
         report.say("", f"damaged: {text}")
-    where = f"sensor {setup.name!r}"
-    caution = source.caution()
-    if caution:
-        report.warnings.append(f"{where}: {caution}")
-    if all(each.is_whole for each in surveys.values()):
-        _say_missing(report, setup.name, surveys)
+    if caution := source.caution():
+        report.warn(f"sensor {setup.name!r}: {caution}")
+    own = {*found.numbers, *found.damaged}
+    known = own.union(*(each.numbers for each in surveys.values()))
+    missing = recordings.listed(sorted(known - own))
+    if missing and all(each.is_whole for each in surveys.values()):
+        report.say("", f"missing: {missing} of the {len(known)} frames of all sensors")
     _say_features(report, session, setup, source, found)
-
-
-def _say_missing(report: _Report, name: str, surveys: Mapping[str, recordings.Survey]) -> None:
-    """Frames that other sensors have."""
-    own = {*surveys[name].numbers, *surveys[name].damaged}
-    others = [each for other, each in surveys.items() if other != name]
-    known = set().union(*(each.numbers for each in others))
-    missing = sorted(known - own)
-    if missing:
-        everyone = len(known | own)
-        report.say(
-            "", f"missing: {recordings.listed(missing)} of the {everyone} frames of all sensors"
-        )
 
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
@@ -219,11 +206,11 @@ def _say_features(
     alone = [(session.alone(one.body.name), one.count) for one in session.objects]
     expected = sum(count * placement.expected_count(setup, each) for each, count in alone)
     if not (found.numbers or found.damage):
-        report.warnings.append(f"{where}: its recording has no frame")
+        report.warn(f"{where}: its recording has no frame")
     if found.counts is None:
         if found.numbers and found.empty:
             frames = recordings.listed(found.empty)
-            report.warnings.append(f"{where}: nothing but one value in frame {frames}")
+            report.warn(f"{where}: nothing but one value in frame {frames}")
         return
     low, high = min(found.counts), max(found.counts)
     middle = float(np.median(found.counts))
@@ -242,7 +229,7 @@ def _say_features(
             f"{expected} are expected: {keys.advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
-        report.warnings.append(f"{where}: no feature in frame {recordings.listed(found.empty)}")
+        report.warn(f"{where}: no feature in frame {recordings.listed(found.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:

@@ -13,7 +13,9 @@ import zlib
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
+from mixpose import __version__
 from mixpose.cli.lines import LineFile, note_path
 from mixpose.cli.notices import say
 from mixpose.cli.request import RunRequest
@@ -45,35 +47,50 @@ class Note:
 
 
 class Notes:
-    """Writes down every now and then what a run knows."""
+    """Writes down every now and then what a run knows; gone when the recording is done.
 
-    def __init__(self, poses: Path, version: str) -> None:
-        self._path, self._version = note_path(poses), version
+    A context; of poses that cannot be gone on with nothing is written.
+    """
+
+    def __init__(self, request: RunRequest) -> None:
+        poses, format_name = request.poses, request.format_name
+        can_go_on = poses is not None and format_name == "jsonl" and not is_device(poses)
+        self._path = note_path(poses) if poses is not None and can_go_on else None
+        self._is_all = request.stop is None
         self._last: tuple[int, LineFile, Memory] | None = None
         self._written_at = -INTERVAL_S
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is not None or not self._is_all:
+            self._write()
+        elif self._path is not None:
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
 
     def remember(self, frame: int, file: LineFile, memory: Memory) -> None:
         """Take what is known after a frame whose lines are written."""
         self._last = frame, file, memory
         if time.monotonic() - self._written_at >= INTERVAL_S:
-            self.write()
+            self._write()
 
-    def write(self) -> None:
+    def _write(self) -> None:
         """Write down what was taken last, where there is room: poses are worth more than notes."""
-        if self._last is None:
+        if self._last is None or self._path is None:
             return
         frame, file, memory = self._last
-        note = Note(self._version, frame, file.size, file.checksum, memory)
+        note = Note(__version__, frame, file.size, file.checksum, memory)
         # without it, as on a full disk, frames are estimated again
         with suppress(OSError), appearing_whole(self._path) as part:
             part.write_text(json.dumps(encode(note)), encoding="ascii")
         self._last, self._written_at = None, time.monotonic()
 
-    def drop(self) -> None:
-        """Forget everything: the recording is done."""
-        self._last = None
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
+
+def is_device(path: Path) -> bool:
+    """Whether a path is a pipe or a device, which holds nothing that could be lost."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @dataclass(frozen=True)
@@ -101,8 +118,8 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
                 f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
                 "and name another file with -o"
             )
-    poses, wanted = request.output, request.selection
-    if poses is None or request.format != "jsonl":
+    poses, wanted = request.poses, request.selection
+    if poses is None or request.format_name != "jsonl":
         raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
     if not poses.is_file():
         return Continuation(None, wanted)
@@ -118,7 +135,7 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         with closing(pair(opened, after.start, after.stop, after.step)) as frames:
             if next(frames, None) is None:
                 return Continuation(file, after, is_done=True)
-        note = _note(poses, header.mixpose)
+        note = _note(poses)
         if note is not None:
             file.rewind(note.size, note.checksum)
             return Continuation(file, _after(wanted, note.frame), note.memory)
@@ -157,12 +174,12 @@ def _after(wanted: Selection, last: int) -> Selection:
     return replace(wanted, start=begin)
 
 
-def _note(poses: Path, version: str) -> Note | None:
+def _note(poses: Path) -> Note | None:
     """The note about a poses file, if there is one that fits it."""
     try:
         note = decode(Note, json.loads(note_path(poses).read_bytes()))
     except (OSError, ValueError, RecursionError):
         return None
     beginning = poses.read_bytes()[: note.size]
-    fits = note.mixpose == version and len(beginning) == note.size > 0
+    fits = note.mixpose == __version__ and len(beginning) == note.size > 0
     return note if fits and zlib.crc32(beginning) == note.checksum else None

@@ -10,18 +10,12 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.cli.app_after import ConvertRequest
-from mixpose.cli.notices import say, warn
-from mixpose.cli.output import pose_output, refuse_to_overwrite, written_paths
+from mixpose.cli.notices import counted, say, warn
+from mixpose.cli.output import Output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
-from mixpose.poses.estimates import (
-    first_answers,
-    header_of,
-    objects_of,
-    relative_to,
-    relative_to_body,
-)
+from mixpose.poses import estimates
 from mixpose.poses.formats import ONE_TRAJECTORY
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -35,8 +29,7 @@ _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 def convert_poses(request: ConvertRequest) -> None:
     """Write the poses of a file in another format.
 
-    Raises SessionError if the options are wrong or do not say enough. Raises RecordingError if the
-    poses file cannot be read, or holds what the format cannot say.
+    Raises RecordingError if it holds what the format cannot say.
     """
     request = replace(request, output=output_of(request.output))
     path, name = request.poses, _format(request)
@@ -59,10 +52,7 @@ def convert_poses(request: ConvertRequest) -> None:
     if name == "rerun":
         write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
-        unit = _unit(poses, request)
-        given = request.session
-        session = session_of(poses, given, allow_code=request.allow_code, unit=unit)
-        write_markers(poses, lines, session, name, request)
+        write_markers(poses, lines, _unit(poses, request), name, request)
         return
     else:
         _write(poses, lines, name, T_sensor_world, request)
@@ -70,7 +60,7 @@ def convert_poses(request: ConvertRequest) -> None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
         many = len(lines) if name in ("jsonl", "csv", "rerun") else posed
-        say(f"{many} pose{'s' * (many != 1)} -> {', '.join(map(str, outputs))}")
+        say(f"{counted(many, 'pose')} -> {', '.join(map(str, outputs))}")
 
 
 def _write(
@@ -83,13 +73,13 @@ def _write(
     frame_id = request.relative_to if name == "ros" else None
     given = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
     options = {key: value for key, value in given.items() if value is not None}
-    header = header_of(poses, _unit(poses, request), __version__)
+    header = estimates.header_of(poses, _unit(poses, request), __version__)
     if name != "bop" or (request.object is not None and request.obj_id is not None):
-        header = replace(header, objects=objects_of(lines))
+        header = replace(header, objects=estimates.objects_of(lines))
     labels = tuple(dict.fromkeys(line.label for line in lines))
-    with pose_output(request.output, name, header, labels, options=options, whole=True) as output:
+    with Output(request.output, name, header, labels, options=options, whole=True) as output:
         for line in lines:
-            output.write(relative_to(T_sensor_world, line))
+            output.write(estimates.relative_to(T_sensor_world, line))
 
 
 def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
@@ -108,13 +98,13 @@ def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
 def _beside(poses: PoseFile, reference: str) -> PoseFile:
     """Poses of the other bodies of a file in the axes of one of them."""
     own = [line for line in poses.poses if line.label == reference]
-    known = {line.frame: line for line in first_answers(own)}
+    known = {line.frame: line for line in estimates.first_answers(own)}
     if len(known) < len(own):
         warn(f"{poses.path}: several right answers for {reference!r}; the first is taken")
     others = [line for line in poses.poses if line.label != reference]
     if not others:
         raise SessionError(f"--relative-to {reference}: {poses.path} has poses of no other body")
-    beside = tuple(relative_to_body(line, known.get(line.frame)) for line in others)
+    beside = tuple(estimates.relative_to_body(line, known.get(line.frame)) for line in others)
     lost = sum(
         one.status != "lost" and then.status == "lost"
         for one, then in zip(others, beside, strict=True)
@@ -217,6 +207,6 @@ def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseL
     answers = Counter((line.frame, line.label) for line in lines)
     several = sum(count > 1 for count in answers.values())
     if several:
-        count = f"{several} frame{'s' * (several != 1)}"
-        warn(f"{poses.path}: several right answers in {count}; the first is written")
-    return first_answers(lines)
+        frames = counted(several, "frame")
+        warn(f"{poses.path}: several right answers in {frames}; the first is written")
+    return estimates.first_answers(lines)

@@ -12,8 +12,8 @@ import numpy as np
 
 from mixpose.checking import with_image_sizes
 from mixpose.cli import output
-from mixpose.cli.app_before import DesignRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.app import DesignRequest
+from mixpose.cli.notices import counted, say, warn
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
@@ -70,14 +70,13 @@ def design_sessions(asked: DesignRequest) -> None:
             draw_study(found, draft)
             sign_figure(draft)
     if written := [output.shown(path) for path in (asked.json, asked.plot) if path is not None]:
-        say(f"{len(names)} system{'s' * (len(names) != 1)} -> {', '.join(written)}")
+        say(f"{counted(len(names), 'system')} -> {', '.join(written)}")
 
 
 def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
     """See that what will be written is in nothing's way, before anything is computed."""
     if asked.json is not None:
-        inputs = [*sessions] if asked.poses is None else [*sessions, asked.poses]
-        output.refuse_to_overwrite_but(asked.json, inputs, JSON_MARK, "--json")
+        output.refuse_to_overwrite_but(asked.json, (*sessions, asked.poses), JSON_MARK, "--json")
     output.refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
     output.refuse_one_for_two(asked.plot, "--plot", asked.json, "--json")
     if asked.plot is not None:
@@ -146,13 +145,14 @@ def _noises(
             )
         if system and system not in names:
             raise SessionError(f"--noise: found no system {system!r}; systems: {', '.join(names)}")
-        matched = False
-        for k, (name, session) in enumerate(zip(names, sessions, strict=True)):
-            for setup in session.sensors:
-                if system in ("", name) and sensor in ("*", setup.name):
-                    noises[k, setup.name] = value
-                    matched = True
-        if not matched:
+        meant = [
+            (k, setup.name)
+            for k, (name, session) in enumerate(zip(names, sessions, strict=True))
+            for setup in session.sensors
+            if system in ("", name) and sensor in ("*", setup.name)
+        ]
+        noises |= dict.fromkeys(meant, value)
+        if not meant:
             known = sorted({setup.name for session in sessions for setup in session.sensors})
             raise SessionError(f"--noise: found no sensor {sensor!r}; sensors: {', '.join(known)}")
     return noises

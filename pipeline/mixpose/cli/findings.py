@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
-from mixpose.cli.body_size import BodySize, size_warnings
-from mixpose.cli.marker_offsets import MOVED, Marker, add_markers, marker_lines
+from mixpose.cli import marker_offsets as offsets
+from mixpose.cli.marker_offsets import BodySize, Marker
 from mixpose.frames.repeated import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
@@ -62,6 +62,10 @@ class Stretches:
         """Frames of the longest stretch."""
         return max((each[2] for each in self.found), default=0)
 
+    def are_no_accident(self, total: int) -> bool:
+        """Whether they come in a row, or in turns all over a run of so many frames."""
+        return self.longest >= _LONG or self.count > _OFTEN * total
+
     def text(self) -> str:
         """The frames for people, the longest stretches if there are many."""
         chosen = sorted(sorted(self.found, key=lambda each: -each[2])[:_SHOWN])
@@ -77,27 +81,19 @@ class Findings:
         self._session = session
         self._places = -1
         self._ok = self._lost = 0
-        names = [setup.name for setup in session.sensors]
-        kinds = [{name: Stretches() for name in names} for _ in range(5)]
+        self._setups = {setup.name: setup for setup in session.sensors}
+        self._bodies = {label: one.body for one in session.objects for label in one.labels}
+        kinds = [{name: Stretches() for name in self._setups} for _ in range(5)]
         self._no_frame, self._no_feature, self._flooded, self._same, self._far = kinds
-        self._most = dict.fromkeys(names, 0)  # features of one frame
-        self._expected = sum(len(one.body) * len(one.labels) for one in session.objects)
-        self._usual = {name: deque[float](maxlen=_USUAL) for name in names}
-        self._sigmas = {setup.name: setup.extract.sigma for setup in session.sensors}
-        self._units = {
-            setup.name: "px" if setup.sensor.unit == "px" else session.unit
-            for setup in session.sensors
-        }
+        self._most = dict.fromkeys(self._setups, 0)  # features of one frame
+        self._expected = sum(map(len, self._bodies.values()))
+        self._usual = {name: deque[float](maxlen=_USUAL) for name in self._setups}
         self._shown: dict[str, NDArray[Any]] = {}
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
         self._doubted = Stretches()  # for whatever reason
         self._markers: dict[str, dict[int, Marker]] = {}
-        self._sizes = {
-            label: BodySize(session, one.body.means)
-            for one in session.objects
-            for label in one.labels
-        }
+        self._sizes = {label: BodySize(session, body.means) for label, body in self._bodies.items()}
         self._frames: list[tuple[int, list[View]]] = []
         self._agreed_before = 0
 
@@ -151,7 +147,7 @@ class Findings:
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
-            add_markers(self._markers.setdefault(estimate.label, {}), estimate)
+            offsets.add_markers(self._markers.setdefault(estimate.label, {}), estimate)
             if estimate.label in self._sizes:
                 self._sizes[estimate.label].add(estimate)
 
@@ -171,7 +167,8 @@ class Findings:
             usual, off = self._usual[name], found[name]
             if off is None or not one.used:
                 continue
-            counts = off >= _AT_LEAST * self._sigmas[name] and len(usual) >= _FEWEST
+            sigma = self._setups[name].extract.sigma
+            counts = off >= _AT_LEAST * sigma and len(usual) >= _FEWEST
             if counts and off > _FAR * median(usual):
                 self._far[name].add(estimate.frame, self._places)
             else:
@@ -179,7 +176,7 @@ class Findings:
 
     def causes(self) -> list[str]:
         """What of the session or the bodies is most likely at fault, a line each."""
-        sizes = size_warnings(self._sizes)
+        sizes = offsets.size_warnings(self._sizes)
         # a body of another size is met off at all of its markers
         return [*self._of_doubts(), *(sizes or self._of_markers())]
 
@@ -190,35 +187,34 @@ class Findings:
     def of_sensors(self) -> list[str]:
         """What is odd about what sensors see, a line each."""
         total, lines = self._places + 1, []
-        kinds = (("no frame", self._no_frame), ("no feature", self._no_feature))
-        for what, found in kinds:
-            for name, each in found.items():
-                if each.longest >= _LONG or each.count > _OFTEN * total:
-                    lines.append(
-                        f"sensor {name!r} had {what} in {each.count} of {total} frames: "
-                        f"{each.text()}"
-                    )
-        for name, each in self._flooded.items():
-            if each.longest >= _LONG or each.count > _OFTEN * total:
-                lines.append(
-                    f"sensor {name!r} found up to {self._most[name]} features, where "
-                    f"{self._expected} are expected, in {each.count} of {total} frames, none of "
-                    f"them ok: {each.text()}; mixpose check says which key of [extract] to change"
-                )
-        for name, each in self._same.items():
-            if each.count:
-                lines.append(
-                    f"sensor {name!r} shows the same as the frame before in frames {each.text()}, "
-                    "which contradicts the others: frozen, or frames doubled?"
-                )
+        for what, found in (("no frame", self._no_frame), ("no feature", self._no_feature)):
+            lines += [
+                f"sensor {name!r} had {what} in {each.count} of {total} frames: {each.text()}"
+                for name, each in found.items()
+                if each.are_no_accident(total)
+            ]
+        lines += [
+            f"sensor {name!r} found up to {self._most[name]} features, where {self._expected} are "
+            f"expected, in {each.count} of {total} frames, none of them ok: {each.text()}; "
+            "mixpose check says which key of [extract] to change"
+            for name, each in self._flooded.items()
+            if each.are_no_accident(total)
+        ]
+        lines += [
+            f"sensor {name!r} shows the same as the frame before in frames {each.text()}, which "
+            "contradicts the others: frozen, or frames doubled?"
+            for name, each in self._same.items()
+            if each.count
+        ]
         far = {name: each for name, each in self._far.items() if each.longest >= _LONG}
-        if far and any(line.endswith(MOVED) for line in self._of_markers()):
+        if far and any(line.endswith(offsets.MOVED) for line in self._of_markers()):
             far = {}  # what one marker makes is said of it
         for name, each in far.items():
+            unit = "px" if self._setups[name].sensor.unit == "px" else self._session.unit
             lines.append(
-                f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
-                f"{self._units[name]} before, in {each.count} of {total} frames: "
-                f"{each.text()}: images torn or blurred, markers half hidden, or out of step?"
+                f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} {unit} "
+                f"before, in {each.count} of {total} frames: {each.text()}: images torn or "
+                "blurred, markers half hidden, or out of step?"
             )
         return lines
 
@@ -229,24 +225,23 @@ class Findings:
                 line += f"; before frame {self._doubted.found[-1][0]} it is not, or the body rests"
             return [line]
         total, lines = self._places + 1, []
-        frozen = sum(each.count for each in self._same.values())
+        asked = {
+            APART: f": {CAUSES}",
+            ASIDE: ": is a part of it hidden, or does it have more rows or fewer than told?",
+        }
+        if self._agreed_before:
+            asked[TWICE] = ": poses before may be of its mirror image; is there a mirror?"
         since = self._changed_since()
         if since is not None:
             lines.append(since[1])
         for doubt, each in self._doubts.items():
-            if each.count <= frozen or (since is not None and each.found[0][0] >= since[0]):
+            if each.count <= self._frozen or (since is not None and each.found[0][0] >= since[0]):
                 continue  # said of the sensor
             if each.count < _LONG and each.count <= total / 2:
                 continue  # a frame here and there: clutter does that
-            line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
-            if doubt == APART:
-                line += f": {CAUSES}"
-            if doubt == ASIDE:
-                line += ": is a part of it hidden, or does it have more rows or fewer than told?"
+            line = f"{doubt} in {each.count} of {total} frames, {each.text()}{asked.get(doubt, '')}"
             if doubt.startswith(TURNED) and each.count > total / 2:
                 line += ": is a feature of [object] missing, or one too many?"
-            if doubt == TWICE and self._agreed_before:
-                line += ": poses before may be of its mirror image; is there a mirror?"
             lines.append(line)
         return lines
 
@@ -261,6 +256,11 @@ class Findings:
             return None
         first = self._doubted.found[-1][0]
         return first, f"{most} from frame {first} on: {asked[most]}"
+
+    @property
+    def _frozen(self) -> int:
+        """Frames in which sensors showed the same as before, and should not."""
+        return sum(each.count for each in self._same.values())
 
     @property
     def _late(self) -> bool:
@@ -280,20 +280,17 @@ class Findings:
         # a body that is there twice, most of the time, is no fault of the session
         twice = self._doubts.get(TWICE, Stretches()).count
         twice = twice if 2 * twice > doubted else 0
-        frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
-        if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
+        if not few or bad < max(_LONG, self._frozen + 1) or len(self._session.labels) > 1:
             return None
         asked = late_sensor if self._late else explanation  # all else would have shown
         return asked(self._session, self._frames)
 
     def _of_markers(self) -> list[str]:
         lines = []
-        bodies = {label: one.body for one in self._session.objects for label in one.labels}
         for label, markers in self._markers.items():
-            if label not in bodies:
-                continue
-            of = f" of {label!r}" if len(self._session.labels) > 1 else ""
-            lines += marker_lines(markers, bodies[label].labels, of, self._session.unit)
+            if (body := self._bodies.get(label)) is not None:
+                of = f" of {label!r}" if len(self._bodies) > 1 else ""
+                lines += offsets.marker_lines(markers, body.labels, of, self._session.unit)
         return lines

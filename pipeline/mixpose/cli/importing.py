@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from mixpose.checking import key_warnings, with_image_sizes
-from mixpose.cli.app_before import ImportRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.app import ImportRequest
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import is_stdout, shown, write_text
 from mixpose.errors import SessionError
 from mixpose.importing import Imported, gather, session_text
@@ -15,10 +15,7 @@ from mixpose.session import Session, load_session
 
 
 def import_files(request: ImportRequest) -> None:
-    """Write a session file, and say on standard error what is in it.
-
-    Raises SessionError if a file cannot be read, or the output is there already.
-    """
+    """Write a session file, which must be new, and say on standard error what is in it."""
     output, unit = request.output, request.unit
     if output.exists() and not is_stdout(output):
         raise SessionError(f"-o {output}: is there already; name a new file")
@@ -30,10 +27,10 @@ def import_files(request: ImportRequest) -> None:
         warn(warning)
     if not imported.bodies:
         warn("no file of a body is among them: [object] is an example, put in your markers")
-    count = len(imported.cameras)
+    cameras = counted(len(imported.cameras), "camera")
     names = ", ".join(camera.name for camera in imported.cameras)
     say(
-        f"{count} camera{'s' * (count != 1)} ({names}), lengths in {unit} -> {shown(output)}; now "
+        f"{cameras} ({names}), lengths in {unit} -> {shown(output)}; now "
         "add the source of each sensor"
     )
 

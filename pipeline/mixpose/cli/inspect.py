@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -10,18 +9,13 @@ from pathlib import Path
 
 from mixpose.body import Body
 from mixpose.cli.app import InspectRequest
-from mixpose.cli.output import refuse_stdout
+from mixpose.cli.output import print_lines, refuse_stdout
 from mixpose.cli.run import named_sources
 from mixpose.cli.session_formats import recording_of
 from mixpose.errors import RecordingError, SessionError, reporting
 from mixpose.frames import Source, pair
-from mixpose.pictures.advice import describe
+from mixpose.pictures import advice, finding, plots, scene, sheet, signature
 from mixpose.pictures.canvas import Picture
-from mixpose.pictures.finding import Finding, find_several
-from mixpose.pictures.plots import require_matplotlib
-from mixpose.pictures.scene import draw_scene
-from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, prefixes_of
-from mixpose.pictures.signature import refuse_foreign, write_png
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.runner import clouds_of, observe, open_sources, scene_of
@@ -32,14 +26,12 @@ from mixpose.tracking import with_clouds
 def inspect_frame(request: InspectRequest) -> None:
     """Write pictures of one frame into a folder and print what was found in it.
 
-    Poses of a run may stand in place of estimating this frame on its own. Raises SessionError if
-    the session or an option is wrong, or the folder holds other people's files, and RecordingError
-    if the recording or the poses cannot be read.
+    Poses of a run may stand in place of estimating this frame on its own.
     """
     folder, poses = request.output, request.poses
     refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
-    require_matplotlib()
+    plots.require_matplotlib()
     _check_folder(folder, session)
     file, named = None if poses is None else read_poses(poses), request.source or ()
     if file is None:
@@ -50,33 +42,33 @@ def inspect_frame(request: InspectRequest) -> None:
     frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
-    scene = scene_of(session)
+    tracked = scene_of(session)
     if file is None:
-        _, estimates = scene.advance(scene.begin(), number, frame_set.time_s, views)
+        _, estimates = tracked.advance(tracked.begin(), number, frame_set.time_s, views)
     else:
         estimates = _from_file(file, session, number)
     bodies = [one.body for one in session.objects for _ in one.instances]
     clouds = clouds_of(session)
     estimates = [with_clouds(one, clouds) for one in estimates]
     drawn = tuple(setup for setup in session.sensors if setup.name not in clouds)
-    found = find_several(drawn, frame_set.frames, views, bodies, estimates)
+    found = finding.find_several(drawn, frame_set.frames, views, bodies, estimates)
     shown = replace(session, sensors=drawn)
     pictures: dict[str, Picture] = {}
     lines = []
     if len(bodies) > 1 and drawn:
-        pictures[BODIES] = draw_scene(shown, frame_set, *estimates)
-    each = zip(prefixes_of(session.labels), bodies, found, estimates, strict=True)
+        pictures[sheet.BODIES] = scene.draw_scene(shown, frame_set, *estimates)
+    each = zip(sheet.prefixes_of(session.labels), bodies, found, estimates, strict=True)
     for prefix, body, findings, estimate in each:
-        made = inspection_pictures(shown, body, findings, estimate) if drawn else {}
+        made = sheet.inspection_pictures(shown, body, findings, estimate) if drawn else {}
         pictures |= {prefix + name: picture for name, picture in made.items()}
         lines += summary(session, body, estimate, findings, poses)
         lines += _of_clouds(session, frame_set, body, estimate)
     with reporting(SessionError, f"-o {folder}: cannot be made"):
         folder.mkdir(exist_ok=True)
     for name, picture in pictures.items():
-        write_png(folder / name, picture)
+        signature.write_png(folder / name, picture)
     lines.append(f"pictures in {folder}: {', '.join(pictures) or 'none'}")
-    sys.stdout.write("\n".join(lines) + "\n")
+    print_lines(lines)
 
 
 def _check_folder(folder: Path, session: Session) -> None:
@@ -85,9 +77,9 @@ def _check_folder(folder: Path, session: Session) -> None:
     if not folder.parent.is_dir():
         raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
     places = [(s.name, (session.folder / e).resolve()) for s in session.sensors for e in s.sources]
-    for name in possible_names(session):
+    for name in sheet.possible_names(session):
         path = (folder / name).resolve()
-        refuse_foreign(folder / name, "-o")
+        signature.refuse_foreign(folder / name, "-o")
         for sensor, place in places:
             if path.parent == place or path.match(str(place)):
                 raise SessionError(
@@ -154,7 +146,7 @@ def summary(
     session: Session,
     body: Body,
     estimate: Estimate,
-    findings: Sequence[Finding],
+    findings: Sequence[finding.Finding],
     poses: Path | None,
 ) -> list[str]:
     """What is said of a frame beside its pictures: where its pose is from, and what to change."""
@@ -171,8 +163,8 @@ def summary(
         lines.append(f"why: {why}; confidence {estimate.confidence:.3g}")
     if estimate.proposer:
         lines.append(f"the pose came from: {estimate.proposer}")
-    for finding in findings:
-        lines += describe(finding, body, session.unit)
+    for found in findings:
+        lines += advice.describe(found, body, session.unit)
     if estimate.status == "lost":
         lines.append(
             f"lost: once the counts are right, mixpose check {session.path} tries what else may be "

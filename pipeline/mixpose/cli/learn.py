@@ -5,16 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mixpose.cli.app_before import LearnRequest
+from mixpose.cli import output
+from mixpose.cli.app import LearnRequest
 from mixpose.cli.notices import say, warn, watched
-from mixpose.cli.output import (
-    is_stdout,
-    print_lines,
-    refuse_suffix,
-    refuse_to_overwrite_but,
-    shown,
-    write_text,
-)
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import Learnt, Lesson, by_markers, learn, like
@@ -25,24 +18,19 @@ from mixpose.session.messages import BadKeyError
 
 
 def learn_session(request: LearnRequest) -> None:
-    """Learn the bodies of a recording and write a table of each.
-
-    Raises SessionError if the session or an option is wrong, or the output would overwrite
-    something else. Raises RecordingError if the recording cannot be read, or no body is seen to
-    move.
-    """
+    """Learn the bodies of a recording, or a RecordingError if none moves; write a table of each."""
     path = request.session
     session = load_scene(path, allow_code=request.allow_code)
-    inputs = [path] if request.like is None else [path, request.like]
-    refuse_to_overwrite_but(request.output, inputs, MARK)
-    refuse_suffix(request.output, "-o", (".csv", ".txt"), "a body is a table of markers")
+    inputs = path, request.like
+    output.refuse_to_overwrite_but(request.output, inputs, MARK)
+    output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
     if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
     with watched() as progress:
         lesson = learn(session, named_sources(request.source or ()), progress)
     bodies = _in_frames(lesson, request, older)
-    if len(bodies) > 1 and is_stdout(request.output):
+    if len(bodies) > 1 and output.is_stdout(request.output):
         raise SessionError(
             f"-o -: found {len(bodies)} bodies, each of which gets a table of its own; name a "
             "file, as -o body.csv"
@@ -50,8 +38,8 @@ def learn_session(request: LearnRequest) -> None:
     first, more = request.output, range(2, len(bodies) + 1)
     files = [first, *(first.with_name(f"{first.stem}-{k}{first.suffix}") for k in more)]
     for file, body in zip(files, bodies, strict=True):
-        refuse_to_overwrite_but(file, inputs, MARK)
-        write_text(file, table_text(body), "-o")
+        output.refuse_to_overwrite_but(file, inputs, MARK)
+        output.write_text(file, table_text(body), "-o")
     _tell(lesson, bodies, files, session)
 
 
@@ -91,7 +79,7 @@ def _tell(
     lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
-    called = [Path("body.csv") if is_stdout(file) else file for file in files]
+    called = [Path("body.csv") if output.is_stdout(file) else file for file in files]
     for file, body in zip(called, bodies, strict=True):
         lines += lines_of(body, file.name, session.unit)
     if len(bodies) > 1 or bodies[0].count > 1:
@@ -99,14 +87,14 @@ def _tell(
         for file, body in zip(called, bodies, strict=True):
             lines += ["", "[[object]]", f'name = "{file.stem}"', f'file = "{file.name}"']
             lines += [f"count = {body.count}"] if body.count > 1 else []
-    print_lines(lines, *files)
+    output.print_lines(lines, *files)
     names = [file.name for file in called]
     pairs = zip(bodies, names, strict=True)
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
     for doubt in (*doubts, *look_alikes(bodies, names), *_late_ones(session, bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
-    say(f"learnt from {lesson.frames} frames -> {', '.join(map(shown, files))}{others}")
+    say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
 
 
 def _late_ones(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:

@@ -87,10 +87,7 @@ class LineFile:
 
 @contextmanager
 def held(folder: Path, called: Path) -> Iterator[None]:
-    """Keep other runs from a folder, as far as the system can; messages call it `called`.
-
-    Raises SessionError if another run holds it.
-    """
+    """Keep other runs from a folder, as far as the system can; SessionError if one holds it."""
     if sys.platform == "win32":  # which opens no folder
         yield
         return

@@ -63,13 +63,18 @@ def warn_of_sources(
             warn(f"sensor {name!r}: {caution}")
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something, in words."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
     """How many frames there were, and how many poses of theirs came to which status."""
     count = sum(statuses.values()) // bodies
     of = f" of {bodies} bodies" if bodies > 1 else ""
     words = ("ok", "ambiguous", "lost")
     parts = [f"{statuses[word]} {word}" for word in words if statuses.get(word)]
-    return f"{count} frame{'s' * (count != 1)}{of}: {', '.join(parts) or 'none'}"
+    return f"{counted(count, 'frame')}{of}: {', '.join(parts) or 'none'}"
 
 
 def told_frames(line: str) -> tuple[dict[str, int], int] | None:
@@ -169,18 +174,17 @@ class Summary:
 
     def warnings(self) -> list[str]:
         """What is most likely wrong with the geometry, once for each sensor at most."""
-        apart = {n for n, k in self.idle.items() if k >= _MOST * self.posed[n]}
+        apart = [n for n, k in self.idle.items() if k >= _MOST * self.posed[n]]
         found = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
             f"{self.counted}: check its T_sensor_world, calibration and source, which "
             "mixpose check tries"
-            for name in self.idle
-            if name in apart
+            for name in apart
         ]
         posed = sum(self.statuses.values()) - self.statuses["lost"]
         seen, causes = self.findings.of_sensors(), self.findings.causes()
         if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
-            apart = set(self.split)
+            apart = list(self.split)
             found += [] if seen else [self._split_text()]
         # what names the cause stands for what only shows it
         found = [*([] if self.findings.tells_of_sensors(causes) else found), *seen, *causes]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -12,22 +12,18 @@ from typing import Self, TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
-from mixpose.cli.request import output_of
 from mixpose.errors import SessionError, reporting
 from mixpose.naming import distinct
-from mixpose.poses.benchmarks import BOP_COLUMNS, TUM_COLUMNS
-from mixpose.poses.csvtable import FRAME_COLUMNS
-from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY
+from mixpose.poses import benchmarks, csvtable, formats, jsonl, writing
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import JsonlWriter
-from mixpose.poses.writing import NO_TIMES, PoseWriter
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
 _HEADER = '{"type": "header"'
+_WHOLE_LINES = map(re.escape, (benchmarks.BOP_COLUMNS, benchmarks.TUM_COLUMNS, writing.NO_TIMES))
 _FIRST_LINES = re.compile(
-    rf"{re.escape(_HEADER)}.*|{','.join(FRAME_COLUMNS[:3])},.*|{re.escape(BOP_COLUMNS)}"
-    rf"|{re.escape(TUM_COLUMNS)}|{re.escape(NO_TIMES)}|# frame -?\d+, (ok|ambiguous)"
+    rf"{re.escape(_HEADER)}.*|{','.join(csvtable.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
+    r"|# frame -?\d+, (ok|ambiguous)"
 )
 """Of files of poses, whole as they are written."""
 
@@ -35,9 +31,11 @@ _FIRST_LINES = re.compile(
 class Output(ExitStack):
     """Writes poses; a file is opened with the first of them, so that no failure empties it.
 
-    Without a path poses go to standard output. `goes_on` is a file of JSON lines that has its
-    header already, in place of opening `path`; `options` are what the writer of the format takes
-    besides; a `whole` file appears when all is written.
+    Without a path poses go to standard output. Of several bodies (their `labels`) each gets a file
+    of its own where the format needs that, ``poses.<body>.tum`` for ``poses.tum``; a SessionError
+    if there is no path then. `goes_on` is a file of JSON lines that has its header already, in
+    place of opening `path`; `options` are what the writer of the format takes besides; a `whole`
+    file appears when all is written.
     """
 
     def __init__(
@@ -45,6 +43,7 @@ class Output(ExitStack):
         path: Path | None,
         format_name: str,
         header: Header,
+        labels: Sequence[str] = (),
         *,
         goes_on: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
@@ -54,15 +53,28 @@ class Output(ExitStack):
         self._called = self._path = path
         self._format, self._header = format_name, header
         self._options, self._is_whole = options or {}, whole
-        self._writer: PoseWriter | None = None
+        self._writer: writing.PoseWriter | None = None
         self.file = goes_on
         if goes_on is not None:
-            self._writer = JsonlWriter(cast(TextIO, goes_on), header, resume=True)
+            self._writer = jsonl.JsonlWriter(cast(TextIO, goes_on), header, resume=True)
+        self._apart: dict[str, Output] = {}  # by label
+        if not _are_apart(format_name, labels):
+            return
+        if path is None:
+            raise SessionError(
+                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
+                "with -o: each body gets one with its own name in it"
+            )
+        for label, own in zip(labels, _body_paths(path, labels), strict=True):
+            self._apart[label] = Output(own, format_name, header, options=options, whole=whole)
 
     def __enter__(self) -> Self:
-        if self._is_whole and self._called is not None:
-            self._path = self.enter_context(appearing_whole(self._called))
-        self.push(self._end)
+        for each in self._apart.values():
+            self.enter_context(each)
+        if not self._apart:
+            if self._is_whole and self._called is not None:
+                self._path = self.enter_context(appearing_whole(self._called))
+            self.push(self._end)
         return super().__enter__()
 
     def _end(self, kind: object, error: object, trace: object) -> None:
@@ -76,7 +88,10 @@ class Output(ExitStack):
                 self.file.close()
 
     def write(self, estimate: Estimate) -> None:
-        """Write one frame, at once."""
+        """Write one frame of one body, at once."""
+        if self._apart:
+            self._apart[estimate.label].write(estimate)
+            return
         if self._writer is None and self._format == "tum" and estimate.time_s is None:
             warn(
                 f"{self._called or 'standard output'}: poses have no times, so that frame numbers "
@@ -85,45 +100,13 @@ class Output(ExitStack):
         writer = self._writer or self._open()
         writer.write(estimate)
 
-    def _open(self) -> PoseWriter:
+    def _open(self) -> writing.PoseWriter:
         if self._path is not None:
             self.file = LineFile(self._path, called=self._called)
         # the writers only ever write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
-        self._writer = FORMATS[self._format](stream, self._header, **self._options)
+        self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
-
-
-class OutputPerBody(ExitStack):
-    """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
-
-    ``poses.tum`` stands for ``poses.<body>.tum``, whose output `start` makes. Raises SessionError
-    if there is no path.
-    """
-
-    file: LineFile | None = None
-
-    def __init__(
-        self,
-        path: Path | None,
-        format_name: str,
-        labels: Sequence[str],
-        start: Callable[[Path], Output],
-    ) -> None:
-        super().__init__()
-        if path is None:
-            raise SessionError(
-                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
-                "with -o: each body gets one with its own name in it"
-            )
-        self._outputs = {
-            label: self.enter_context(start(own))
-            for label, own in zip(labels, _body_paths(path, labels), strict=True)
-        }
-
-    def write(self, estimate: Estimate) -> None:
-        """Write one frame of one body, at once."""
-        self._outputs[estimate.label].write(estimate)
 
 
 def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
@@ -132,40 +115,20 @@ def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
-def pose_output(
-    path: Path | None,
-    format_name: str,
-    header: Header,
-    labels: Sequence[str],
-    *,
-    goes_on: LineFile | None = None,
-    options: Mapping[str, int | str] | None = None,
-    whole: bool = False,
-) -> Output | OutputPerBody:
-    """Where the poses of bodies go, as `Output` says; to a file each where the format needs it."""
-    start = partial(Output, format_name=format_name, header=header, options=options, whole=whole)
-    if _is_apart(format_name, labels):
-        return OutputPerBody(path, format_name, labels, start)
-    return start(path, goes_on=goes_on)
-
-
-def _is_apart(format_name: str, labels: Sequence[str]) -> bool:
-    """Whether a format needs a file for each of the bodies."""
-    return format_name in ONE_TRAJECTORY and len(labels) > 1
+def _are_apart(format_name: str, labels: Sequence[str]) -> bool:
+    """Whether a format needs a file for each of some bodies."""
+    return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
 
 
 def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
     """The files that poses go to; none where that is standard output."""
     if path is None:
         return []
-    return _body_paths(path, labels) if _is_apart(format_name, labels) else [path]
+    return _body_paths(path, labels) if _are_apart(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
-    """Make sure that a file about to be written is new, or holds poses that mixpose wrote.
-
-    Raises SessionError if it is an input of the run, or holds something else.
-    """
+    """Raise SessionError unless a file to be written is new, or holds poses that mixpose wrote."""
     beginning = _beginning(path, inputs)
     first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
@@ -176,13 +139,11 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 
 
 def refuse_to_overwrite_but(
-    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o", *, begins: str = ""
+    path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
-    """Make sure that a file about to be written is new, empty, or begins with a mark of mixpose in
-    it; standard output is.
+    """Raise SessionError unless a file to be written is new, empty, or has a mark near its begin.
 
-    `begins` is what the very first characters have to be. Raises SessionError if it is one of the
-    inputs, or holds something else; `option` named it.
+    `begins` is what the very first characters have to be, `option` what named the file.
     """
     if is_stdout(path):
         return
@@ -191,7 +152,7 @@ def refuse_to_overwrite_but(
         raise _foreign(path, option)
 
 
-def _beginning(path: Path, inputs: Iterable[Path], option: str = "-o") -> str:
+def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") -> str:
     """The first characters of a file that may be in the way; none where no file is."""
     if not path.parent.is_dir():
         raise SessionError(f"{option} {path}: there is no folder {path.parent}")
@@ -199,7 +160,7 @@ def _beginning(path: Path, inputs: Iterable[Path], option: str = "-o") -> str:
         raise SessionError(f"{option} {path}: is a folder; name a file")
     if not path.is_file():
         return ""
-    if any(each.exists() and path.samefile(each) for each in inputs):
+    if any(each is not None and each.exists() and path.samefile(each) for each in inputs):
         raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")
@@ -213,14 +174,14 @@ def _foreign(path: Path, option: str = "-o") -> SessionError:
 
 def is_stdout(named: Path | None) -> bool:
     """Whether what an option names is standard output."""
-    return named is not None and output_of(named) is None
+    return named == Path("-")
 
 
-def refuse_suffix(named: Path, option: str, allowed: Sequence[str], what: str) -> None:
+def refuse_suffix(named: Path, allowed: Sequence[str], what: str) -> None:
     """Raise a SessionError where a name ends as files do that are something else than `what`."""
     if named.suffix and named.suffix.casefold() not in allowed:
         raise SessionError(
-            f"{option} {named}: found the suffix {named.suffix}; {what}: name it "
+            f"-o {named}: found the suffix {named.suffix}; {what}: name it "
             f"{named.with_suffix(allowed[0]).name}"
         )
 
@@ -249,10 +210,7 @@ def print_lines(lines: Iterable[str], *written: Path | None) -> None:
 
 
 def write_text(path: Path, text: str, option: str) -> None:
-    """Write a text to the file that an option names, or to standard output.
-
-    Raises SessionError if it cannot be written.
-    """
+    """Write a text to the file that an option names, or to standard output, or SessionError."""
     if is_stdout(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(text.encode("utf-8"))  # the same bytes on every system

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from mixpose.cli.app_after import PivotRequest
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import write_text
+from mixpose.cli.output import print_lines, write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -26,8 +25,7 @@ _SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few pe
 def pivot_poses(request: PivotRequest) -> None:
     """Find the tip of a tool, tell it, and write it into a session.
 
-    Raises SessionError if an option names what is not there. Raises RecordingError if the poses
-    cannot be read, or do not tell the tip.
+    Raises RecordingError if the poses do not tell the tip.
     """
     path = request.poses
     poses = read_poses(path)
@@ -40,7 +38,7 @@ def pivot_poses(request: PivotRequest) -> None:
     unit = poses.unit or "units"
     frames = {line.frame for line in poses.poses if line.label == tool}
     unsure = len(frames) - tip.frames - tip.left_out
-    sys.stdout.write("\n".join(_lines(tool, request.reference, tip, unit, unsure)) + "\n")
+    print_lines(_lines(tool, request.reference, tip, unit, unsure))
     _warn(tip)
     if request.into is not None:
         _put_into(request.into, tool, poses, tip)

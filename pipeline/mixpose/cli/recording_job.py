@@ -20,7 +20,7 @@ import uuid
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from mixpose.cli.lines import held, note_path
@@ -37,29 +37,29 @@ _INTERRUPTED_STATUS = 130
 
 
 @dataclass(frozen=True)
-class Job:
-    """What is to be done; text only, as it may travel to another machine."""
+class Recording:
+    """One of many; text only, as it may travel to another machine."""
 
+    name: str  # of its folder
     session: str  # absolute path
     session_sha256: str  # of its bytes; empty where it cannot be read
-    # absolute path of the folder of all recordings, and the name of this one's in it
-    folder: str
-    name: str
-    poses: str  # name of the file with the poses
     options: tuple[str, ...]  # of ``mixpose run``
     mixpose: str  # version
+
+
+@dataclass(frozen=True)
+class Job(Recording):
+    """What is to be done."""
+
+    folder: str  # absolute path of that of all recordings
+    poses: str  # name of the file with the poses
     shared: bool = False  # whether another worker may come to do the same
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Outcome(Recording):
     """How a recording ended: what its status file holds."""
 
-    name: str
-    session: str
-    session_sha256: str
-    options: tuple[str, ...]
-    mixpose: str
     state: str
     exit_status: int  # of ``mixpose run``
     frames: Mapping[str, int] = field(default_factory=dict)  # poses by their status
@@ -148,10 +148,10 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
             if outcome.state != INTERRUPTED:
                 outcome = _put_in_place(part, job, outcome)
     except SessionError as error:
-        outcome = replace(outcome_of(job, FAILED, 2), reason=str(error))
+        outcome = outcome_of(job, FAILED, 2, str(error))
     except OSError as error:
         reason = f"{error.filename or part}: cannot be written: {error.strerror}"
-        outcome = replace(outcome_of(job, FAILED, 2), reason=reason)
+        outcome = outcome_of(job, FAILED, 2, reason)
     finally:
         if job.shared:
             shutil.rmtree(part, ignore_errors=True)
@@ -165,7 +165,7 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     command = [sys.executable, "-m", "mixpose.cli.child", "run", *job.options]
     command += [f"--output={job.poses}", *(["--resume"] if goes_on else [])]
     # what is begun says of what it is, should nothing come to say how it ended
-    _write_status(part, outcome_of(job, INTERRUPTED, _INTERRUPTED_STATUS))
+    write_json(part / STATUS, asdict(outcome_of(job, INTERRUPTED, _INTERRUPTED_STATUS)))
     log.touch()
     began = time.monotonic()
     status = running.run([*command, "--", job.session], part, log, threads)
@@ -180,18 +180,18 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
         with suppress(OSError, ValueError, KeyError):
             frames = _statuses_in(poses)
     said = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
+    reason = None if status == 0 else said
     outcome = replace(
-        outcome_of(job, state, 128 - status if status < 0 else status),
+        outcome_of(job, state, 128 - status if status < 0 else status, reason),
         frames=frames,
         bodies=bodies,
         # a run that goes on may say again what the one before it said
         warnings=sum(line.startswith("mixpose: warning: ") for line in set(lines)),
-        reason=None if status == 0 else said,
         seconds=round(time.monotonic() - began, 3),
     )
     if state == DONE:  # nothing is left to go on with
         note_path(poses).unlink(missing_ok=True)
-    _write_status(part, outcome)
+    write_json(part / STATUS, asdict(outcome))
     return outcome
 
 
@@ -213,10 +213,10 @@ def _statuses_in(poses: Path) -> dict[str, int]:
     return dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
 
 
-def _write_status(part: Path, outcome: Outcome) -> None:
-    text = json.dumps(asdict(outcome), indent=1, ensure_ascii=False)
-    with appearing_whole(part / STATUS) as file:
-        file.write_text(text + "\n", encoding="utf-8")
+def write_json(path: Path, said: Mapping[str, object]) -> None:
+    """Write a file that people may read, too."""
+    with appearing_whole(path) as part:
+        part.write_text(json.dumps(said, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
@@ -249,20 +249,20 @@ def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
 
 def _not_shared(job: Job) -> Outcome | None:
     """What to say where this machine does not see the folders of the one that asked."""
-    for path in (Path(job.session), Path(job.folder)):
-        if not path.exists():
-            reason = f"{path}: no such file"
-            if job.shared:
-                reason = (
-                    f"{path}: not there on worker {socket.gethostname()}; sessions, recordings and "
-                    "-o must lie in a folder that all workers see under the same name"
-                )
-            return replace(outcome_of(job, FAILED, 2), reason=reason)
-    return None
+    missing = [path for path in (job.session, job.folder) if not Path(path).exists()]
+    if not missing:
+        return None
+    reason = f"{missing[0]}: no such file"
+    if job.shared:
+        reason = (
+            f"{missing[0]}: not there on worker {socket.gethostname()}; sessions, recordings and "
+            "-o must lie in a folder that all workers see under the same name"
+        )
+    return outcome_of(job, FAILED, 2, reason)
 
 
-def outcome_of(job: Job, state: str, exit_status: int) -> Outcome:
+def outcome_of(job: Job, state: str, exit_status: int, reason: str | None = None) -> Outcome:
     """How a job ended on this machine."""
-    same = ("name", "session", "session_sha256", "options", "mixpose")
-    told = {key: getattr(job, key) for key in same}
-    return Outcome(**told, state=state, exit_status=exit_status, host=socket.gethostname())
+    same = {one.name: getattr(job, one.name) for one in fields(Recording)}
+    host = socket.gethostname()
+    return Outcome(**same, state=state, exit_status=exit_status, reason=reason, host=host)

@@ -5,10 +5,15 @@ Apart from the run itself, so that a command which only starts others need not l
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import typer
+
+from mixpose.cli.words import AllowCode, Format, option
 from mixpose.errors import SessionError
 from mixpose.selection import Selection
 
@@ -25,39 +30,109 @@ SUFFIXES = {
 FARTHEST_S = 0.5
 """What poses are foretold at most: a hand has turned round by then."""
 
+Sources = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=PATH",
+        help="Another recording of a sensor, relative to the working folder, or the number of a "
+        "camera; repeatable.",
+    ),
+]
+
 
 @dataclass(frozen=True)
 class RunRequest:
-    """The options of ``mixpose run``."""
+    """Estimate a pose per frame."""
 
-    output: Path | None
-    format: str
-    sources: tuple[str, ...]
-    selection: Selection
-    resume: bool
-    overlay: Path | None = None
+    sessions: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SESSION.toml...",
+            help="One session file or several, patterns such as 'day*/session.toml', or text files "
+            "(.txt) with one to a line.",
+        ),
+    ]
+    output: Path | None = option(
+        "Write poses here, not to stdout (-), in the format that the suffix tells. With "
+        "several sessions, a folder in which each gets its own for poses, log and status; what "
+        "is done there already is not done again."
+    )
+    format: Format | None = option(
+        "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
+    )
+    source: Sources = None
+    start: int | None = option("First frame number.")
+    stop: int | None = option("Frame number to stop before.")
+    step: int = option("Take every N-th frame number.", 1, min=1)
+    resume: bool = option("Go on after the last frame in the output.", False)
+    workers: int = option("How many sessions are run at a time.", 1, min=1)
+    overlay: Path | None = option(
+        "Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."
+    )
+    view: str | None = option(
+        "Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
+        "opens it to others who have the address with its token.",
+        metavar="[PORT]",
+    )
+    pause: bool = option("With --view, on files: begin paused, to go on from the page.", False)
+    scheduler: str | None = option(
+        "Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
+        "local for one on this machine.",
+        metavar="ADDRESS",
+    )
+    labels: bool = option(
+        "Say in each pose line which detection is which feature, and where features are in "
+        "space by these alone; .jsonl only.",
+        False,
+    )
+    publish: list[str] | None = option(
+        "Send each pose to another program too: udp://host:port, tcp://host:port, "
+        "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
+        "'?only=ok' none but those that are ok; repeatable.",
+        metavar="URL",
+    )
+    predict: float | None = option(
+        "Publish where the body will be so much after each frame.", metavar="SECONDS"
+    )
+    allow_code: AllowCode = False
     debug: bool = False
-    allow_code: bool = False
-    scheduler: str | None = None
-    labels: bool = False
-    publish: tuple[str, ...] = ()
-    predict: float | None = None
-    view: str | None = None
-    pause: bool = False
+
+    @property
+    def poses(self) -> Path | None:
+        """Where poses go; None: to standard output."""
+        return output_of(self.output)
+
+    @property
+    def format_name(self) -> str:
+        """The format of poses: the one named, else that of the file's suffix, else JSON lines.
+
+        Raises SessionError if the suffix is that of no format, or of one that is not written while
+        poses are estimated.
+        """
+        return self.format or ("jsonl" if self.are_many else _by_its_suffix(self.poses))
+
+    @property
+    def are_many(self) -> bool:
+        """Whether recordings get a folder each: several sessions, a pattern, list, or cluster."""
+        first = self.sessions[0]
+        is_pattern = glob.has_magic(first) and not Path(first).exists()
+        is_list = len(self.sessions) > 1 or first.endswith(".txt")
+        return self.scheduler is not None or is_list or is_pattern
+
+    @property
+    def selection(self) -> Selection:
+        """Which frames are estimated."""
+        return Selection(self.start, self.stop, self.step)
 
     @property
     def options(self) -> dict[str, int | bool]:
         """What is not the default of the options that all lines of a file have to share."""
-        step, labels = self.selection.step, self.labels
-        return {**({"step": step} if step != 1 else {}), **({"labels": True} if labels else {})}
+        step = {"step": self.step} if self.step != 1 else {}
+        return step | ({"labels": True} if self.labels else {})
 
     @property
     def ahead_s(self) -> float:
-        """How far poses that are published are foretold.
-
-        Raises SessionError if nothing is published, or the time is not one that can be looked
-        ahead.
-        """
+        """How far poses that are published are foretold; a SessionError where they cannot be."""
         seconds = self.predict
         if seconds is None:
             return 0.0
@@ -84,15 +159,7 @@ def by_suffix(output: Path | None, suffixes: Mapping[str, str]) -> str | None:
     return next((each for end, each in suffixes.items() if name.endswith(end)), None)
 
 
-def format_of(output: Path | None, named: str | None) -> str:
-    """The format of poses: the one that is named, else that of the file's suffix.
-
-    Without either, poses are JSON lines: to standard output, a pipe, or a name without a suffix.
-    Raises SessionError if the suffix is that of no format, or of one that is not written while
-    poses are estimated.
-    """
-    if named is not None:
-        return named
+def _by_its_suffix(output: Path | None) -> str:
     if output is None or not output.suffix or (output.exists() and not output.is_file()):
         return "jsonl"
     if output.name.casefold().endswith(".rrd"):

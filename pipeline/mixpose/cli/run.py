@@ -5,14 +5,14 @@ from __future__ import annotations
 import glob
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, continuation
+from mixpose.cli.continuation import Continuation, Notes, continuation, is_device
 from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
-from mixpose.cli.output import pose_output, refuse_stdout, refuse_to_overwrite, written_paths
+from mixpose.cli.output import Output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -27,61 +27,54 @@ from mixpose.tracking import PosePredictor
 from mixpose.tracking.proposers import predicted
 
 
-def run_session(path: Path, request: RunRequest) -> None:
+def run_session(request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 
-    Raises SessionError if the session or the options are wrong. Raises RecordingError if the
-    recording cannot be read; frames already estimated stay written.
+    Whatever is raised, frames already estimated stay written.
     """
     with ExitStack() as pages:  # what outlives the poses
-        _run_session(path, request, pages)
+        _run_session(request, pages)
 
 
-def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
-    session = load_session(path, allow_code=request.allow_code)
-    replaced = named_sources(request.sources)
+def _run_session(request: RunRequest, pages: ExitStack) -> None:
+    session = load_session(request.sessions[0], allow_code=request.allow_code)
+    replaced = named_sources(request.source or ())
     header = header_of(session, replaced, request.options)
     opened = open_sources(session, replaced)
-    outputs = written_paths(request.output, request.format, header.labels)
+    outputs = written_paths(request.poses, request.format_name, header.labels)
     for each in outputs:
-        if not _is_device(each):
+        if not is_device(each):
             refuse_to_overwrite(each, _inputs(session))
     go_on = Continuation(None, request.selection)
     if request.resume:
         go_on = continuation(request, header, opened)
     if go_on.is_done:
-        say(f"nothing left to do: {request.output} has all frames asked for already")
+        say(f"nothing left to do: {request.poses} has all frames asked for already")
         return
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = pose_output(request.output, request.format, header, header.labels, goes_on=go_on.file)
+    output = Output(request.poses, request.format_name, header, header.labels, goes_on=go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, go_on.there)
-        watch = _each(
-            is_new,
-            _publishing(stack, session, request, header),
-            summary.findings.watch,
-            _overlay(stack, session, request),
-            view,
-        )
+        watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
             opened=opened,
             selection=go_on.selection,
-            watch=watch,
+            watch=partial(_each, is_new, watches),
             memory=go_on.memory,
             remember=memories.append,
             labels=request.labels,
         )
         stack.enter_context(closing(estimates))
-        notes = stack.enter_context(_notes(request))
-        shown = _with_progress(estimates, session, quiet=request.output is None)
+        notes = stack.enter_context(Notes(request))
+        shown = _with_progress(estimates, session, quiet=request.poses is None)
         for estimate in filter(is_new, shown):
             output.write(estimate)
             is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
-            if notes is not None and output.file is not None and is_whole:
+            if output.file is not None and is_whole:
                 notes.remember(estimate.frame, output.file, memories[-1])
             summary.add(estimate)
             if request.debug and estimate.proposer != predicted.__name__:
@@ -90,54 +83,31 @@ def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     summary.say(f" -> {', '.join(names)}" if names else "")
 
 
-@contextmanager
-def _notes(request: RunRequest) -> Iterator[Notes | None]:
-    """What writes down where the run could go on; gone when the recording is done."""
-    if request.output is None or request.format != "jsonl" or _is_device(request.output):
-        yield None
-        return
-    notes = Notes(request.output, __version__)
-    try:
-        yield notes
-    except BaseException:
-        notes.write()
-        raise
-    if request.selection.stop is None:
-        notes.drop()
-    else:
-        notes.write()
-
-
 def _is_new(labels: Sequence[str], there: ResumePoint | None, estimate: Estimate) -> bool:
     """Whether an estimate comes after the last line that is there already."""
     place = labels.index(estimate.label) + 1  # of its line among those of the frame
     return there is None or (estimate.frame, place) > (there.frame, there.lines)
 
 
-def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
-    """What draws each frame, finished with the stack; None where nothing is to be drawn."""
-    if request.overlay is None:
-        return None
-    instead = "a folder or a video, as --overlay run.mp4"
-    refuse_stdout(request.overlay, "--overlay", "pictures", instead)
-    from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
-
-    return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
-
-
-def _publishing(
+def _watches(
     stack: ExitStack, session: Session, request: RunRequest, header: Header
-) -> Watch | None:
-    """What sends each pose on, finished with the stack; None where nothing is published."""
+) -> Iterator[Watch]:
+    """What sends each pose on and draws its frame, where asked for; finished with the stack."""
     ahead_s = request.ahead_s
-    if not request.publish:
-        return None
-    from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
+    if request.publish:
+        from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
-    each = [(label, one.body) for one in session.objects for label in one.labels]
-    foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in each}
-    publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
-    return stack.enter_context(publishing).watch
+        each = [(label, one.body) for one in session.objects for label in one.labels]
+        foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
+        publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
+        yield stack.enter_context(publishing).watch
+    if request.overlay is not None:
+        instead = "a folder or a video, as --overlay run.mp4"
+        refuse_stdout(request.overlay, "--overlay", "pictures", instead)
+        from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
+
+        overlay = Overlay(session, request.overlay, resume=request.resume)
+        yield stack.enter_context(overlay).watch
 
 
 def _foresee(known: PosePredictor, seconds: float) -> Callable[[Estimate], Estimate]:
@@ -153,34 +123,30 @@ def _foresee(known: PosePredictor, seconds: float) -> Callable[[Estimate], Estim
 
 def _view(
     stack: ExitStack, session: Session, request: RunRequest, opened: Mapping[str, Source]
-) -> Watch | None:
-    """What shows each frame on a page, gone with the stack; None where nothing is to be shown."""
+) -> list[Watch]:
+    """What shows each frame on a page, gone with the stack; nothing where none is to be shown."""
     if request.view is None:
         if request.pause:
             raise SessionError("--pause: nothing to go on with; add --view")
-        return None
+        return []
     from mixpose.viewing import Viewer  # noqa: PLC0415 - only where it is shown
 
     waits = all(source.kind != "live" for source in opened.values())
     viewer = Viewer(session, request.view, say, on_files=waits, paused=request.pause)
     stack.enter_context(viewer).announce()
-    return viewer.watch
+    return [viewer.watch]
 
 
-def _each(is_new: Callable[[Estimate], bool], *watches: Watch | None) -> Watch:
-    """Several that look at each new frame, one after the other."""
-    there = [one for one in watches if one is not None]
-
-    def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        for one in there if is_new(estimate) else ():
-            one(frame_set, views, estimate)
-
-    return watch
-
-
-def _is_device(path: Path) -> bool:
-    """Whether a path is a pipe or a device, which holds nothing that could be lost."""
-    return path.exists() and not path.is_file() and not path.is_dir()
+def _each(
+    is_new: Callable[[Estimate], bool],
+    watches: Sequence[Watch],
+    frame_set: FrameSet,
+    views: Sequence[View],
+    estimate: Estimate,
+) -> None:
+    """Let several look at each new frame, one after the other."""
+    for watch in watches if is_new(estimate) else ():
+        watch(frame_set, views, estimate)
 
 
 def _inputs(session: Session) -> Iterator[Path]:

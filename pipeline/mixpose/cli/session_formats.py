@@ -13,7 +13,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.cli.app_after import ConvertRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError, require_package
 from mixpose.frames import Source
@@ -34,16 +34,17 @@ MOST_PLACES = 50_000_000
 def write_markers(
     poses: PoseFile,
     lines: Sequence[PoseLine],
-    session: Session,
+    unit: str,
     format_name: str,
     request: ConvertRequest,
 ) -> None:
     """Write where the markers of all bodies were: measured where they were, else by the pose.
 
-    `lines` are those of the poses to write, `session` has the markers. Raises SessionError if a
-    package is missing, or poses and options do not go together, and RecordingError if the poses
-    hold what such a file cannot.
+    `lines` are those of the poses to write, in a unit of lengths. Raises SessionError if a package
+    is missing, or poses and options do not go together, and RecordingError if the poses hold what
+    such a file cannot.
     """
+    session = session_of(poses, request.session, allow_code=request.allow_code, unit=unit)
     output, measured = request.output, request.measured
     if format_name == "c3d":
         _place(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
@@ -69,7 +70,7 @@ def write_markers(
     frames, markers = told.is_known.shape
     known, found = told.is_known.sum(), told.is_measured.sum()
     say(
-        f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
+        f"{counted(markers, 'marker')} in {counted(frames, 'frame')}: "
         f"{found} places measured, {known - found} by the pose, "
         f"{told.is_known.size - known} gaps -> {output}"
     )
@@ -120,8 +121,7 @@ def trajectories_of(
                 )
             places[row, k], residuals[row, k] = point.at, point.residual
             by_sensor[row, k] = [
-                name in line.sensors[one].labels if one in line.sensors else False
-                for one in sensors
+                one in line.sensors and name in line.sensors[one].labels for one in sensors
             ]
     several = len(bodies) > 1
     return Trajectories(
@@ -220,10 +220,10 @@ def session_of(
         found = poses.header.get("session")
         if not isinstance(found, str):
             raise SessionError(f"{poses.path}: names no session; add --session SESSION.toml")
-        path = Path(found)
-        if not path.is_file():
-            path = poses.path.parent / found  # as in truth files, beside their session
-        if not path.is_file():
+        # beside their session are truth files
+        places = (Path(found), poses.path.parent / found)
+        path = next((place for place in places if place.is_file()), None)
+        if path is None:
             raise SessionError(
                 f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
             )

@@ -1,4 +1,4 @@
-"""``mixpose run`` on many recordings, here or on a cluster: each in its own process and folder.
+"""``mixpose run``, on many recordings here or on a cluster: each in its own process and folder.
 
 A process is the same command with one session, so that a recording gives the same poses alone and
 among others, and none can disturb another.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import glob
 import hashlib
-import json
 import os
 import shutil
 from collections import Counter
@@ -19,9 +18,11 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
+import typer
+
 from mixpose import __version__
 from mixpose.cli import recording_job
-from mixpose.cli.notices import frames_text, say
+from mixpose.cli.notices import counted, frames_text, say, warn
 from mixpose.cli.recording_job import DONE, FAILED, INTERRUPTED, UNFINISHED, Job, Outcome, run_job
 from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError, reporting
@@ -38,11 +39,23 @@ _COLUMNS = ("name", "state", "ok", "ambiguous", "lost", "warnings", "seconds", "
 _STATUSES = ("ok", "ambiguous", "lost")
 
 
-def are_many(named: Sequence[str], scheduler: str | None) -> bool:
-    """Whether recordings get a folder each: several sessions, a pattern, a list, or a cluster."""
-    first = named[0]
-    pattern = glob.has_magic(first) and not Path(first).exists()
-    return scheduler is not None or len(named) > 1 or first.endswith(".txt") or pattern
+def run(request: RunRequest) -> None:
+    """Run one session here, or many in processes of their own, as was asked for."""
+    many, written = request.are_many, request.format_name
+    if request.labels and written != "jsonl":
+        raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
+    if many and (request.publish or request.predict is not None):
+        raise SessionError(
+            "--publish: found several sessions; allowed is one, whose poses receivers take for one "
+            "recording"
+        )
+    if many:
+        raise typer.Exit(run_sessions(sessions_of(request.sessions), request))
+    from mixpose.cli.run import run_session  # noqa: PLC0415 - many are run elsewhere
+
+    if request.workers > 1:
+        warn(f"--workers {request.workers}: one session is one process, frames follow each other")
+    run_session(request)
 
 
 def sessions_of(named: Sequence[str]) -> list[Path]:
@@ -83,7 +96,7 @@ def _listed(path: Path) -> list[Path]:
 
 def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
     """Raise SessionError for options that serve a single recording."""
-    alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
+    alone = {"--source": request.source, "--overlay": request.overlay, "--view": request.view}
     alone["--pause"] = "" if request.pause else None
     for option, value in alone.items():
         if not value and value != "":
@@ -93,23 +106,21 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
                 f"{sessions[-1]}: no such session file; after --view allowed are a port, HOST:PORT "
                 "or nothing"
             )
-        shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
+        shown = f" {value[0] if isinstance(value, list) else value}".rstrip()
         found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
         raise SessionError(
             f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
         )
 
 
-def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) -> int:
-    """Estimate many recordings, say in the end how each of them went, and return the worst exit
-    status.
+def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
+    """Estimate many recordings that are not done yet; say how each went, return the worst status.
 
-    What is done already, with the same session and options, is not done again. The folder of the
-    output is made if it is not there; `workers` count on a cluster only where it is a local one.
-    Raises SessionError if there is no folder for the poses, or an option serves a single recording.
+    Workers count on a cluster only where it is a local one. Raises SessionError if there is no
+    folder for the poses, or an option serves a single recording.
     """
     _refuse_alone(sessions, request)
-    folder = _folder(request.output, len(sessions))
+    folder = _folder(request.poses, len(sessions))
     jobs = _jobs(sessions, folder, request)
     _refuse_others(folder, jobs)
     before = map(recording_job.finished, jobs)
@@ -118,7 +129,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
         say(f"{len(outcomes)} of {len(jobs)} recordings are done already")
     left = [k for k in range(len(jobs)) if k not in outcomes]
     try:
-        with _doing(request, workers) as (executor, function):
+        with _doing(request) as (executor, function):
             for place, result in executor.run(function, [jobs[k] for k in left]):
                 number = left[place]
                 outcomes[number] = _outcome_of(jobs[number], result)
@@ -134,8 +145,9 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
 
 
 @contextmanager
-def _doing(request: RunRequest, workers: int) -> Iterator[tuple[Executor, partial[Outcome]]]:
+def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
     """What does the jobs, and how."""
+    workers = request.workers
     if request.scheduler is not None:
         with on_cluster(request.scheduler, workers if workers > 1 else None) as cluster:
             yield cluster, partial(run_job)
@@ -155,12 +167,14 @@ def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
-    return replace(recording_job.outcome_of(job, FAILED, 3), reason=reason, host="")
+    return replace(recording_job.outcome_of(job, FAILED, 3, reason), host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
     names = names_of(sessions)
-    suffix = next(end for end, format_name in SUFFIXES.items() if format_name == request.format)
+    suffix = next(
+        end for end, format_name in SUFFIXES.items() if format_name == request.format_name
+    )
     return [
         Job(
             session=str(session.absolute()),
@@ -196,9 +210,8 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 
 def _options(request: RunRequest) -> tuple[str, ...]:
     """Of a run of one session."""
-    chosen = request.selection
-    values: dict[str, object] = {"format": request.format, "step": chosen.step}
-    values |= {"start": chosen.start, "stop": chosen.stop}
+    values = {"format": request.format_name, "step": request.step}
+    values |= {"start": request.start, "stop": request.stop}
     flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
     given = [f"--{name}={value}" for name, value in values.items() if value is not None]
     return (*given, *(f"--{name}" for name, is_on in flags.items() if is_on))
@@ -220,7 +233,7 @@ def _beginning(path: Path) -> bytes:
 def _folder(folder: Path | None, count: int) -> Path:
     if folder is None:
         raise SessionError(f"-o DIR: missing; {count} sessions need a folder for the poses")
-    sessions = f"{count} session{'s' * (count != 1)}"
+    sessions = counted(count, "session")
     if folder.exists() and not folder.is_dir():
         raise SessionError(f"-o {folder}: is a file; {sessions} need a folder for the poses")
     if not folder.exists() and folder.name.casefold().endswith((*SUFFIXES, ".rrd")):
@@ -250,8 +263,8 @@ def _line(outcome: Outcome) -> str:
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
     text = frames_text(outcome.frames, outcome.bodies)
-    many = outcome.warnings
-    return f"{text}; {many} warning{'s' * (many != 1)} in its log" if many else text
+    warnings = f"; {counted(outcome.warnings, 'warning')} in its log" if outcome.warnings else ""
+    return text + warnings
 
 
 def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> None:
@@ -263,9 +276,7 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> Non
         "not_done": asked - states[DONE] - states[FAILED],
         "results": [asdict(outcome) for outcome in outcomes],
     }
-    with appearing_whole(folder / SUMMARY) as part:
-        text = json.dumps(summary, indent=1, ensure_ascii=False)
-        part.write_text(text + "\n", encoding="utf-8")
+    recording_job.write_json(folder / SUMMARY, summary)
     with appearing_whole(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as f:
         table = csv.writer(f, lineterminator="\n")
         table.writerow(_COLUMNS)
@@ -277,10 +288,9 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> Non
 def _say_all(folder: Path, outcomes: Sequence[Outcome]) -> int:
     """Say how many are done, and once more which failed; the largest exit status."""
     failed = [outcome for outcome in outcomes if outcome.state == FAILED]
-    count = f"{len(outcomes)} recording{'s' * (len(outcomes) != 1)}"
     done = sum(outcome.state == DONE for outcome in outcomes)
     parts = f"{done} done" + (f", {len(failed)} failed" if failed else "")
-    say(f"{count}: {parts} -> {folder / TABLE}")
+    say(f"{counted(len(outcomes), 'recording')}: {parts} -> {folder / TABLE}")
     if any(outcome.state == INTERRUPTED for outcome in outcomes):
         raise KeyboardInterrupt
     return max((outcome.exit_status for outcome in outcomes), default=0)

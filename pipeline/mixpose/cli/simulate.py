@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from dataclasses import fields
 
-from mixpose.cli.app_simulate import SimulateRequest
-from mixpose.cli.notices import bar, warn
+from mixpose.cli.app import SimulateRequest
+from mixpose.cli.notices import bar, counted, warn
 from mixpose.cli.output import refuse_stdout
+from mixpose.cli.words import option_name
 from mixpose.errors import SessionError
 from mixpose.session import load_session
 from mixpose.session.values import LONGEST_DELAY_S, as_number
@@ -29,11 +30,7 @@ def delays_of(given: list[str]) -> dict[str, float]:
 
 
 def simulate_session(request: SimulateRequest) -> None:
-    """Render the recording of a session into a folder.
-
-    Raises SessionError if the session or the options are wrong, or the folder holds a recording
-    already.
-    """
+    """Render the recording of a session into a folder."""
     names = {one.name for one in fields(SimulationOptions)} - {"delay"}
     given = {name: value for name, value in vars(request).items() if name in names}
     options = SimulationOptions(**given, delay=delays_of(request.delay or []))
@@ -49,10 +46,10 @@ def simulate_session(request: SimulateRequest) -> None:
             progress=lambda done: moved(completed=done),
         )
     if unused:
-        typed = {one.name: one.metadata.get("names", ()) for one in fields(SimulateRequest)}
-        told = [next(iter(typed[name]), f"--{name.replace('_', '-')}") for name in unused]
-        warn(f"{', '.join(told)}: no sensor or body of this session has what that is about")
-    count = f"{options.frames} frame{'s' * (options.frames != 1)}"
+        typed = {one.name: option_name(one) for one in fields(SimulateRequest)}
+        told = ", ".join(typed[name] for name in unused)
+        warn(f"{told}: no sensor or body of this session has what that is about")
+    count = counted(options.frames, "frame")
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.cli.app_after import SmoothRequest
-from mixpose.cli.notices import say, warn
+from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import Output, refuse_suffix, refuse_to_overwrite
 from mixpose.cli.request import output_of
 from mixpose.errors import RecordingError
@@ -23,8 +23,7 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 def smooth_poses(request: SmoothRequest) -> None:
     """Smooth the poses of a file and write them.
 
-    Raises SessionError if the output would overwrite something else. Raises RecordingError if the
-    poses cannot be read, were smoothed before, or say too little.
+    Raises RecordingError if they were smoothed before, were foretold, or say too little.
     """
     path, output = request.poses, output_of(request.output)
     poses = read_poses(path)
@@ -46,7 +45,7 @@ def smooth_poses(request: SmoothRequest) -> None:
     if output is not None:
         refuse_to_overwrite(output, [path])
         told = "smoothed poses are JSON lines, of which mixpose convert makes other formats"
-        refuse_suffix(output, "-o", (".jsonl", ".json", ".ndjson"), told)
+        refuse_suffix(output, (".jsonl", ".json", ".ndjson"), told)
     bodies = {}
     for label in dict.fromkeys(line.label for line in poses.poses):
         own = [line for line in poses.poses if line.label == label]
@@ -60,7 +59,7 @@ def smooth_poses(request: SmoothRequest) -> None:
         _tell(label, body, poses.unit)
     if output is not None:
         count = sum(body.smoothed for body in bodies.values())
-        say(f"{count} pose{'s' * (count != 1)} smoothed -> {output}")
+        say(f"{counted(count, 'pose')} smoothed -> {output}")
 
 
 def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) -> None:
@@ -120,7 +119,7 @@ def _tell(label: str, body: SmoothedBody, unit: str) -> None:
     ]
     for count, what, done in told:
         if count:
-            say(f"{label}: {count} {what}{'s' * (count != 1)} {done}")
+            say(f"{label}: {counted(count, what)} {done}")
     if body.refused:
         numbers = ", ".join(map(str, body.refused[:8])) + (", ..." if len(body.refused) > 8 else "")
         warn(f"{label}: ok, but far off the poses around them, now ambiguous: frames {numbers}")

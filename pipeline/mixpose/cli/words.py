@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field, fields
+from dataclasses import Field, field, fields
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -28,38 +28,54 @@ AllowCode = Annotated[
 ]
 
 
-def option(default: Any, meaning: str, *names: str, panel: str | None = None, **more: Any) -> Any:
+def option(
+    meaning: str,
+    default: Any = None,
+    *,
+    name: str | None = None,
+    panel: str | None = None,
+    **more: Any,
+) -> Any:
     """A field of a record that is an option of a command, needed where the default is `...`.
 
-    Without names it is called like the field. `panel` heads a group of options in the help, and
+    Without a name it is called like the field. `panel` heads a group of options in the help, and
     typer takes `more`.
     """
     settings = {"help": meaning, "rich_help_panel": panel, **more}
-    metadata = {"names": names, "settings": settings}
+    metadata = {"name": name, "settings": settings}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
-def taking(request: type, work: Callable[[Any], None] | str) -> Callable[..., None]:
+def option_name(one: Field[Any]) -> str:
+    """What is typed for a field; of a bool, too, for which typer adds one with "no-" otherwise."""
+    return one.metadata.get("name") or f"--{one.name.replace('_', '-')}"
+
+
+def taking(request: type, work: str) -> Callable[..., None]:
     """A command whose arguments and options are the fields of a record, and its docstring the help.
 
-    The record goes to `work`, or to that ``module:function`` of this room, imported when called.
+    The record goes to that ``module:function`` of this room, imported when called. All raise
+    SessionError if the session or an option is wrong, or an output would overwrite something else,
+    and RecordingError if a recording or poses cannot be read. A field `debug` is whether all that
+    is known of errors is wanted, which may be asked of any command.
     """
     hints: dict[str, Any] = get_type_hints(request, include_extras=True)
     for one in fields(request):
         if one.metadata:
-            kind, names = hints[one.name], one.metadata["names"]
-            if kind is bool and not names:  # else typer adds one that begins with "no-"
-                names = (f"--{one.name.replace('_', '-')}",)
-            hints[one.name] = Annotated[kind, typer.Option(*names, **one.metadata["settings"])]
+            names = ("-o", "--output") if one.name == "output" else (option_name(one),)
+            hints[one.name] = Annotated[
+                hints[one.name], typer.Option(*names, **one.metadata["settings"])
+            ]
     form = signature(request)
+    if "debug" in hints:
+        hints["debug"] = typer.Context  # which has it
     typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
 
     def called(**given: Any) -> None:
-        function = work
-        if isinstance(function, str):
-            module, _, name = function.partition(":")
-            function = getattr(import_module(f"mixpose.cli.{module}"), name)
-        function(request(**given))
+        module, _, name = work.partition(":")
+        if "debug" in given:
+            given["debug"] = bool(given["debug"].obj)
+        getattr(import_module(f"mixpose.cli.{module}"), name)(request(**given))
 
     called.__doc__, called.__annotations__ = request.__doc__, hints
     called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]

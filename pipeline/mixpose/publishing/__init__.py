@@ -4,4 +4,3 @@ A new protocol is one file with its `Sender` and one line in `mixpose.publishing
 """
 
 from mixpose.publishing.channel import Publishing as Publishing
-from mixpose.publishing.message import SENDERS as SENDERS

@@ -13,8 +13,7 @@ import numpy as np
 from mixpose.constants import constant
 from mixpose.poses.header import Header
 from mixpose.poses.writing import require_finite
-from mixpose.publishing.address import Address, parse
-from mixpose.publishing.message import SENDERS, Message, Sender, TooLargeError, sender_for
+from mixpose.publishing.message import Address, Message, Sender, TooLargeError, parse, sender_for
 from mixpose.records import Estimate, FrameSet
 
 _REMEMBERED = 10_000  # latencies: a live source may run for days
@@ -100,7 +99,7 @@ class Channel:
         address: Address,
         sender: Sender,
         tell: Callable[[str], None],
-        rules: PublishingRules = PublishingRules(),
+        rules: PublishingRules,
     ) -> None:
         self._address, self._sender, self._tell, self._rules = address, sender, tell, rules
         self._backlog = Backlog(rules.waiting)
@@ -218,7 +217,7 @@ class Publishing:
         rules: PublishingRules = PublishingRules(),
     ) -> None:
         self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
-        addresses = [parse(url, SENDERS) for url in urls]
+        addresses = [parse(url) for url in urls]
         self._channels = [
             Channel(each, sender_for(each, header), tell, rules) for each in addresses
         ]

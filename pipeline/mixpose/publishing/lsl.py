@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.publishing.address import Address
-from mixpose.publishing.message import Message, Sender
+from mixpose.publishing.message import Address, Message, Sender
 
 if TYPE_CHECKING:
     from pylsl import StreamOutlet
@@ -44,7 +43,6 @@ class LslSender(Sender):
                 f"liblsl cannot be loaded: {' '.join(str(error).split())}"
             ) from error
         self._clock = pylsl.local_clock
-        self._nan = float("nan")
         names = {label: f"{address.name}-{label}" for label in header.labels}
         if len(names) == 1:
             names = dict.fromkeys(names, address.name)
@@ -56,12 +54,12 @@ class LslSender(Sender):
     def send(self, message: Message) -> bool:
         """Push the sample of one body."""
         estimate, T = message.estimate, message.estimate.T_world_object
-        pose = [self._nan] * 7
+        pose = [float("nan")] * 7
         if T is not None:
             pose = [*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()]
         outlet: StreamOutlet = self._outlets[estimate.label]
         heard = bool(outlet.have_consumers())
-        stamp = self._clock() - (0.0 if message.age_s is None else message.age_s)
+        stamp = self._clock() - (message.age_s or 0.0)
         outlet.push_sample([*pose, _STATUS[estimate.status], float(estimate.frame)], stamp)
         return heard
 

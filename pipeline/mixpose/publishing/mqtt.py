@@ -7,9 +7,8 @@ import threading
 from typing import TYPE_CHECKING, Any, cast
 
 from mixpose.poses.header import Header
-from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, header_text, path_words
+from mixpose.publishing.message import Address, Message, Sender, header_text, path_words
 from mixpose.publishing.sockets import force_down, keep_little
 
 if TYPE_CHECKING:

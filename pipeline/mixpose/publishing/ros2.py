@@ -17,17 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mixpose.poses.header import Header
 from mixpose.poses.ros import pose_message
-from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, path_word, path_words
+from mixpose.publishing.message import Address, Message, Sender, path_word, path_words
 from mixpose.publishing.sockets import connected, force_down
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
 DEFAULT_BRIDGE = "127.0.0.1:9090"
-POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TRANSFORMS = "/tf"
 _DEPTH = 10  # of the queues of publishers, as in ROS's examples
 
 
@@ -46,15 +44,12 @@ class Topics(NamedTuple):
     frames: Mapping[str, str]  # likewise, the frames of bodies in transforms
     unit: str
     frame_id: str
-    transforms: str = "/tf"
 
-
-class RosMessage(NamedTuple):
-    """A message with its fields by name, and where it goes."""
-
-    topic: str
-    kind: str
-    fields: dict[str, Any]
+    @property
+    def kinds(self) -> dict[str, str]:
+        """What kind of messages go to each topic, transforms last."""
+        kinds = dict.fromkeys(self.poses.values(), "geometry_msgs/msg/PoseWithCovarianceStamped")
+        return {**kinds, TRANSFORMS: "tf2_msgs/msg/TFMessage"}
 
 
 def topics(address: Address, header: Header) -> Topics:
@@ -73,8 +68,8 @@ def topics(address: Address, header: Header) -> Topics:
     return Topics(poses, words, header.unit, address.options.get("frame", "world"))
 
 
-def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
-    """The pose of a message and its transform, in metres; nothing of a lost frame.
+def ros_messages(message: Message, to: Topics) -> list[tuple[str, dict[str, Any]]]:
+    """The pose of a message and its transform, in metres, fields by topic; none of a lost frame.
 
     The stamp is when the frame was taken: Unix time of a live source, the time of a recording's
     frame or, without times, its number.
@@ -92,8 +87,8 @@ def ros_messages(message: Message, to: Topics) -> list[RosMessage]:
         "transform": {"translation": pose["position"], "rotation": pose["orientation"]},
     }
     return [
-        RosMessage(to.poses[estimate.label], POSE, fields),
-        RosMessage(to.transforms, TRANSFORMS, {"transforms": [transform]}),
+        (to.poses[estimate.label], fields),
+        (TRANSFORMS, {"transforms": [transform]}),
     ]
 
 
@@ -106,17 +101,16 @@ class RosNodeSender(Sender):
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("mixpose", context=self._context)
-        kinds = dict.fromkeys(self._topics.poses.values(), POSE)
-        kinds[self._topics.transforms] = TRANSFORMS
+        self._kinds = {topic: _type(kind) for topic, kind in self._topics.kinds.items()}
         self._publishers = {
-            topic: self._node.create_publisher(_type(kind), topic, _DEPTH)
-            for topic, kind in kinds.items()
+            topic: self._node.create_publisher(kind, topic, _DEPTH)
+            for topic, kind in self._kinds.items()
         }
 
     def send(self, message: Message) -> bool:
         """Publish the pose of one body and its transform."""
-        for each in ros_messages(message, self._topics):
-            self._publishers[each.topic].publish(_filled(_type(each.kind)(), each.fields))
+        for topic, fields in ros_messages(message, self._topics):
+            self._publishers[topic].publish(_filled(self._kinds[topic](), fields))
         return any(one.get_subscription_count() for one in self._publishers.values())
 
     def close(self) -> None:
@@ -176,14 +170,13 @@ class RosbridgeSender(Sender):
             )
         except WebSocketException as error:
             raise ConnectionError(f"ws://{self._bridge}: {error}") from error
-        for topic in self._topics.poses.values():
-            self._say({"op": "advertise", "topic": topic, "type": POSE})
-        self._say({"op": "advertise", "topic": self._topics.transforms, "type": TRANSFORMS})
+        for topic, kind in self._topics.kinds.items():
+            self._say({"op": "advertise", "topic": topic, "type": kind})
 
     def send(self, message: Message) -> bool:
         """Publish the pose of one body and its transform."""
-        for each in ros_messages(message, self._topics):
-            self._say({"op": "publish", "topic": each.topic, "msg": each.fields})
+        for topic, fields in ros_messages(message, self._topics):
+            self._say({"op": "publish", "topic": topic, "msg": fields})
         from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
         assert self._connection is not None

@@ -11,9 +11,15 @@ from typing import Any
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, TooLargeError, header_text, path_words
+from mixpose.publishing.message import (
+    Address,
+    Message,
+    Sender,
+    TooLargeError,
+    header_text,
+    path_words,
+)
 
 HEADER_S = 1.0
 """The header, which says the unit, is repeated so often: nobody knows who listens since when."""

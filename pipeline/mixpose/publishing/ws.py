@@ -13,9 +13,8 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING
 
 from mixpose.poses.header import Header
-from mixpose.publishing.address import Address
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Message, Sender, header_text
+from mixpose.publishing.message import Address, Message, Sender, header_text
 from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:

@@ -90,8 +90,8 @@ def _listen(host: str, port: int) -> Place:
 class Answer:
     """What a request gets in place of the page."""
 
-    status: HTTPStatus
     text: str
+    status: HTTPStatus = HTTPStatus.FORBIDDEN
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -106,23 +106,19 @@ class Guard:
         """What a request for a path and query gets in place of the page; None where it may pass."""
         host = headers.get("Host", "")
         if self.token is None and not _is_loopback(host):
-            return Answer(
-                HTTPStatus.FORBIDDEN, f"Open http://127.0.0.1:{self.port}/ on the machine itself.\n"
-            )
+            return Answer(f"Open http://127.0.0.1:{self.port}/ on the machine itself.\n")
         origin = headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.casefold() != host.casefold():
-            return Answer(HTTPStatus.FORBIDDEN, "This page answers no other site.\n")
+            return Answer("This page answers no other site.\n")
         if self.token is None:
             return None
         name = f"mixpose-view-{self.port}"
         if self._is_token(parse_qs(urlsplit(target).query).get("token", [""])[0]):
             cookie = f"{name}={self.token}; HttpOnly; SameSite=Lax; Path=/"
-            return Answer(HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": cookie})
+            return Answer("", HTTPStatus.SEE_OTHER, {"Location": "/", "Set-Cookie": cookie})
         if self._is_token(_cookie(headers.get("Cookie", ""), name)):
             return None
-        return Answer(
-            HTTPStatus.FORBIDDEN, "Open the whole address that the run has told, with its token.\n"
-        )
+        return Answer("Open the whole address that the run has told, with its token.\n")
 
     def _is_token(self, text: str) -> bool:
         # in a time that does not tell how much of it is right

@@ -1,4 +1,4 @@
-"""What passes from the run to the page, and back."""
+"""What passes from the run to the page, a `Moment` or None at the end, and back."""
 
 from __future__ import annotations
 
@@ -69,20 +69,8 @@ class Moment:
     per_second: float = float("nan")  # frames estimated in a second, lately
 
 
-@dataclass(frozen=True)
-class Done:
-    """The recording is at its end."""
-
-
-@dataclass(frozen=True)
-class Viewers:
-    """How many browsers have the page open."""
-
-    count: int
-
-
-Wish: TypeAlias = Literal["next", "pause", "go on", "step"]
-"""What the page asks of the run: another moment, or what was clicked."""
+Wish: TypeAlias = Literal["next", "pause", "go on", "step"] | int
+"""What the page asks of the run: another moment, what was clicked; or its number of browsers."""
 
 
 def row_of(estimates: tuple[Estimate, ...]) -> Row:

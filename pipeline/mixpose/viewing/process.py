@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mixpose.session import Session
 from mixpose.viewing.address import Place
-from mixpose.viewing.moment import PACE, Done, Moment, Viewers, Wish
+from mixpose.viewing.moment import PACE, Moment, Wish
 
 if TYPE_CHECKING:  # an extra
     from mixpose.viewing.page import Page
@@ -27,8 +27,7 @@ def show(
 ) -> None:
     """Show the moments that come through a pipe until it ends.
 
-    The pipe takes `Moment` and `Done`, and gives `Viewers` and what the page wishes. Runs
-    `on_files` can be paused, and are `paused` to begin with or not.
+    Runs `on_files` can be paused, and are `paused` to begin with or not.
     """
     _be_quiet()
     from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
@@ -49,15 +48,15 @@ def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
             asked = True
         if not connection.poll(_LOOK_S if asked or not wishes.viewers else 1e-3):
             continue
-        message = connection.recv()
-        if isinstance(message, Done):
+        moment: Moment | None = connection.recv()
+        if moment is None:
             page.end()
-        if isinstance(message, Moment):
-            began = time.monotonic()
-            page.show(message)
-            took = time.monotonic() - began
-            ready_at = began + max(1.0 / PACE.most_per_second, took / PACE.share)
-            asked = False
+            continue
+        began = time.monotonic()
+        page.show(moment)
+        took = time.monotonic() - began
+        ready_at = began + max(1.0 / PACE.most_per_second, took / PACE.share)
+        asked = False
 
 
 class Wishes:
@@ -68,7 +67,7 @@ class Wishes:
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, what: Wish | Viewers) -> None:
+    def wish(self, what: Wish) -> None:
         """Ask the run for something, or tell it."""
         with self._lock:
             self._connection.send(what)
@@ -76,7 +75,7 @@ class Wishes:
     def viewers_are(self, count: int) -> None:
         """Tell how many browsers look."""
         self.viewers = count
-        self.wish(Viewers(count))
+        self.wish(count)
 
 
 def _be_quiet() -> None:

@@ -7,9 +7,10 @@ as the browser's camera expects.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import viser
@@ -22,9 +23,9 @@ from mixpose.body import Body
 from mixpose.pictures.overlay import BODY_COLOURS, STATUS_COLOURS
 from mixpose.pictures.scene import with_bodies
 from mixpose.records import Estimate, Floats
-from mixpose.session import Session
-from mixpose.viewing.moment import PACE, Moment, Row
-from mixpose.viewing.outlines import Outline, outlines_of, up_of
+from mixpose.sensors import Rays, Sensor
+from mixpose.session import SensorSetup, Session
+from mixpose.viewing.moment import PACE, Moment, Row, Shown
 
 _SIZE = 4.0  # of the scene, in units of the page
 _BODY_RADII = 4.0  # that a scene has at least
@@ -38,6 +39,10 @@ _GRID = ((50, 50, 50), (80, 80, 80))
 _LINE = {"thickness": 2.0, "thickness_units": "screen"}  # px
 _POWERS = (1, 10, 100, 1000, 10000)
 _SEEN_SHARE = 0.1  # of a body's radius: an ellipsoid of this size is seen
+_ALONG_EDGE = 8  # rays along an edge of an image: lenses bend edges
+_LENGTH = 0.12  # of the scene, that lines of sight are drawn
+_SHARES = (1 - 1e-6, *np.linspace(0.95, 0.05, 19).tolist())  # the very edge rounds to outside
+_UPRIGHT = np.cos(np.deg2rad(30.0))  # an axis of the world that is nearer than this is up
 
 MAGNIFICATIONS = tuple(f"× {power}" for power in _POWERS)
 """By how much ellipsoids may be enlarged, as words."""
@@ -135,7 +140,7 @@ class Scene:
         scene.add_label(
             f"/sensors/{k}/name",
             outline.name,
-            position=self._scale * outline.middle,
+            position=self._scale * outline.places.mean(axis=0),
             font_screen_scale=_SMALL,
         )
 
@@ -166,13 +171,15 @@ class Scene:
         return _BodyNodes(pose, markers, trail, ellipsoid)
 
     def _draw_ground(self, places: Floats, up: Floats, radius: float) -> None:
-        """The world's axes, and a grid below all that is there, of cells of a round length."""
+        """The world's axes, and a grid below all that is there, of about a tenth of it a cell."""
         self._server.scene.set_up_direction(tuple(up.tolist()))
         length = self._scale * radius
         self._server.scene.add_frame("/world", axes_length=length, axes_radius=0.02 * length)
         middle, lowest = places.mean(axis=0), float((places @ up).min())
         below = middle + (lowest - radius - middle @ up) * up
-        cell = self._scale * self.cell
+        wanted = 0.1 * _SIZE / self._scale  # rounded down to 1, 2 or 5 times a power of ten
+        power = 10.0 ** np.floor(np.log10(wanted))
+        cell = self._scale * float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
         turn, _ = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])
         self._server.scene.add_grid(
             "/grid",
@@ -185,15 +192,6 @@ class Scene:
             wxyz=tuple(np.roll(turn.as_quat(), 1).tolist()),
             position=self._scale * below,
         )
-
-    @property
-    def cell(self) -> float:
-        """Length of a grid's cell: 1, 2 or 5 times a power of ten, about a tenth of the scene."""
-        if not self._scale:
-            return 0.0
-        wanted = 0.1 * _SIZE / self._scale
-        power = 10.0 ** np.floor(np.log10(wanted))
-        return float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
 
     def _look(self, bodies: Floats, radius: float, sensors: Floats, up: Floats) -> None:
         """Look at all that is there, over the shoulders of the sensors."""
@@ -242,3 +240,83 @@ def _wxyz(T: Floats) -> Floats:
 
 def _rgb(bgr: tuple[int, int, int]) -> tuple[int, int, int]:
     return bgr[2], bgr[1], bgr[0]
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A sensor in space."""
+
+    name: str
+    # (n, 3), where it stands; of parallel beams the corners of the image on the sensor's plane
+    places: Floats
+    # lines of sight around the edge of the image, in order; None of a range sensor
+    border: Rays | None
+
+    def segments(self, size: float) -> Floats:
+        """Lines (n, 2, 3) to draw, in a scene of a size."""
+        if self.border is None or not len(self.border):
+            return np.zeros((0, 2, 3))
+        starts = self.border.origins
+        ends = starts + _LENGTH * size * self.border.directions
+        far = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
+        along = np.stack([starts, ends], axis=1)[::_ALONG_EDGE]
+        near = np.stack([starts, np.roll(starts, -1, axis=0)], axis=1)
+        return np.concatenate([far, along] if self.border.central else [far, along, near])
+
+
+def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
+    """All sensors of a session in space; `shown` tells sizes of images that it does not say."""
+    found = []
+    for setup in session.sensors:
+        position = getattr(setup.sensor, "position", None)
+        if position is not None:
+            found.append(Outline(setup.name, np.reshape(position, (1, 3)), None))
+            continue
+        rays = _border(setup.sensor, *_bounds(setup, shown.get(setup.name)))
+        if rays is not None:
+            places = rays.origins[:1] if rays.central else rays.origins[::_ALONG_EDGE]
+            found.append(Outline(setup.name, places, rays))
+    return found
+
+
+def up_of(session: Session) -> Floats:
+    """The world's direction (3,) that is up in the images: an axis where one nearly is; else z."""
+    # ranges and clouds have no image
+    cameras: list[Any] = [s.sensor for s in session.sensors if s.sensor.dimension == 2]
+    ups = [-camera.T_sensor_world[1, :3] for camera in cameras]
+    total = np.sum(ups, axis=0) if ups else np.zeros(3)
+    if np.linalg.norm(total) < 0.1 * max(len(ups), 1):
+        return np.array([0.0, 0.0, 1.0])
+    total /= np.linalg.norm(total)
+    axis = int(np.argmax(np.abs(total)))
+    if abs(total[axis]) >= _UPRIGHT:
+        return np.asarray(np.sign(total[axis]) * np.eye(3)[axis])
+    return np.asarray(total)
+
+
+def _bounds(setup: SensorSetup, shown: Shown | None) -> tuple[Floats, Floats]:
+    """Corners of a camera's image in px."""
+    lower, upper = setup.sensor.lower, setup.sensor.upper
+    if np.isfinite(lower).all() and np.isfinite(upper).all():
+        return lower, upper
+    image = None if shown is None or shown.frame is None else shown.frame.data
+    if shown is not None and isinstance(image, np.ndarray):
+        return np.zeros(2), np.array(image.shape[1::-1]) / shown.zoom - 1.0
+    matrix = getattr(setup.sensor, "camera_matrix", None)
+    middle = getattr(setup.sensor, "principal_point", None) if matrix is None else matrix[:2, 2]
+    return np.zeros(2), 2.0 * np.asarray(middle if middle is not None else (320.0, 240.0))
+
+
+def _border(sensor: Sensor, lower: Floats, upper: Floats) -> Rays | None:
+    """Rays of the edge of an image, or of as much amid it as its lens model explains."""
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    steps = np.linspace(0.0, 1.0, _ALONG_EDGE + 1)[:-1, None]
+    for share in _SHARES:
+        (left, top), (right, bottom) = middle - share * half, middle + share * half
+        corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        edge = np.concatenate([a + steps * (b - a) for a, b in sides])
+        rays = sensor.rays(edge)
+        if rays is not None and len(rays) == len(edge):
+            return rays
+    return None

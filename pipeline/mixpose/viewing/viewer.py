@@ -18,7 +18,7 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Done, Moment, Row, Shown, Viewers, Wish, row_of
+from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish, row_of
 
 _LOOK_S = 0.2
 """How often a wait looks whether it was interrupted; on some systems a wait on a lock is not."""
@@ -179,7 +179,7 @@ class Viewer:
         with suppress(OSError):  # it is gone, as `_receive` notices, too
             while (taken := self._next()) is not None:
                 self._connection.send(self._moment(*taken))
-            self._connection.send(Done())  # and the page stays as it is
+            self._connection.send(None)  # and the page stays as it is
 
     def _next(self) -> tuple[_Frame, tuple[Row, ...]] | None:
         """The newest frame and all rows since the last, as soon as they are asked for."""
@@ -214,10 +214,10 @@ class Viewer:
         """Take what the page says until it is gone."""
         with suppress(EOFError, OSError):
             while True:
-                message: Wish | Viewers = self._connection.recv()
+                message: Wish = self._connection.recv()
                 with self._state:
-                    if isinstance(message, Viewers):
-                        self._viewers = message.count
+                    if isinstance(message, int):
+                        self._viewers = message
                     elif message == "next":
                         self._asked = True
                     elif message == "step":
