@@ -29,48 +29,39 @@ class Sensor(Protocol):
     @property
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
-        ...
 
     @property
     def unit(self) -> Literal["px", "length"]:
         """What the sensor coordinates count."""
-        ...
 
     @property
     def lower(self) -> Floats:
         """Smallest measurable coordinates (m,); minus infinity where unknown."""
-        ...
 
     @property
     def upper(self) -> Floats:
         """Largest measurable coordinates (m,); infinity where unknown."""
-        ...
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Map world points (..., 3) to sensor coordinates (..., m) and a visibility mask (...)."""
-        ...
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `project`, with the Jacobian (..., m, 3) by world coordinates in between."""
-        ...
 
     def towards(self, points_world: Floats) -> Floats:
         """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
-        ...
 
     def rays(self, y: Floats) -> Rays | None:
         """Lines of sight of detections (M, m); None where a detection leaves no line in space.
 
         Detections that no point in space can cause are left out.
         """
-        ...
 
     def moved(self, motion: Floats) -> Self:
         """The sensor that measures of points x what this one measures of ``motion @ x``.
 
         `motion` is a rigid motion (4, 4) of the world.
         """
-        ...
 
 
 @runtime_checkable
@@ -80,14 +71,6 @@ class AffineSensor(Sensor, Protocol):
     @property
     def affine(self) -> Floats:
         """Sensor coordinates as rows (m, 4) that are multiplied by (x, y, z, 1) in the world."""
-        ...
-
-
-def image_bounds(resolution: tuple[int, int] | None) -> tuple[Floats, Floats]:
-    """Corners of an image (width, height) in pixel coordinates; infinite where unknown."""
-    if resolution is None:
-        return np.full(2, -np.inf), np.full(2, np.inf)
-    return np.full(2, -0.5), np.asarray(resolution, dtype=np.float64) - 0.5
 
 
 def within(y: Floats, lower: Floats, upper: Floats) -> Mask:

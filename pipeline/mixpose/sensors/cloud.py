@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.sensors.base import Sensor
+from mixpose.sensors.camera import PlacedSensor
 from mixpose.sensors.parallel import ParallelBeam
 from mixpose.sensors.rays import Rays
 
@@ -36,17 +37,17 @@ class CloudPlane(ParallelBeam):
 
 
 @dataclass(frozen=True, eq=False)
-class CloudSensor:
+class CloudSensor(PlacedSensor):
     """Measures points in space."""
 
     # (4, 4) to the axes that the points are in
     T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
 
-    dimension = 3
-    unit: Literal["px", "length"] = field(default="length", init=False, repr=False)
+    dimension: ClassVar[int] = 3
+    unit: ClassVar[Literal["px", "length"]] = "length"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_sensor_world", np.asarray(self.T_sensor_world, dtype=float))
+        self._as_floats("T_sensor_world")
 
     @property
     def lower(self) -> Floats:
@@ -85,10 +86,6 @@ class CloudSensor:
     def rays(self, y: Floats) -> None:
         """None: a detection is a point, not a line."""
         return
-
-    def moved(self, motion: Floats) -> Self:
-        """The cloud of points x as this one has it of ``motion @ x``."""
-        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
 
 
 @lru_cache(maxsize=64)

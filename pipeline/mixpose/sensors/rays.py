@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.records import Floats, Mask
-from mixpose.rigid import inverse
-
-_WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -42,37 +38,3 @@ class Rays:
             directions=self.directions[chosen],
             pixels=self.pixels[chosen],
         )
-
-
-class CentralCamera(Protocol):
-    """What rays through one centre ask of a camera."""
-
-    @property
-    def T_sensor_world(self) -> Floats:
-        """Where it stands (4, 4)."""
-        ...
-
-    @property
-    def camera_matrix(self) -> Floats:
-        """Its intrinsics (3, 3)."""
-        ...
-
-    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Pixels (M, 2) of points (M, 3), and which it sees."""
-        ...
-
-
-def central_rays(camera: CentralCamera, pixels: Floats, directions: Floats) -> Rays:
-    """Rays through the centre of projection, along directions (M, 3) in the camera's axes.
-
-    Detections outside of what the lens model explains are left out.
-    """
-    T_world_sensor = inverse(camera.T_sensor_world)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = directions @ T_world_sensor[:3, :3].T
-    origin = T_world_sensor[:3, 3]
-    focal = float(np.sqrt(abs(np.linalg.det(camera.camera_matrix[:2, :2]))))
-    rays = Rays(np.tile(origin, (len(pixels), 1)), directions, pixels, True, 0.0, 1.0 / focal)
-    again, visible = camera.project(origin + directions)
-    error = np.linalg.norm(again - pixels, axis=1)
-    return rays.select(visible & (error < _WORST_ROUND_TRIP))
