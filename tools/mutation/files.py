@@ -333,7 +333,7 @@ _FORMATS = (
     Mutant(
         "poses-beside-a-body-that-errs-in-nothing",
         "poses/estimates.py",
-        "C = line.covariance + moved @ reference.covariance @ moved.T",
+        "C = line.covariance + rigid.covariance_at(reference.covariance, arm)",
         "C = line.covariance",
         "a tool on a patient is told surer than it is",
         (_RELATIVE,),
@@ -341,8 +341,8 @@ _FORMATS = (
     Mutant(
         "poses-beside-a-body-that-does-not-turn-them",
         "poses/estimates.py",
-        "moved[:3, 3:] = np.cross(np.eye(3), arm).T",
-        "pass",
+        "rigid.covariance_at(reference.covariance, arm)",
+        "reference.covariance",
         "what a turn of the patient moves at the tool is not in the covariance",
         (_RELATIVE,),
     ),

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
+from mixpose.poses.writing import PoseWriter, plain, pose_of
 from mixpose.records import Estimate
 
 _UPPER = np.triu_indices(6)
@@ -63,13 +63,13 @@ class CsvWriter(PoseWriter):
         self._rows = self._rows or self._begun(tuple(estimate.sensors))
         row = {
             "frame": estimate.frame,
-            "time_s": plain_or_none(estimate.time_s),
+            "time_s": plain(estimate.time_s),
             "object": estimate.object,
             "status": estimate.status,
             "unit": self._header.unit,
             **_pose_cells(estimate),
             **(_tip_cells(estimate) if self._header.tips else {}),
-            "confidence": plain_or_none(estimate.confidence),
+            "confidence": plain(estimate.confidence),
             "score": plain(1.0 if estimate.score is None else estimate.score),
             "latency_ms": plain(estimate.latency_ms or 0.0),
         }
@@ -77,8 +77,8 @@ class CsvWriter(PoseWriter):
             row["instance"] = estimate.instance
         for name, report in estimate.sensors.items():
             row[f"{name}_used"] = "true" if report.used else "false"
-            row[f"{name}_explained"] = plain_or_none(report.explained)
-            row[f"{name}_rms"] = plain_or_none(report.rms)
+            row[f"{name}_explained"] = plain(report.explained)
+            row[f"{name}_rms"] = plain(report.rms)
         columns = set(self._rows.fieldnames)
         unknown = [name for name in estimate.sensors if f"{name}_used" not in columns]
         if unknown:
@@ -107,9 +107,5 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
 def _tip_cells(estimate: Estimate) -> dict[str, Any]:
     """Cells of the tip, as far as there is one."""
     tip, C = estimate.tip, estimate.tip_covariance
-    if tip is None:
-        return {}
-    cells = dict(zip(TIP_COLUMNS, plain(tip)))
-    if C is not None:
-        cells |= zip(TIP_COLUMNS[3:], plain(C[np.triu_indices(3)]), strict=True)
-    return cells
+    upper = [] if C is None else plain(C[np.triu_indices(3)])
+    return {} if tip is None else dict(zip(TIP_COLUMNS, [*plain(tip), *upper]))

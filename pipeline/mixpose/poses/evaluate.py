@@ -1,23 +1,14 @@
 """Poses against the truth, modulo the object's symmetries.
 
-Which right answer a pose is held against
-    A frame may have several right answers: several lines in the truth file, and each of them
-    times every symmetry S of the object, ``T_truth @ S``.  The pose is held against the one that
-    is nearest in *rotation*.  Position could not tell: where the symmetry axis passes through the
-    object's origin, all answers share one position; and where it passes beside the origin (a
-    board measured from its corner), the answers' positions differ just because their rotations
-    do, so that a small turn of a long object could tip the balance.  A sum of both would need a
-    length that says how many millimetres a degree is worth.  The rotations of a symmetry group
-    differ by many degrees, so the nearest is never in doubt for a pose that is any good.
-    Answers whose rotations are alike (within `TIE_DEG`: marks in a row, taken for their
-    neighbours) differ in position; the nearest of these counts.
-
-A pose that was foretold is held against the truth of the moment that it is for (see
-`mixpose.poses.foretold`).
+A frame may have several right answers: several lines in the truth file, and each of them times
+every symmetry S of the object, ``T_truth @ S``.  A pose is held against the one that is nearest in
+rotation: positions of answers are all alike, or differ just because their rotations do, which in a
+symmetry group is by many degrees.  Of answers whose rotations are alike (within `TIE_DEG`: marks in
+a row, taken for their neighbours) the one nearest in position counts.
 
 Rotation and position errors of a frame belong to the same right answer.  The error is the twist
-that leads from the right answer to the pose, in the order and axes of `mixpose.rigid`; the
-position error is that of the object's origin.
+that leads from it to the pose, in the order and axes of `mixpose.rigid`; the position error is that
+of the object's origin.
 """
 
 from __future__ import annotations
@@ -32,13 +23,7 @@ import numpy as np
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.consistency import (
-    Consistency,
-    ConstantOffset,
-    consistency,
-    constant_offset,
-    normalised_error_squared,
-)
+from mixpose.poses import consistency
 from mixpose.poses.estimates import in_unit
 from mixpose.poses.foretold import truth_of_then
 from mixpose.poses.instances import Swaps, renumbered
@@ -104,12 +89,12 @@ class Evaluation:
     # over ambiguous frames: the error of the best hypothesis
     best_rotation_deg: Spread | None
     best_translation: Spread | None
-    nees: Consistency | None  # None where no "ok" frame has a covariance
+    nees: consistency.Consistency | None  # None where no "ok" frame has a covariance
     # each body by itself, where there are several
     bodies: Mapping[str, Evaluation] = field(default_factory=dict)
     swaps: Swaps | None = None  # None where no bodies are identical
     # the one transform that explains most of the errors of "ok" frames, if there is one
-    offset: ConstantOffset | None = None
+    offset: consistency.ConstantOffset | None = None
     # whether the truth has covariances, as estimates do, and the poses have none
     exchanged: bool = False
 
@@ -174,8 +159,10 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
         **_spreads(sure, "ok_"),
         **_spreads(best, "best_"),
-        nees=consistency([(e.nees, e.dimensions) for e in trusted if e.nees is not None]),
-        offset=constant_offset([error.pair for error in trusted if error.pair is not None]),
+        nees=consistency.consistency(
+            [(e.nees, e.dimensions) for e in trusted if e.nees is not None]
+        ),
+        offset=consistency.constant_offset([e.pair for e in trusted if e.pair is not None]),
         exchanged=any(line.covariance is not None for line in truth.poses)
         and all(line.covariance is None for line in poses.poses),
     )
@@ -253,7 +240,7 @@ def _frame_error(key: FrameKey, line: PoseLine | None, answers: Floats) -> Frame
         best_twist, _ = _nearest_twist(answers, np.stack(rivals))
     nees, dimensions = None, 0
     if line.covariance is not None:
-        nees, dimensions = normalised_error_squared(twist, line.covariance)
+        nees, dimensions = consistency.normalised_error_squared(twist, line.covariance)
     pair = (line.T_world_object, answer)
     return FrameError(frame, name, line.status, twist, best_twist, nees, dimensions, pair)
 

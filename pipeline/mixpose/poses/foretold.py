@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
+from operator import attrgetter
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -36,16 +37,12 @@ def truth_of_then(truth: PoseFile, poses: PoseFile) -> PoseFile:
     ahead_s = {line.frame: line.ahead_s for line in poses.poses if line.ahead_s}
     if not ahead_s:
         return truth
-    by_body = sorted((one for one in truth.poses if one.T_world_object is not None), key=_label)
+    posed = (line for line in truth.poses if line.T_world_object is not None)
     moved: dict[int, PoseLine] = {}
-    for _, each in groupby(by_body, key=_label):
-        lines = sorted(each, key=lambda line: line.frame)
+    for _, each in groupby(sorted(posed, key=attrgetter("label", "frame")), attrgetter("label")):
+        lines = list(each)
         moved |= _moved(lines, _times(truth, lines), ahead_s)
     return replace(truth, poses=tuple(moved.get(id(line), line) for line in truth.poses))
-
-
-def _label(line: PoseLine) -> str:
-    return line.label
 
 
 def _times(truth: PoseFile, lines: Sequence[PoseLine]) -> Floats:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
@@ -84,8 +85,8 @@ def _distance(a: PoseLine, b: PoseLine, symmetries: Floats | None) -> float:
 
 
 def _by_frame(lines: Sequence[PoseLine]) -> dict[int, list[PoseLine]]:
-    ordered = sorted(lines, key=lambda line: line.frame)
-    return {frame: list(some) for frame, some in groupby(ordered, key=lambda line: line.frame)}
+    frame_of = attrgetter("frame")
+    return {frame: list(some) for frame, some in groupby(sorted(lines, key=frame_of), frame_of)}
 
 
 def _assigned(
