@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import PurePosixPath
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
 from mixpose.session.calibration.pieces import size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
@@ -24,6 +26,9 @@ from mixpose.session.values import LARGEST, as_number
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
 _CENTRE = 0.5  # px, of a pixel from its corner
+
+_Placed: TypeAlias = dict[str, tuple[str, Floats | None]]
+"""By name: the number of the camera, and where it stands."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,7 @@ def _of_kind(group: Group, kind: str) -> Content | None:
     return files[0] if files else None
 
 
-def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
-    """By name: the number of the camera, and where it stands."""
+def _placed(group: Group) -> _Placed:
     cameras, images, rigs = (_of_kind(group, kind) for kind in ("cameras", "images", "rigs"))
     if cameras is None:
         raise BadKeyError("COLMAP's cameras.txt is missing; give it beside this file")
@@ -96,7 +100,7 @@ def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
     return {f"camera{number}": (number, None) for number in numbers}
 
 
-def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
+def _from_images(content: Content) -> _Placed:
     """A sensor for each image: a camera that was moved was at several places."""
     lines = [line for line in content.lines if not line.startswith("#")]
     while lines and not lines[0]:
@@ -107,7 +111,7 @@ def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
             f"found {len(poses)} images; allowed: at most {_MOST_IMAGES}, one of each camera: "
             "mixpose's cameras stand still"
         )
-    placed: dict[str, tuple[str, Floats | None]] = {}
+    placed: _Placed = {}
     for row in poses:
         if len(row) != 10:
             raise BadKeyError(
@@ -120,12 +124,12 @@ def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
     return placed
 
 
-def _from_rigs(content: Content) -> dict[str, tuple[str, Floats | None]]:
+def _from_rigs(content: Content) -> _Placed:
     """Sensors of the only rig: the reference at its origin, the others where they say."""
     rigs = [row for row in _rows(content) if len(row) > 3 and _whole(row[1]) > 1]
     if len(rigs) > 1:
         raise BadKeyError(f"found {len(rigs)} rigs of several sensors; allowed: one")
-    placed: dict[str, tuple[str, Floats | None]] = {}
+    placed: _Placed = {}
     for row in rigs:
         kind, number, *rest = row[2:]
         if kind == "CAMERA":
@@ -164,8 +168,12 @@ def _floats(cells: Sequence[str]) -> list[float]:
     return values
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+def _cameras(group: Group) -> dict[str, Reader]:
     placed = _placed(group)
+    return {name: partial(_read, group, placed, name) for name in placed}
+
+
+def _read(group: Group, placed: _Placed, name: str, _: CameraModel) -> CalibratedCamera:
     number, pose = placed[name]
     cameras = _of_kind(group, "cameras")
     assert cameras is not None, "without it there are no names"
@@ -203,7 +211,6 @@ COLMAP = Format(
     "a COLMAP file",
     "COLMAP's text (cameras.txt ...)",
     recognises=lambda content: bool(_kind(content)),
-    names=lambda group: list(_placed(group)),
-    read=_read,
+    cameras=_cameras,
     groups=lambda contents: [contents],
 )

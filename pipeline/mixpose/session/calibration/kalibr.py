@@ -7,13 +7,14 @@ programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` in its place
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
 from mixpose.session.calibration.pieces import model_of_distortion, plain, present, size_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, under
@@ -23,18 +24,22 @@ from mixpose.session.values import numbers
 _MATRIX = "a 4x4 matrix, four rows of four numbers"
 
 
-def _cameras(content: Content) -> list[str]:
+def _cameras(group: Group) -> dict[str, Reader]:
+    chain = group[0].mapping
     named = [
         name
-        for name, camera in content.mapping.items()
+        for name, camera in chain.items()
         if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
     ]
     # YAML's writers put cam10 before cam2, and the one before it is cam9
-    return sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
+    names = sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
+    return {name: partial(_read, chain, names, name) for name in names}
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
-    camera = group[0].mapping[name]
+def _read(
+    chain: dict[str, Any], names: list[str], name: str, model: CameraModel
+) -> CalibratedCamera:
+    camera = chain[name]
     with under(name):
         if camera.get("camera_model", "pinhole") != "pinhole":
             raise BadKeyError(found(camera["camera_model"], '"pinhole"'), "camera_model")
@@ -48,8 +53,7 @@ def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
             D = distortion(plain(coefficients), model)
         with under("resolution"):
             size = size_of(camera.get("resolution"))
-    pose = _pose(group[0].mapping, _cameras(group[0]), name)
-    return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, "m")
+    return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
 
 
 def _matrix(intrinsics: Any) -> Floats:
@@ -102,7 +106,6 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
 KALIBR = Format(
     "a Kalibr file",
     "Kalibr camchain (cam0: intrinsics ...)",
-    recognises=lambda content: bool(_cameras(content)),
-    names=lambda group: _cameras(group[0]),
-    read=_read,
+    recognises=lambda content: bool(_cameras([content])),
+    cameras=_cameras,
 )

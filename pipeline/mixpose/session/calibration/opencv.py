@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import cv2
@@ -20,7 +21,7 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
 from mixpose.session.calibration.pieces import model_of_distortion, motion_of
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, nearest, under
@@ -91,14 +92,14 @@ def _require_shallow(content: Content) -> None:
 
 def _groups(contents: Group) -> list[Group]:
     """Files with cameras; one without belongs to the only other."""
-    with_cameras = [content for content in contents if _cameras(_open([content]), content.stem)]
+    with_cameras = [content for content in contents if _places(_open([content]), content.stem)]
     others = [content for content in contents if content not in with_cameras]
     if len(with_cameras) == 1:
         return [[*with_cameras, *others]]
     return [[content] for content in contents]
 
 
-def _cameras(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
+def _places(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
     """By name: the map of a camera, or its nodes of matrix and distortion."""
     nested: dict[str, str | tuple[str, str]] = {
         name: name
@@ -126,26 +127,26 @@ def _usual(opened: _Nodes, names: tuple[str, ...]) -> str | None:
     return next((name for name in names if name in opened.nodes), None)
 
 
-def _names(group: Group) -> list[str]:
+def _cameras(group: Group) -> dict[str, Reader]:
     opened = _open(group)
-    names = list(_cameras(opened, group[0].stem))
-    if not names and {"R", "T"} <= set(opened.nodes):
+    places = _places(opened, group[0].stem)
+    if not places and {"R", "T"} <= set(opened.nodes):
         raise BadKeyError(
             "holds R and T, where one camera stands to another, and no camera matrix; allowed: "
             "beside it the file that has the matrices of the two"
         )
-    if not names:  # which says what is there and how to name it
+    if not places:  # which says what is there and how to name it
         choose_node(opened, "camera_matrix", None)
-    return names
+    names = list(places)
+    return {name: partial(_read, opened, names, name, place) for name, place in places.items()}
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
-    opened = _open(group)
-    cameras = _cameras(opened, group[0].stem)
-    place = cameras[name]
+def _read(
+    opened: _Nodes, names: list[str], name: str, place: str | tuple[str, str], model: CameraModel
+) -> CalibratedCamera:
     if not isinstance(place, str):
         intrinsics = _intrinsics(opened, model, place[0], place[1] or None)
-        return CalibratedCamera(name, intrinsics, _stereo_pose(opened, list(cameras), name))
+        return CalibratedCamera(name, intrinsics, _stereo_pose(opened, names, name))
     node = opened.nodes[place]
     own = _Nodes({key: node.getNode(key) for key in list(node.keys())}, opened.storages)
     with under(place):
@@ -155,11 +156,7 @@ def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
 def read_nodes(
     content: Content, model: CameraModel, matrix: str | None, distortion_name: str | None
 ) -> CalibratedCamera:
-    """Read the camera whose nodes the user names.
-
-    Raises BadKeyError if the text cannot be parsed, or a node is missing or is no camera matrix or
-    distortion.
-    """
+    """Read the camera whose nodes the user names; BadKeyError if they are not there or not such."""
     intrinsics = _intrinsics(_open([content]), model, matrix, distortion_name)
     return CalibratedCamera(content.stem, intrinsics)
 
@@ -261,4 +258,4 @@ def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     return None
 
 
-OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _names, _read, _groups)
+OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _cameras, _groups)

@@ -40,11 +40,8 @@ def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floa
 
 
 def model_of_distortion(name: object) -> CameraModel | None:
-    """The camera model that a distortion model of Kalibr or ROS belongs to.
-
-    None for the empty name, which ROS writes for a camera without distortion.
-    """
-    if name is None or name == "":
+    """The camera model that a distortion model of Kalibr or ROS belongs to."""
+    if name is None or name == "":  # as ROS writes for a camera without distortion
         return None
     if isinstance(name, str) and name in MODELS:
         return MODELS[name]
