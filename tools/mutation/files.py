@@ -100,8 +100,8 @@ _SETUPS = (
     Mutant(
         "session-bias-by-default",
         "session/schema_sensors.py",
-        'range_bias: Number = Field(0.0, description="a length")',
-        'range_bias: Number = Field(1.0, description="a length")',
+        'range_bias: common.Number = Field(0.0, description="a length")',
+        'range_bias: common.Number = Field(1.0, description="a length")',
         "ranges are off by a length that nobody wrote",
     ),
     Mutant(
@@ -159,8 +159,8 @@ _CALIBRATIONS = (
     Mutant(
         "session-binned-images-pass",
         "session/calibration/ros.py",
-        "if content.get(key, 0) not in (0, 1):",
-        "if content.get(key, 0) < 0:",
+        "if table.get(key, 0) not in whole:",
+        "if table.get(key, 0) < 0:",
         "the camera matrix of the whole image is used for binned ones",
     ),
     Mutant(

@@ -66,8 +66,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     normals = _normals(table, markers, count)
     _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
-    gravity = _gravity(table)
-    names = _names(table, markers)
+    gravity, names = _gravity(table), _names(table, markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
 
 
@@ -163,11 +162,10 @@ def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
 
 
 def covariances(sigma: Any, count: int) -> Floats:
-    """Read the key ``sigma`` as one covariance per feature, (N, 3, 3).
+    """Read the key ``sigma``, which is `SIGMA_ALLOWED`, as one covariance per feature, (N, 3, 3).
 
-    It is a number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature. Where
-    three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and three
-    lists of three numbers are a covariance for all of them.
+    Where three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and
+    three lists of three numbers are a covariance for all of them.
     """
     if _is_single(sigma):
         _check_ambiguous(sigma, count)
@@ -188,9 +186,8 @@ def _is_single(sigma: Any) -> bool:
     if not isinstance(sigma, list):
         return True
     lists = [item for item in sigma if isinstance(item, list)]
-    if len(sigma) != 3 or not lists:
-        return len(sigma) == 3
-    return len(lists) == 3 and not any(isinstance(x, list) for item in lists for x in item)
+    of_numbers = not any(isinstance(x, list) for item in lists for x in item)
+    return len(sigma) == 3 and (not lists or (len(lists) == 3 and of_numbers))
 
 
 def _check_ambiguous(sigma: Any, count: int) -> None:

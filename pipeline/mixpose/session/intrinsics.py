@@ -53,10 +53,7 @@ def camera_matrix(value: Any) -> Floats:
 
 
 def distortion(value: Any, model: str) -> Floats:
-    """Read distortion coefficients, as a list or as a matrix of one row or column.
-
-    Raises BadKeyError if a camera of this model cannot have that many.
-    """
+    """Read as many coefficients as the model may have: a list, or a matrix of one row or column."""
     is_row = isinstance(value, list) and len(value) == 1 and isinstance(value[0], list)
     flat = value[0] if is_row else column_as_list(value)
     if flat is None or flat == []:

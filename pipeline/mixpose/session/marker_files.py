@@ -67,10 +67,7 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
 
 
 def read_rom(content: bytes) -> Markers:
-    """Read the markers of an NDI tool.
-
-    Raises BadKeyError if the file is none, is cut short, or has changed since it was written.
-    """
+    """Read the markers of an NDI tool; BadKeyError if the file is none or damaged."""
     if not content.startswith(NDI_MARK):
         raise BadKeyError('not an NDI .rom file, which begins with "NDI"')
     if len(content) < _POSITIONS + 12 * _MOST_NDI:
@@ -86,10 +83,7 @@ def read_rom(content: bytes) -> Markers:
 
 
 def read_vsk(content: bytes) -> Markers:
-    """Read the markers of a Vicon subject that is one rigid body.
-
-    Raises BadKeyError if the file is no such XML, is a skeleton, or lacks a parameter.
-    """
+    """Read the markers of a Vicon subject; BadKeyError if the file is not that of a rigid body."""
     text = as_text(content)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise BadKeyError("found a DOCTYPE or ENTITY, which a .vsk file does not have")
@@ -147,7 +141,7 @@ def read_astertrack(content: bytes) -> Markers:
             faces.append((group, number, _corners(cells, number)))
     if not vertices or not faces:
         raise BadKeyError("found no vertices (v) and faces (f), as a Wavefront .obj has them")
-    groups = list(dict.fromkeys(group for group, _, _ in faces))
+    groups = list(dict.fromkeys(group for group, *_ in faces))
     of_markers = [name for name in groups if "marker" in name.lower()]
     if not of_markers and groups != [""]:
         raise BadKeyError(
@@ -214,11 +208,10 @@ class Markers:
 
 
 def read_markers(path: Path) -> Markers:
-    """Read a marker table; problems name line and column.
+    """Read a marker table, a CSV file; problems name line and column.
 
-    It is a CSV file with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along
-    x, y and z) or nine (the covariance, row by row). The columns in which ``mixpose learn`` says
-    how well markers are known may stand there, too.
+    The header ``name,x,y,z`` is followed by no column, one (σ), three (σ along x, y and z) or nine
+    (the covariance, row by row), and perhaps by `LEARNT_COLUMNS`.
     """
     content = read_bytes(path)
     with in_file(path.name):

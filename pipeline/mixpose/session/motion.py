@@ -19,8 +19,7 @@ _ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
 
 
 def read_motion(table: Placement, matrix_key: str) -> Floats | None:
-    """Read the one form of a rigid motion that a table holds, made exactly rigid; None if it holds
-    none.
+    """Read the one form of a rigid motion (4, 4) that a table holds, made exactly rigid, or None.
 
     `matrix_key` is that of the 4x4 form: "T_world_object" or "T_sensor_world". Two forms, half a
     form, and a matrix that is no rigid motion are refused.

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from mixpose.records import Floats
-from mixpose.session.values import LARGEST, SMALLEST, ArrayOf, Method, Threshold
+from mixpose.session.values import LARGEST, SMALLEST, Method, Threshold, array_of
 
 Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
 Number: TypeAlias = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -18,7 +18,7 @@ NotNegative: TypeAlias = Annotated[float, Field(ge=0, le=LARGEST)]
 Positive: TypeAlias = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 Motion: TypeAlias = Annotated[
-    Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
+    Floats | None, array_of((4, 4), "a 4x4 matrix, four rows of four numbers")
 ]
 
 
@@ -39,14 +39,14 @@ class Placement(Table):
     """The forms of a rigid motion beside the 4x4 matrix."""
 
     rotation_vector: Annotated[
-        Floats | None, ArrayOf((3,), "three numbers: axis times angle in radians")
+        Floats | None, array_of((3,), "three numbers: axis times angle in radians")
     ] = None
     """The rotation, in place of the matrix and together with `translation`.
     Example: `rotation_vector = [0.1, -0.2, 1.0]`"""
-    quaternion_xyzw: Annotated[Floats | None, ArrayOf((4,), "four numbers: x, y, z, w")] = None
+    quaternion_xyzw: Annotated[Floats | None, array_of((4,), "four numbers: x, y, z, w")] = None
     """The same rotation as a quaternion of length 1, the real part last.
     Example: `quaternion_xyzw = [0.0, 0.0, 0.7071068, 0.7071068]`"""
-    translation: Annotated[Floats | None, ArrayOf((3,), "three numbers: x, y, z")] = None
+    translation: Annotated[Floats | None, array_of((3,), "three numbers: x, y, z")] = None
     """The last column of the matrix, in `unit`; beside a rotation.
     Example: `translation = [20, 10, 900]`"""
 

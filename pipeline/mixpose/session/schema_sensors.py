@@ -7,33 +7,23 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field
 
 from mixpose.records import Floats
+from mixpose.session import schema_common as common
 from mixpose.session import values
 from mixpose.session.intrinsics import MATRIX_FORM
-from mixpose.session.schema_common import (
-    ExtractTable,
-    Motion,
-    NotNegative,
-    Number,
-    Placement,
-    Positive,
-    Table,
-    Text,
-)
-from mixpose.session.values import ArrayOf, Delay, SensorName, Source, read_calibration_key
 from mixpose.units import Unit
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
 
 
-class CalibrationTable(Table):
+class CalibrationTable(common.Table):
     """A calibration file, and what to read in it. `calibration = "cam.yml"` is short for
     `calibration = { file = "cam.yml" }`.
     """
 
-    file: Text
+    file: common.Text
     """A file of OpenCV (YAML, XML or JSON), Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP,
     told apart by content. Where it says how cameras stand to each other, and `T_sensor_world` is
     left out, that is taken over; the world is then the one of the file.
@@ -57,7 +47,7 @@ class CalibrationTable(Table):
     Example: `unit = "mm"`"""
 
 
-class CalibrationErrorTable(Table):
+class CalibrationErrorTable(common.Table):
     """How far off a calibration may be, as standard deviations. Poses stay as they are; their
     covariances know of it, to first order. `mixpose calibrate` prints such numbers; where a rig was
     bumped or a lens refocused, they are yours to guess (`docs/sensors-in-time.md`).
@@ -66,27 +56,27 @@ class CalibrationErrorTable(Table):
     focal: float = Field(0.0, ge=0, le=0.5, description="a share, from 0 to 0.5")
     """Of the focal length, as a share of it; with parallel beams of `pixel_size`.
     Example: `focal = 0.001`"""
-    principal_point: NotNegative = Field(0.0, description="px, at least 0")
+    principal_point: common.NotNegative = Field(0.0, description="px, at least 0")
     """Of the principal point along each axis, in px.
     Example: `principal_point = 0.5`"""
     rotation_deg: float = Field(0.0, ge=0, le=45, description="degrees, from 0 to 45")
     """Of the orientation about each axis.
     Example: `rotation_deg = 0.05`"""
-    position: NotNegative = Field(0.0, description="a length, at least 0")
+    position: common.NotNegative = Field(0.0, description="a length, at least 0")
     """Of where the sensor stands along each axis, in `unit`.
     Example: `position = 0.5`"""
-    range_bias: NotNegative = Field(0.0, description="a length, at least 0")
+    range_bias: common.NotNegative = Field(0.0, description="a length, at least 0")
     """Of `range_bias`, with `model = "lateration"`.
     Example: `range_bias = 0.02`"""
 
 
-class SensorTable(Table):
+class SensorTable(common.Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
-    name: SensorName
+    name: values.SensorName
     """Name of the sensor, a different one for each.
     Example: `name = "left"`"""
-    source: Source = ()
+    source: values.Source = ()
     """The recording, relative to the session file: images, a video, a table of detections
     (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
     profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
@@ -96,10 +86,10 @@ class SensorTable(Table):
     """When frames were taken, in seconds: a table with a row for each frame, beside the session
     file or relative to it.  Times must not go back from frame to frame.
     Example: `times = "times.csv"`"""
-    fps: Positive | None = Field(None, description="frames per second, greater than 0")
+    fps: common.Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
     Example: `fps = 25`"""
-    delay: Delay = 0.0
+    delay: values.Delay = 0.0
     """Seconds by which this sensor's frames are taken later than their times say; negative where
     they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
     delay is known (`docs/sensors-in-time.md`).
@@ -110,22 +100,20 @@ class SensorTable(Table):
     """How far off the calibration may be: standard deviations that covariances are to know of. Left
     out: what residuals show of it.
     Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`"""
-    extract: ExtractTable | None = Field(None, description="a table [sensor.extract]")
+    extract: common.ExtractTable | None = Field(None, description="a table [sensor.extract]")
     """Keys of `[extract]` that differ for this sensor.
     Example: `extract = { polarity = "dark" }`"""
 
 
-class PlacedTable(SensorTable, Placement):
+class PlacedTable(SensorTable, common.Placement):
     """A sensor that stands somewhere and looks somewhere."""
 
-    T_sensor_world: Motion = None
+    T_sensor_world: common.Motion = None
     """Maps coordinates of the world to those of the sensor, which looks along +z with x to the
     right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
     the origin of the world.
     Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""
-    resolution: Annotated[tuple[int, int] | None, PlainValidator(values.resolution)] = Field(
-        None, description=values.RESOLUTION_FORM
-    )
+    resolution: values.Resolution = None
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
     Example: `resolution = [640, 512]`"""
     readout: float = Field(0.0, ge=0, le=1, description=SPAN_ALLOWED)
@@ -145,15 +133,15 @@ class CameraTable(PlacedTable):
     """The lens: OpenCV's pinhole model, or its fisheye model. The latter sees beyond 90° from its
     axis, too, as far as the image goes.
     Example: `model = "pinhole"`"""
-    camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
+    camera_matrix: Annotated[Floats | None, values.array_of((3, 3), MATRIX_FORM)] = None
     """Focal lengths and principal point in px; pixel centres have integer coordinates.
     Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`"""
     distortion: Any = Field(None, description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
     """OpenCV's distortion coefficients, in OpenCV's order. Left out: none.
     Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`"""
-    calibration: Annotated[CalibrationTable | None, BeforeValidator(read_calibration_key)] = Field(
-        None, description='a file, or a table { file = "...", ... }'
-    )
+    calibration: Annotated[
+        CalibrationTable | None, BeforeValidator(values.read_calibration_key)
+    ] = Field(None, description='a file, or a table { file = "...", ... }')
     """A calibration file in place of `camera_matrix` and `distortion`.
     Example: `calibration = "left.yml"`"""
 
@@ -164,11 +152,11 @@ class ParallelTable(PlacedTable):
     model: Literal["parallel"]
     """Parallel beams.
     Example: `model = "parallel"`"""
-    pixel_size: Positive = Field(description="length per px, a number greater than 0")
+    pixel_size: common.Positive = Field(description="length per px, a number greater than 0")
     """Length in the world, in `unit`, that one px shows.
     Example: `pixel_size = 0.5`"""
     principal_point: Annotated[
-        Floats, ArrayOf((2,), "[u, v], the px where the sensor's origin projects")
+        Floats, values.array_of((2,), "[u, v], the px where the sensor's origin projects")
     ]
     """Where the sensor's origin is in the image, in px.
     Example: `principal_point = [150, 160]`"""
@@ -180,21 +168,25 @@ class LaterationTable(SensorTable):
     model: Literal["lateration"]
     """Ranges, in `unit`.
     Example: `model = "lateration"`"""
-    position: Annotated[Floats, ArrayOf((3,), "[x, y, z], the sensor's place in the world")]
+    position: Annotated[Floats, values.array_of((3,), "[x, y, z], the sensor's place in the world")]
     """Where ranges are measured from, in `unit`.
     Example: `position = [0, -1000, 0]`"""
-    range_bias: Number = Field(0.0, description="a length")
+    range_bias: common.Number = Field(0.0, description="a length")
     """What every reading is too long by, in `unit`.
     Example: `range_bias = 0.15`"""
-    range_min: Number | None = Field(None, description="a length: range of a profile's first bin")
+    range_min: common.Number | None = Field(
+        None, description="a length: range of a profile's first bin"
+    )
     """For range profiles: the range that their first bin stands for, in `unit`.
     Example: `range_min = 700`"""
-    bin_size: Positive | None = Field(None, description="a length greater than 0: from bin to bin")
+    bin_size: common.Positive | None = Field(
+        None, description="a length greater than 0: from bin to bin"
+    )
     """For range profiles: length from one bin to the next, in `unit`.
     Example: `bin_size = 1.0`"""
 
 
-class CloudTable(SensorTable, Placement):
+class CloudTable(SensorTable, common.Placement):
     """Points in space that nobody has labelled, from a system that triangulates by itself. The
     source is a table with columns `x,y,z`, in `unit`.
     """
@@ -202,7 +194,7 @@ class CloudTable(SensorTable, Placement):
     model: Literal["cloud"]
     """Points in space.
     Example: `model = "cloud"`"""
-    T_sensor_world: Motion = None
+    T_sensor_world: common.Motion = None
     """Maps coordinates of the world to the axes that the points are in; in place of a rotation with
     `translation`. Left out: the points are in the world's axes.
     Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""

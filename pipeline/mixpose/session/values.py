@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias, TypeGuard
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, PlainValidator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler
 from pydantic_core import core_schema
 
 from mixpose.limits import MOST_PIXELS
@@ -39,10 +41,10 @@ _WIDEST = 1_000_000  # px; more than any image library reads
 
 
 @dataclass(frozen=True)
-class ArrayOf:
-    """Annotation of a key that holds nested lists of numbers, see `arrays.numbers`."""
+class ReadBy:
+    """Annotation of a key: what reads the value in the file, and what it may be."""
 
-    shape: tuple[int | None, ...]
+    read: Callable[[Any], Any]
     description: str
 
     def __get_pydantic_core_schema__(
@@ -50,9 +52,10 @@ class ArrayOf:
     ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(self.read)
 
-    def read(self, value: Any) -> Floats:
-        """Read what the file holds."""
-        return numbers(value, self.shape, self.description)
+
+def array_of(shape: tuple[int | None, ...], description: str) -> ReadBy:
+    """Annotation of a key that holds nested lists of numbers, see `numbers`."""
+    return ReadBy(partial(numbers, shape=shape, allowed=description), description)
 
 
 def _read_sensor_name(name: str) -> str:
@@ -114,21 +117,27 @@ def _read_free(value: Any) -> tuple[str, ...]:
 SensorName: TypeAlias = Annotated[
     str, AfterValidator(_read_sensor_name), Field(description="a name for the sensor, as text")
 ]
-Method: TypeAlias = Annotated[
-    str | None, PlainValidator(_read_method), Field(description=_METHOD_ALLOWED)
-]
-Threshold: TypeAlias = Annotated[
-    str | float | None, PlainValidator(_read_threshold), Field(description=_THRESHOLD_ALLOWED)
-]
-Source: TypeAlias = Annotated[
-    str | tuple[str, ...], PlainValidator(_read_source), Field(description=_SOURCE_ALLOWED)
-]
-Delay: TypeAlias = Annotated[
-    float | Literal["estimate"], PlainValidator(_read_delay), Field(description=_DELAY_ALLOWED)
-]
-Free: TypeAlias = Annotated[
-    tuple[str, ...], PlainValidator(_read_free), Field(description=_FREE_ALLOWED)
-]
+Method: TypeAlias = Annotated[str | None, ReadBy(_read_method, _METHOD_ALLOWED)]
+Threshold: TypeAlias = Annotated[str | float | None, ReadBy(_read_threshold, _THRESHOLD_ALLOWED)]
+Source: TypeAlias = Annotated[str | tuple[str, ...], ReadBy(_read_source, _SOURCE_ALLOWED)]
+Delay: TypeAlias = Annotated[float | Literal["estimate"], ReadBy(_read_delay, _DELAY_ALLOWED)]
+Free: TypeAlias = Annotated[tuple[str, ...], ReadBy(_read_free, _FREE_ALLOWED)]
+
+
+def resolution(value: Any) -> tuple[int, int]:
+    """Read the width and height of an image in px."""
+    match value:
+        case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
+            if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
+                if width * height <= MOST_PIXELS:
+                    return width, height
+                raise BadKeyError(
+                    f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
+                )
+    raise BadKeyError(found(value, RESOLUTION_FORM))
+
+
+Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(resolution, RESOLUTION_FORM)]
 
 
 def read_calibration_key(value: Any) -> Any:
@@ -182,16 +191,3 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
         with under(i):
             rows.append(numbers(item, inner, allowed))
     return np.array(rows, dtype=np.float64)
-
-
-def resolution(value: Any) -> tuple[int, int]:
-    """Read the width and height of an image in px."""
-    match value:
-        case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
-            if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
-                if width * height <= MOST_PIXELS:
-                    return width, height
-                raise BadKeyError(
-                    f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
-                )
-    raise BadKeyError(found(value, RESOLUTION_FORM))
