@@ -167,7 +167,7 @@ MUTANTS = (
     ),
     Mutant(
         "importing-lengths-of-tables-in-silence",
-        "importing/gather.py",
+        "importing.py",
         "    if lengths in (None, unit):",
         "    if True:",
         "a body in metres is a thousand times too small, though its unit was said",

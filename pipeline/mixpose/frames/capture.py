@@ -177,13 +177,10 @@ def name_of(address: str | int) -> str:
 
 
 def quieten_opencv() -> None:
-    """Turn off the messages of OpenCV and of its FFmpeg backend.
+    """Turn off the messages of OpenCV and of its FFmpeg backend, but for whoever set their levels.
 
-    A recording that cannot be read is one line on standard error, written by mixpose; the
-    decoders' own account of the same fault would surround it with dozens more.  Whoever set
-    ``OPENCV_LOG_LEVEL`` or ``OPENCV_FFMPEG_LOGLEVEL`` wants to see it and keeps it.
-
-    FFmpeg's level counts only before the first video is opened, so call this before that.
+    They would surround mixpose's own line on what cannot be read with dozens more. FFmpeg's level
+    counts only before the first video is opened.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     if "OPENCV_LOG_LEVEL" not in os.environ:

@@ -24,17 +24,8 @@ import cv2
 
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
-from mixpose.frames.capture import (
-    NotOpenedError,
-    SilentError,
-    grab,
-    is_device,
-    is_pipe,
-    name_of,
-    opened,
-    retrieve,
-)
-from mixpose.frames.source import Frames, Source, SourceKind, selection
+from mixpose.frames import capture as captures
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, Moment, RawFrame
 
@@ -62,13 +53,20 @@ def live_address(source: str) -> str | int | None:
     """The camera's index or address where a source is live; None where it is a recording."""
     if camera := _CAMERA.fullmatch(source):
         return int(camera[1])
-    if is_device(source):
+    if captures.is_device(source):
         return source
     scheme, _, rest = source.partition("://")
     if not rest or scheme.lower() not in _SCHEMES:
         return None
     suffix = PurePosixPath(urlsplit(source).path).suffix.lower()
     return None if scheme.lower().startswith("http") and suffix in _FILES else source
+
+
+def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
+    """A camera or a stream, opened when its frames are asked for."""
+    address = live_address(source)
+    assert address is not None, "recognised as live"
+    return LiveSource(address, spec.resolution, clock)
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class LiveSource(Source):
 
     def describe(self) -> str:
         """One line for people."""
-        return f"live {name_of(self.address)}, opened when it is needed"
+        return f"live {captures.name_of(self.address)}, opened when it is needed"
 
     def check_times(self, wanted: range) -> None:
         """Nothing to look for: nobody knows which frames will come."""
@@ -207,10 +205,12 @@ class _Reader:
             try:
                 self._read_on()
                 return
-            except (SilentError, NotOpenedError):
+            except (captures.SilentError, captures.NotOpenedError):
                 heard = time.monotonic() if self._count > before else heard
                 address = self._source.address
-                lost = isinstance(address, str) and is_pipe(address)  # what it held is gone
+                lost = isinstance(address, str) and captures.is_pipe(
+                    address
+                )  # what it held is gone
                 if lost or not self._count or time.monotonic() - heard > RETURN_S:
                     raise
             if self._stop.wait(_AGAIN_S):
@@ -219,18 +219,18 @@ class _Reader:
     def _read_on(self) -> None:
         address, clock = self._source.address, self._source.clock
         times = CaptureTimes(address)
-        with opened(address) as capture:
-            while not self._stop.is_set() and grab(capture, address):
+        with captures.opened(address) as capture:
+            while not self._stop.is_set() and captures.grab(capture, address):
                 number = self._count
                 moment = times.moment(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-                image = retrieve(capture, address, number, self._source.resolution)
+                image = captures.retrieve(capture, address, number, self._source.resolution)
                 time_s = moment.seconds - self._began if clock is None else clock(number)
                 with self._changed:
                     self._frames.append(RawFrame(number, time_s, image, moment))
                     self._changed.notify_all()
                 self._count += 1
         if isinstance(address, int) and not self._stop.is_set():
-            raise RecordingError(f"{name_of(address)}: gives no frames any more")
+            raise RecordingError(f"{captures.name_of(address)}: gives no frames any more")
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class CaptureTimes:
     """
 
     def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:
-        self._is_device = isinstance(address, int) or is_device(address)
+        self._is_device = isinstance(address, int) or captures.is_device(address)
         self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
         self._rules = rules
         self._last: tuple[float, float] | None = None  # stamp, and least difference
