@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -61,24 +61,17 @@ class RollingSensor:
     delay: float
     readout: float
 
-    @property
-    def dimension(self) -> int:
-        """m, the number of sensor coordinates."""
-        return self.sensor.dimension
-
-    @property
-    def unit(self) -> Literal["px", "length"]:
-        """What the sensor coordinates count."""
-        return self.sensor.unit
+    dimension: ClassVar[int] = 2
+    unit: ClassVar[Literal["px", "length"]] = "px"
 
     @property
     def lower(self) -> Floats:
-        """Smallest measurable coordinates (m,)."""
+        """The image's upper left corner (2,)."""
         return self.sensor.lower
 
     @property
     def upper(self) -> Floats:
-        """Largest measurable coordinates (m,)."""
+        """The image's lower right corner (2,)."""
         return self.sensor.upper
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:

@@ -48,7 +48,8 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
         bodies.setdefault(each.label, []).append(each)
     rests = [_rests(own) for own in bodies.values()]
     if len(bodies) == 1 and rests[0]:
-        T = _mean_pose(estimates)
+        poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
+        T = poses[0] if len(poses) == 1 else rigid.mean_motion(poses)
         _require_still(estimates, T)
         return Floor(T, f"the body {estimates[0].label!r}", None, _tilt_of_body(estimates, T, up))
     if all(rests):
@@ -68,8 +69,7 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     # where points are farther off the plane than they err by, it is not flat, or they lie not on it
     errs = max(errs, off * np.sqrt(count / (count - 3)))
     T = _plane(points.mean(axis=0), normal, up)
-    tilt_deg = float(np.degrees(errs / across))
-    return Floor(T, f"a plane through {count} points", off, tilt_deg)
+    return Floor(T, f"a plane through {count} points", off, float(np.degrees(errs / across)))
 
 
 def _tilt_of_body(estimates: Sequence[Estimate], T_mean: Floats, up: Axis) -> float:
@@ -79,9 +79,8 @@ def _tilt_of_body(estimates: Sequence[Estimate], T_mean: Floats, up: Axis) -> fl
         return 0.0
     normal = T_mean[:3, "xyz".index(up)]
     level = np.eye(3) - np.outer(normal, normal)
-    return float(
-        np.degrees(np.sqrt(np.linalg.eigvalsh(level @ np.mean(turns, axis=0) @ level)[-1]))
-    )
+    variances = np.linalg.eigvalsh(level @ np.mean(turns, axis=0) @ level)
+    return float(np.degrees(np.sqrt(variances[-1])))
 
 
 def _point(one: Estimate) -> Floats:
@@ -115,18 +114,11 @@ def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
         )
 
 
-def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
-    poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
-    return np.asarray(poses[0]) if len(poses) == 1 else rigid.mean_motion(poses)
-
-
 def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float, float]:
-    """Upward normal of the plane of least squared distances of points (n, 3).
+    """Upward normal of the plane of least squared distances of points (n, 3), and their RMS.
 
-    Also the root mean square of these, and the root of the summed squares of how far points are
-    from their middle where they spread least within the plane.
-
-    Raises a RecordingError where the points, with a covariance (3, 3) each, span none.
+    And the root of the summed squares of how far points are from their middle where they spread
+    least within the plane. A RecordingError where points of a covariance (3, 3) each span none.
     """
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle)

@@ -20,6 +20,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.trajectories import track as tracks
 from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
 from mixpose.trajectories.intensity import (
     SmoothingRules,
@@ -28,16 +29,6 @@ from mixpose.trajectories.intensity import (
     smooth_with_sudden_motion,
 )
 from mixpose.trajectories.lines import require_covariances, require_frames_once
-from mixpose.trajectories.track import (
-    MotionModel,
-    SmoothedTrack,
-    Track,
-    of_free,
-    smooth_track,
-    track_of,
-    white_parts,
-    without,
-)
 
 _ROUNDED_S = 1e-6  # of differences of times, which are since 1970 at worst
 _ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
@@ -48,7 +39,7 @@ class SmoothedBody:
     """The poses of a body, smoothed."""
 
     estimates: tuple[Estimate, ...]  # of each line and each frame that was filled, by number
-    model: MotionModel | None  # None where there were too few poses
+    model: tracks.MotionModel | None  # None where there were too few poses
     smoothed: int  # poses
     filled: int  # frames in which no pose was
     decided: int  # ambiguous frames that are ok now
@@ -62,7 +53,7 @@ class _Segment:
 
     lines: tuple[PoseLine | None, ...]
     frames: tuple[int, ...]
-    track: Track
+    track: tracks.Track
 
 
 def smooth_body(
@@ -149,10 +140,10 @@ def _times(lines: Sequence[PoseLine]) -> Floats | None:
     return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
 
 
-def _track(lines: Sequence[PoseLine], times: Floats) -> Track:
+def _track(lines: Sequence[PoseLine], times: Floats) -> tracks.Track:
     poses = np.stack([line.T_world_object for line in lines if line.T_world_object is not None])
     covariances = np.stack([line.covariance for line in lines if line.covariance is not None])
-    return track_of(times, poses, covariances, np.ones(len(lines), bool))
+    return tracks.track_of(times, poses, covariances, np.ones(len(lines), bool))
 
 
 def _segments(
@@ -201,7 +192,9 @@ def _between(before: int, after: int, step: int, lost: Sequence[int]) -> list[in
     return sorted([*lost, *(n for n in even if all(2 * abs(n - one) >= step for one in lost))])
 
 
-def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Estimate]:
+def _smoothed(
+    segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
+) -> dict[int, Estimate]:
     """Estimates by frame."""
     chosen = _chosen(segment, model, rules)
     poses = segment.track.poses.copy()
@@ -217,7 +210,7 @@ def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> d
     first, last = int(inside[0]), int(inside[-1]) + 1
     lines, frames = segment.lines[first:last], segment.frames[first:last]
     track, result = _without_foreign(track.part(slice(first, last)), model, rules)
-    spare = max(0.0, 1.0 - model.white) * of_free(track.covariances, track.free)
+    spare = max(0.0, 1.0 - model.white) * tracks.of_free(track.covariances, track.free)
     found = {}
     for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
         T, covariance = result.poses[k], result.covariances[k] + spare[k]
@@ -241,7 +234,9 @@ def _alternatives(line: PoseLine) -> Alternatives:
     return Alternatives(poses, weights / max(weights.sum(), 1.0), may_be_none=True)
 
 
-def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Choice]:
+def _chosen(
+    segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
+) -> dict[int, Choice]:
     """What each ambiguous frame of a segment shows, by its place."""
     lines = [(k, line) for k, line in enumerate(segment.lines) if line is not None]
     if all(line.status == "ok" for _, line in lines):
@@ -253,14 +248,15 @@ def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dic
 
 
 def _without_foreign(
-    track: Track, model: MotionModel, rules: SmoothingRules
-) -> tuple[Track, SmoothedTrack]:
+    track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
+) -> tuple[tracks.Track, tracks.SmoothedTrack]:
     """A track without poses that lie where those around them forbid, and the track smoothed.
 
     The first is one of them if it is the last of the way back, which tells where it should be.
     """
-    if _off(track, smooth_track(track, model), model, -1)[0] > _limit(track, rules):
-        left, back = _without_foreign_after_first(_reversed(track), model, rules)
+    if _off(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
+        reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
+        left, back = _without_foreign_after_first(reversed_track, model, rules)
         if not left.measured[-1]:
             left, rest = _without_foreign_after_first(track.part(slice(1, None)), model, rules)
             poses = np.concatenate([back.poses[-1:], rest.poses])
@@ -271,51 +267,42 @@ def _without_foreign(
     return _without_foreign_after_first(track, model, rules)
 
 
-def _reversed(track: Track) -> Track:
-    """The same, back from the last time to the first."""
-    return replace(
-        track,
-        times=-track.times[::-1],
-        poses=track.poses[::-1],
-        covariances=track.covariances[::-1],
-        measured=track.measured[::-1],
-    )
-
-
-def _limit(track: Track, rules: SmoothingRules) -> float:
+def _limit(track: tracks.Track, rules: SmoothingRules) -> float:
     """Squared distance of a pose from what all others say, beyond which it may be a wrong one."""
     return float(chdtri(int(track.free.sum()), rules.foreign))
 
 
 def _without_foreign_after_first(
-    track: Track, model: MotionModel, rules: SmoothingRules
-) -> tuple[Track, SmoothedTrack]:
+    track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
+) -> tuple[tracks.Track, tracks.SmoothedTrack]:
     """The same, where the first pose is right."""
     limit = _limit(track, rules)
-    wrong = logs_of_wrong(track, white_parts(track, np.array([model.white])), rules)[:, 0]
+    wrong = logs_of_wrong(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
         # among motion that is steady a corner of the path looks foreign, too
-        off = _off(track, smooth_track(track, model), model, -1)
+        off = _off(track, tracks.smooth_track(track, model), model, -1)
         padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
         bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
         bad[0] = False
         if not bad.any():
             break
         # but at a corner the others tell of sudden motion as well
-        among, others, _ = smooth_with_sudden_motion(without(track, bad), model, rules)
+        among, others, _ = smooth_with_sudden_motion(tracks.without(track, bad), model, rules)
         places = np.flatnonzero(bad)
         parts = np.append(0, (places[1:] + places[:-1] + 1) // 2)  # what is next to each of them
         likelier = np.add.reduceat(others - logs, parts) + wrong[places] > 0
         bad[places] = likelier & (_off(track, among, model, 1)[places] > limit)
         if not bad.any():
             break
-        track = without(track, bad)
+        track = tracks.without(track, bad)
         result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     return track, result
 
 
-def _off(track: Track, result: SmoothedTrack, model: MotionModel, sign: int) -> Floats:
+def _off(
+    track: tracks.Track, result: tracks.SmoothedTrack, model: tracks.MotionModel, sign: int
+) -> Floats:
     """Squared distance (N,) of each pose from what all others say.
 
     rᵀ(R − P)⁻¹r where the pose took part in the result, with the sign −1, and rᵀ(R + P)⁻¹r where
