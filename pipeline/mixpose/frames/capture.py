@@ -61,11 +61,10 @@ def _is(kind: Callable[[int], bool], address: str) -> bool:
 
 @contextmanager
 def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
-    """A capture that is released at the end; grey videos keep their depth.
+    """A capture of a file, pipe, device, address (with ``://``) or camera's index, for a while.
 
-    `address` is the path of a file, a pipe or a device, the address of a stream (with ``://``), or
-    the index of a camera. Raises RecordingError if it does not open, a stream or a pipe within
-    `PATIENCE_S`.
+    Grey videos keep their depth. Raises RecordingError if it does not open, a stream or a pipe
+    within `PATIENCE_S`.
     """
     quieten_opencv()
     with contextlib.ExitStack() as stack:
@@ -117,10 +116,7 @@ def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
 
 
 def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
-    """Go to the next frame; False where there is none.
-
-    Raises SilentError if a stream falls silent without ending.
-    """
+    """Go to the next frame; False at the end, SilentError where a stream falls silent without."""
     began = time.monotonic()
     found = capture.grab()
     silence = time.monotonic() - began

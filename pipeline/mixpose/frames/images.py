@@ -138,10 +138,9 @@ def _time_of_stamp(stamp: int) -> float:
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
-    """Frame numbers of images.
+    """Frame numbers of images: what names without extension end in, if all do and no two alike.
 
-    The number that a name without its extension ends in, where every name ends in one and no two
-    are alike; else the place in `paths`, from 0.
+    Else the place in `paths`, from 0.
     """
     numbers = [number for number in _endings(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
@@ -175,11 +174,9 @@ def natural_order(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_image(path: Path) -> Image:
-    """Read one image file as grey values (H, W): uint8, uint16 or float32, as deep as the file has
-    them.
+    """Read an image file as grey values (H, W): uint8, uint16 or float32, as deep as the file is.
 
-    Raises RecordingError if the file cannot be read, is cut short, damaged or no image, or holds
-    NaN.
+    Raises RecordingError if it cannot be read, is cut short, damaged or no image, or holds NaN.
     """
     quieten_opencv()
     data = _bytes_of(path)

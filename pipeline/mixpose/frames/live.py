@@ -1,10 +1,8 @@
 """Live sources: cameras and streams that do not wait, of which only the newest frame counts.
 
-A pose that comes late is worth little, so a frame that arrives while the one before it is still
-being estimated is passed over when a newer one is there.  Numbers count all frames that arrived,
-so that those passed over leave gaps.
-
-A source that falls silent is opened again for a while; meanwhile the others go on without it.
+A frame that arrives while the one before it is still being estimated is passed over when a newer
+one is there.  Numbers count all frames that arrived, so that those passed over leave gaps.  A
+source that falls silent is opened again for a while; meanwhile the others go on without it.
 """
 
 from __future__ import annotations
@@ -92,7 +90,7 @@ class LiveSource(Source):
         """Nothing to look for: nobody knows which frames will come."""
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Each time the newest frame, once there is one that has not been given yet.
+        """The newest frame, each time there is one that has not been given yet.
 
         Raises RecordingError if the source does not open or falls silent.
         """
@@ -104,11 +102,10 @@ class LiveSource(Source):
 def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[FrameSet, None, None]:
     """The newest frames of all sources, once each has one that was not given yet.
 
-    The frames of a set are those that were captured nearest to the latest moment which all have
-    reached: at most half a period apart, however long each was on its way. Sets are numbered by the
-    source that has given most frames. One that has ended is left out of further sets, and one that
-    is silent until it gives frames again. Raises RecordingError if a source does not open or falls
-    silent.
+    Those of a set were captured nearest to the latest moment which all have reached: at most half a
+    period apart. Sets are numbered by the source that has given most frames. One that has ended is
+    left out of further sets, and one that is silent until it gives frames again. Raises
+    RecordingError if a source does not open or falls silent.
     """
     began = time.monotonic()
     with ExitStack() as stack:
@@ -246,11 +243,11 @@ class ClockRules:
 class CaptureTimes:
     """Tells from the stamps of a live source when its frames were captured.
 
-    A camera at this machine (V4L2) stamps frames by the machine's own clock. Stamps of a stream are
-    of a clock that is off by an unknown time; as no frame arrives before it was captured, the least
-    difference seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor
-    Synchronization Problem*, IROS 2010). Moments are then late by the shortest transmission, and
-    free of what others took longer.
+    A camera at this machine (V4L2) stamps frames by the machine's own clock, a stream by a clock
+    that is off by an unknown time. As no frame arrives before it was captured, the least difference
+    seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor Synchronization
+    Problem*, IROS 2010): moments are late by the shortest transmission, and free of what others
+    took longer.
     """
 
     def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:

@@ -68,8 +68,8 @@ def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
 def open_source(spec: SourceSpec) -> Source:
     """Find the recording of a sensor and open it, without reading more than its beginning.
 
-    Raises SessionError if the options of the source contradict each other, or do not fit the
-    recording. Raises RecordingError if there is no such recording or its beginning cannot be read.
+    Raises SessionError if its options contradict each other or do not fit it, and RecordingError if
+    it is not there or cannot be read.
     """
     clock = clock_of(spec)
     try:
@@ -88,10 +88,7 @@ def open_source(spec: SourceSpec) -> Source:
 
 
 def files_of(spec: SourceSpec) -> list[str]:
-    """The files that a recording is read from, or the address of a camera or stream.
-
-    Raises RecordingError if there is no such recording.
-    """
+    """The files of a recording, or the address of a live one; RecordingError if there is none."""
     return _recognise(spec)[1]
 
 

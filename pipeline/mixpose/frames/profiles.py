@@ -74,10 +74,10 @@ class RangeProfiles(Source):
 
 
 def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
-    """Open a file of range profiles and learn its shape.
+    """Open a file of range profiles, frames x bins, and learn its shape.
 
-    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid. Raises
-    RecordingError if the file is no array of frames x bins.
+    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid, and
+    RecordingError if the file is no such array.
     """
     range_min = _option(spec, "range_min", spec.range_min)
     bin_size = _option(spec, "bin_size", spec.bin_size)

@@ -72,8 +72,7 @@ class Source(Protocol):
     def check_times(self, wanted: range) -> None:
         """Look for a time for each frame in a range of numbers, without decoding frames.
 
-        Raises RecordingError if the table of times lacks rows, as far as the frame numbers are
-        known in advance.
+        Raises RecordingError if the table of times lacks rows, as far as numbers are known before.
         """
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:

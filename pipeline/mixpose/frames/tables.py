@@ -49,11 +49,7 @@ class _Contents:
 
 @dataclass(frozen=True)
 class DetectionTable(Source):
-    """Detections of one sensor, a row each.
-
-    A table whose frames ascend is streamed, whatever its length.  One with its rows in another
-    order is read whole and sorted.
-    """
+    """Detections of one sensor, a row each; streamed where frames ascend, else read whole."""
 
     kind: ClassVar[SourceKind] = "detections"
     ahead: ClassVar[int] = 0
@@ -125,8 +121,8 @@ class DetectionTable(Source):
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Group the rows to frames; skipped frames are not converted.
 
-        The time of a frame is that of its earliest detection.  A row of weight 0 says no more
-        than that its frame exists.
+        The time of a frame is that of its earliest detection; a row of weight 0 only says that it
+        exists.
         """
         wanted = source.selection(start, stop, step, self.first)
         rows: Iterator[_Row] = self._rows()
@@ -226,10 +222,7 @@ class DetectionTable(Source):
 
 
 def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTable:
-    """Read the header of a table of detections.
-
-    Raises RecordingError if the file cannot be read or its header names other columns than it may.
-    """
+    """Open a table of detections; RecordingError if its header has other columns than it may."""
     coordinates = _COORDINATES[spec.kind]
     _, cells = next(csv_rows(path), (0, []))
     columns = header(cells)

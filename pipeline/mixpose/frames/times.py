@@ -73,10 +73,7 @@ def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
 
 
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Refuse a table of times that lacks a row for one of some frames.
-
-    Raises RecordingError in one line: the table, which frames it lacks and what is allowed.
-    """
+    """Raise a RecordingError if a table of times lacks a row for one of some frames."""
     missing = untimed(clock, numbers)
     if not missing:
         return
@@ -92,7 +89,7 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 def clock_of(spec: SourceSpec) -> Clock | None:
     """What gives the frames of a source their times; None where the session does not say.
 
-    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number. Raises
+    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number, and
     RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:

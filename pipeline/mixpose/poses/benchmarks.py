@@ -40,11 +40,10 @@ class TumWriter(PoseWriter):
 class BopWriter(PoseWriter):
     """Writes one row per frame that has a pose; lost frames are left out.
 
-    R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
+    R (row by row) and t (mm) are those of `T_world_object`; the toolkit takes them for object to
     camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
-    the estimate took in seconds, as BOP has it, or -1 where that was not measured. BOP numbers its
-    objects: the first one of the header is `obj_id`, the next one more; names that it does not have
-    follow as they occur.
+    the estimate took in seconds, or -1 where that was not measured. The first object of the header
+    is `obj_id`, the next one more; names that it does not have follow as they occur.
     """
 
     def __init__(

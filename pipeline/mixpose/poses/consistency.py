@@ -44,11 +44,10 @@ def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
 
 
 def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
-    """Mahalanobis distance squared of an error (6,), and its dimensions: the rank of the
-    covariance.
+    """Mahalanobis distance squared of an error (6,), and its dimensions: the covariance's rank.
 
-    Only directions that the covariance leaves free count: an axis that is held at the start pose
-    has no variance, and its error no measure. None where it leaves none free.
+    Only directions that the covariance (6, 6) leaves free count: one that is held at the start pose
+    has no variance. None where it leaves none free.
     """
     variance = np.diag(covariance)
     kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)
@@ -93,10 +92,7 @@ class ConstantOffset:
 
 
 def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | None:
-    """The transform that explains most of the errors of poses with their truths, where one does.
-
-    Bodies that hardly move tell nothing.
-    """
+    """The transform that explains most of the errors of poses with their truths, if one does."""
     if len(pairs) < _FEWEST:
         return None
     poses, truth = (np.stack(each) for each in zip(*pairs, strict=True))

@@ -34,12 +34,10 @@ SENSOR_COLUMNS = ("used", "explained", "rms")
 class CsvWriter(PoseWriter):
     """Writes one row per frame; what a frame does not have is an empty cell.
 
-    Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
-    behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
-    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; where a body has a tip,
-    where it is and its covariance, ``tip_<a>`` and ``tip_cov_<a>_<b>``; confidence; score;
-    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor, which the header
-    names or else the first frame; latency_ms.
+    Columns: `FRAME_COLUMNS` (where bodies are identical also instance, behind object),
+    `POSE_COLUMNS`, the upper triangle of the covariance, row by row, in the axes of
+    `mixpose.rigid`; where a body has a tip `TIP_COLUMNS`; confidence; score; `SENSOR_COLUMNS` of
+    each sensor, which the header names or else the first frame; latency_ms.
     """
 
     def __init__(self, stream: TextIO, header: Header) -> None:

@@ -55,7 +55,7 @@ def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
 def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
     """A pose in the axes of another body, T_reference_object, as sure as both; lost without it.
 
-    Errors of the two are taken for independent of each other.  What else either may be is left out.
+    Errors of the two are taken for independent. What else either may be is left out.
     """
     T = line.T_world_object
     if reference is None or T is None or reference.T_world_object is None:

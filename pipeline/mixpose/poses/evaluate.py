@@ -105,13 +105,11 @@ def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
 
 
 def evaluate(poses: PoseFile, truth: PoseFile, *, numbered: bool = False) -> Evaluation:
-    """Compare poses with the truth.
+    """Compare poses with the truth, in the unit of the poses, or else of the truth.
 
-    `numbered` says that identical bodies have the numbers of the truth already.
-
-    Errors are given in the unit of the poses; a file that states no unit is taken to be in that of
-    the other. Raises RecordingError if the truth holds no pose, the files have no object in
-    common, or a frame stands twice in the poses.
+    `numbered` says that identical bodies have the numbers of the truth already. Raises
+    RecordingError if the truth holds no pose, the files have no object in common, or a frame stands
+    twice in the poses.
     """
     swaps = None
     if not numbered:
@@ -172,9 +170,8 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
     """Compare poses with the truth, one by one: per frame and body of the truth, in its order.
 
     They are in the unit of the poses; identical bodies are taken by their numbers. Truth lines
-    without a pose say nothing and are passed over. Symmetries of an object are those that the
-    truth's header names; if it names none, those of the poses' header. Raises RecordingError as
-    `evaluate`.
+    without a pose are passed over. Symmetries of an object are those of the truth's header; if it
+    names none, those of the poses' header. Raises RecordingError as `evaluate`.
     """
     unit = poses.unit or truth.unit
     truth = in_unit(truth_of_then(truth, poses), unit)

@@ -1,9 +1,8 @@
 """Where a body truly is at the moments that poses were foretold for.
 
 A pose that ``mixpose run --publish --predict`` sent bears the number of the frame that it was
-foretold from, and says how much later it is for, ``ahead_s``. What it is held against is the truth
-of then: between the frames of the truth file the body moves on cubic splines, of position and of
-rotation.
+foretold from, and says how much later it is for, ``ahead_s``. It is held against the truth of then:
+between frames the body moves on cubic splines, of position and of rotation.
 """
 
 from __future__ import annotations
@@ -30,9 +29,8 @@ _GAP = 2.5
 def truth_of_then(truth: PoseFile, poses: PoseFile) -> PoseFile:
     """The truth with each body where it is at the moment that the poses of a frame are for.
 
-    Where that is between frames too far apart, or after the last one, nothing is known: the line
-    says that it is lost. Raises RecordingError if the truth has no times, or several right answers
-    for a frame.
+    Where that is between frames too far apart, or after the last one, the line says that it is
+    lost. Raises RecordingError if the truth has no times, or several right answers for a frame.
     """
     ahead_s = {line.frame: line.ahead_s for line in poses.poses if line.ahead_s}
     if not ahead_s:

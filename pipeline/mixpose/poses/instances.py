@@ -1,8 +1,7 @@
 """Which of identical bodies in the poses is which in the truth, and how often they change places.
 
-Numbers of identical bodies mean nothing by themselves.  Over a whole file they are assigned once,
-so that as many poses as possible are nearest to the truth of their number.  Where a body is
-followed into another's place, and called by its own number there, that is a swap.
+Numbers are assigned once for a whole file, so that as many poses as possible are nearest to the
+truth of theirs.  Where a body is followed into another's place, that is a swap.
 """
 
 from __future__ import annotations

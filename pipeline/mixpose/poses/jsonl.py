@@ -153,20 +153,18 @@ class PoseFile:
 def read_poses(path: str | Path) -> PoseFile:
     """Read a poses or truth file.
 
-    A line needs `frame`, `object` and `T_world_object`; everything else, the header included, may
-    be left out, and unknown keys are passed over. Raises RecordingError with file and line, if the
-    file or a line of it is not as the format says, a last line cut off by an interruption
-    included.
+    A line needs `frame`, `object` and `T_world_object`; all else, the header included, may be left
+    out, and unknown keys are passed over. Raises RecordingError with file and line if one is not as
+    the format says, a last line cut off by an interruption included.
     """
     path = Path(path)
     return _parse(path, _read_bytes(path))
 
 
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
-    """Read a poses file that a run may still be writing, or was interrupted in.
+    """Read a poses file that a run may still be writing, and whether its last line was cut off.
 
-    A last line that was cut off is left out; whether there was one is said beside the poses. Raises
-    RecordingError as `read_poses`, for every other line.
+    Such a line is left out. Raises RecordingError as `read_poses`, for every other line.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -199,9 +197,8 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
     """Find the frame that an interrupted run wrote last, for a run with this header to go on.
 
     What follows it is a half-written line, to be cut off. None where no frame is whole or no file
-    is there: the caller writes the file afresh. Raises SessionError if the file is of another
-    session, seed, unit, recording, step or version of mixpose, or if one of the two has labels, and
-    RecordingError if it is not a poses file.
+    is there. Raises SessionError if the file is of another session, seed, unit, recording, options
+    or version of mixpose, and RecordingError if it is not a poses file.
     """
     path = Path(path)
     if not path.exists():

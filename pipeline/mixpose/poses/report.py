@@ -15,9 +15,8 @@ _STATISTICS = ("rms", "median", "p95", "max")
 def as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """The evaluation as plain values for JSON; what could not be measured is None.
 
-    ``per_axis`` holds the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees)
-    the world's axes; ``ok_frames`` the errors of frames that are ok alone; ``best_hypothesis``
-    those of the best hypothesis of ambiguous frames.
+    ``per_axis`` is the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees) the
+    world's axes; ``best_hypothesis`` the errors of the best hypothesis of ambiguous frames.
     """
     nees, per_axis = evaluation.nees, evaluation.per_axis_rms
     best = {"frames": evaluation.ambiguous, **_errors(evaluation, "best_")}

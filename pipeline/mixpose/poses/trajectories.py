@@ -70,7 +70,7 @@ def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
     """Numbers that frames of pose lines have in such a file, by their own.
 
     The same, but where frames are numbered by stamps: these count from 0, at the usual step of
-    their times, or of the stamps where there are none. Gaps stay gaps.
+    their times, else of the stamps. Gaps stay gaps.
     """
     stamps = sorted({line.frame for line in lines})
     steps = [after - before for before, after in pairwise(stamps)]
@@ -146,10 +146,10 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:
     """Write trajectories in mm, and tell whether frame n of mixpose is frame n + 1 there.
 
-    Where numbers are too large for that, frames begin at 1. A measured point has its residual, and
-    the bits of the sensors that measured it, of the first seven; one by the pose has the residual 0
-    and no bit, as C3D has it for points that are computed; one that is not known the residual -1.
-    Raises RecordingError if there are more frames than a file can number.
+    Else numbers are too large, and frames begin at 1. A measured point has its residual, and the
+    bits of the first seven sensors that measured it; one by the pose has the residual 0 and no bit,
+    as C3D has it for points that are computed; one that is not known the residual -1. Raises
+    RecordingError if there are more frames than a file can number.
     """
     import ezc3d  # noqa: PLC0415 - not everybody has it
 

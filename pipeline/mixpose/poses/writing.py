@@ -92,10 +92,7 @@ class Stamps:
         self._has_times: bool | None = None  # the first frame decides
 
     def time_of(self, estimate: Estimate) -> float:
-        """Time in s, or the frame number.
-
-        Raises RecordingError if some frames have a time and others have none.
-        """
+        """Time in s, or the frame number; RecordingError if frames before it differ in that."""
         has_time = estimate.time_s is not None
         if self._has_times is None:
             self._has_times = has_time

@@ -52,16 +52,10 @@ class Sensor(Protocol):
         """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
 
     def rays(self, y: Floats) -> Rays | None:
-        """Lines of sight of detections (M, m); None where a detection leaves no line in space.
-
-        Detections that no point in space can cause are left out.
-        """
+        """Lines of sight of detections (M, m) that a point can cause; None if they leave none."""
 
     def moved(self, motion: Floats) -> Self:
-        """The sensor that measures of points x what this one measures of ``motion @ x``.
-
-        `motion` is a rigid motion (4, 4) of the world.
-        """
+        """The sensor that measures of x what this one does of ``motion @ x``, rigid (4, 4)."""
 
 
 @runtime_checkable

@@ -101,10 +101,10 @@ def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
 def as_images(
     sensors: Sequence[Sensor], deviations: Sequence[float]
 ) -> tuple[tuple[Sensor, ...], Floats, list[int]]:
-    """Sensors with clouds as their images, which tell as much at as many deviations.
+    """Sensors with clouds as their images, which tell as much at as many deviations along an axis.
 
-    Deviations are those along an axis: of a cloud's images √2 times the cloud's, as each coordinate
-    is in two of them.  The last are the places of the sensors given, or of their first images.
+    These are √2 times the cloud's, as each coordinate is in two images. The last are the places of
+    the sensors given, or of their first images.
     """
     parts = [one.planes if isinstance(one, CloudSensor) else (one,) for one in sensors]
     counts = [len(part) for part in parts]

@@ -18,8 +18,8 @@ def facing(
 ) -> Mask:
     """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
 
-    Normals (n, 3) are in the object's frame, poses (..., 4, 4).  In images a feature is `edge_on`
-    from that cosine of the angle to its normal; ranges are measured from all of its front.  All
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4). In images a feature is `edge_on`
+    from that cosine of the angle to its normal; ranges are measured from all of its front. All
     features face a cloud, whose system sees them from several sides.
     """
     if normals is None or isinstance(sensor, CloudPlane | CloudSensor):

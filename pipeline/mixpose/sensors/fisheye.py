@@ -19,10 +19,8 @@ _NEWTON = 4  # steps from a table of angles, which is right to 1e-6
 class FisheyeCamera(CentralCamera):
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
 
-    It sees as far from its axis as the radius grows and the image goes, beyond 90° too; without a
-    resolution up to 90°.
-
-    Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
+    It sees as far as the radius grows and the image goes, without a resolution up to 90° from its
+    axis. Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
     """
 
     camera_matrix: Floats  # (3, 3) px

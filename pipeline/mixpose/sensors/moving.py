@@ -144,10 +144,10 @@ class RollingBatch:
         return np.asarray(self._still.towards(at.swapaxes(1, 2)) @ turns)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `SensorBatch.linearise`.
+        """As `SensorBatch.linearise`, where t solves t = moment of the row that is seen at t.
 
-        The moment t solves t = moment of the row that is seen at t.  One Newton step from the
-        middle row leaves the square of the share of the readout in which the image moves a row.
+        One Newton step from the middle row leaves the square of the share of the readout in which
+        the image moves a row.
         """
         per_row = self._per_row
         each = points_world if points_world.ndim > 2 else points_world[None]
@@ -171,7 +171,7 @@ class RollingBatch:
     def _moved(self, arms: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
         """Points (3, L, n) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
 
-        Of arms (3, L, n) from the body's origin.  Velocities are those of points of the body, but
+        Of arms (3, L, n) from the body's origin. Velocities are those of points of the body, but
         for how far its origin moved; turns are rotation vectors (3, L, n) or (3, L, 1).
         """
         more = seconds * self._acceleration

@@ -3,13 +3,9 @@
 NDI's .rom (SROM): a binary file of 752 bytes with up to 20 markers, in mm. Little-endian: "NDI", a
 checksum at byte 4 (the sum of all bytes after it), the number of markers at byte 28, positions as
 three float32 each from byte 72.
-
-Vicon's .vsk: XML in which positions of markers name parameters, in mm. A file may describe a
-skeleton of several segments; a rigid body has one.
-
-AsterTrack's .obj: a mesh in metres, in which each face of a marker group is a flat marker. A marker
-is at the middle of its face and looks along the face's normal. Groups are those whose name has
-"marker" in it; a file without groups has nothing but markers.
+Vicon's .vsk: XML in which positions of markers name parameters, in mm; a rigid body is one segment.
+AsterTrack's .obj: a mesh in metres. Each face of a group whose name has "marker" in it, or of a
+file without groups, is a flat marker: at the middle of the face, looking along its normal.
 """
 
 from __future__ import annotations

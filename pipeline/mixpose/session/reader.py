@@ -29,8 +29,8 @@ _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
 def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read what a session file says of sensors and recordings, whatever it says of bodies.
 
-    Its body is a stand-in: `[object]` may be missing, or name a file that is still to be made. The
-    rest is as for `load_session`, but that `[start]` and `[estimator]` do not count.
+    As `load_session`, but that `[start]` and `[estimator]` do not count, and the body is a
+    stand-in: `[object]` may be missing, or name a file that is still to be made.
     """
     return _loaded(Path(path), allow_code=allow_code, bodies=False)
 

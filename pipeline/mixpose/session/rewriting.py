@@ -49,10 +49,7 @@ def _has_module(folder: Path, name: str) -> bool:
 
 
 def text_of(document: Any, session: Session, head: str = "") -> str:
-    """The text of a TOML document below a head, its bytes as those of the session file.
-
-    So a byte order mark is kept, and where all lines end in CR LF, new ones do too.
-    """
+    """The text of a TOML document below a head; byte order mark and ends of lines stay."""
     written, text = _written(session), head + str(tomlkit.dumps(document))
     if "\r\n" in written and not _BARE_END.search(written):
         text = _BARE_END.sub("\r\n", text)

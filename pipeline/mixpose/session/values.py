@@ -171,8 +171,7 @@ def limits(value: object) -> str:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
-    """Read nested lists of numbers as a float64 array; a problem points at the first that does not
-    fit.
+    """Read nested lists of numbers as a float64 array; a problem points at the first misfit.
 
     `shape` has the length of the list at each depth, None for any length but zero; `allowed` is
     what to tell the user.

@@ -46,7 +46,7 @@ def choices(
 ) -> list[Choice]:
     """Choose among the alternatives (N) of each time of a track.
 
-    The poses of the track itself count for nothing; its covariances are those of all alternatives.
+    The track's poses count for nothing; its covariances are those of all alternatives.
     """
     paths, logs = _followed(track, alternatives, model, rules)
     shares = np.exp(logs - logs.max())

@@ -33,15 +33,13 @@ class Floor:
 
 
 def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
-    """The frame that bodies on the floor tell.
+    """The frame that bodies on the floor tell, whose axis `up` points up; of a body, its own.
 
-    One body that rests is the frame of the world.  Three that rest, or three poses apart, are
-    three points: the origin, where the first axis leads to, and any other of the floor.  More are a
-    plane, in which the origin and the first axis are as near to where they were as can be.  Of a
-    body with a tip the tip is the point, of others the origin.
-
-    `up` is the axis of the world that points up; of a body, its own. Up is where the sensors
-    (n, 3), in the old world, are. Raises RecordingError if the poses tell no floor.
+    One body that rests is the frame of the world. Three that rest, or three poses apart, are three
+    points: the origin, where the first axis leads to, and any other of the floor. More are a plane,
+    in which the origin and the first axis are as near to where they were as can be. Of a body with
+    a tip the tip is the point, of others the origin. Up is where the sensors (n, 3), in the old
+    world, are. Raises RecordingError if the poses tell no floor.
     """
     bodies: dict[str, list[Estimate]] = {}
     for each in estimates:

@@ -260,9 +260,6 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
 
 
 def logs_of_wrong(track: Track, own: Floats, rules: SmoothingRules) -> Floats:
-    """Log-likelihoods (N, G), without −3 log 2π, of poses that are ok, and wrong.
-
-    By their `white_parts` (N, G, 6, 6).
-    """
+    """Log-likelihoods (N, G), without −3 log 2π, of wrong poses, by `white_parts` (N, G, 6, 6)."""
     anywhere = np.diagonal(own, axis1=2, axis2=3) + (rules.reach * track.moved) ** 2
     return np.asarray(np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=2))

@@ -170,7 +170,7 @@ def _linear(pivoting: Pivoting) -> tuple[Floats, Floats]:
 def _alike(pivoting: Pivoting, rules: PivotRules) -> Mask:
     """The poses (N,) to begin with, which a tip and a point bring together about as well as most.
 
-    Those of three poses, of which the median of all is off least (Rousseeuw, J. Am. Stat. Assoc. 79
+    By three poses, of which the median of all is off least (Rousseeuw, J. Am. Stat. Assoc. 79
     (1984) 871).
     """
     (A, b), rng = _linear(pivoting), np.random.default_rng(0)

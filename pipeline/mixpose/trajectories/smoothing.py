@@ -109,10 +109,7 @@ def smooth_body(
 
 @contextmanager
 def _possible(label: str) -> Iterator[dict[int, Estimate]]:
-    """Estimates by frame, to be worked out within.
-
-    Raises RecordingError in one line where numbers of the recording are too large or too small.
-    """
+    """Estimates by frame, to be worked out within; a RecordingError if numbers do not allow it."""
     found: dict[int, Estimate] = {}
     try:
         with np.errstate(all="ignore"):

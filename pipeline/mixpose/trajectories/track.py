@@ -55,8 +55,8 @@ def of_free(covariances: Floats, free: Mask) -> Floats:
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
     """A track whose covariances can be inverted; directions without variance are held.
 
-    A held direction gets the median variance of the others of its kind: its poses agree, so that
-    any will do.
+    Such a one gets the median variance of the others of its kind: its poses agree, so that any will
+    do.
     """
     seen = covariances[measured]
     variances = np.median(np.diagonal(seen, axis1=1, axis2=2), axis=0)

@@ -1,9 +1,8 @@
 """Calibrations in OpenCV's FileStorage format: YAML, XML or JSON.
 
-A file holds one camera under usual names (``camera_matrix``), several numbered ones
-(``M1``, ``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a
-file of their own, as OpenCV's sample for stereo writes them), or a map for each (MC-Calib's
-``camera_0``).
+A file holds one camera under usual names (``camera_matrix``), several numbered ones (``M1``,
+``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a file of their
+own), or a map for each (MC-Calib's ``camera_0``).
 """
 
 from __future__ import annotations
