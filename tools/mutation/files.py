@@ -100,8 +100,8 @@ _SETUPS = (
     Mutant(
         "session-bias-by-default",
         "session/schema_sensors.py",
-        'range_bias: common.Number = Field(0.0, description="a length")',
-        'range_bias: common.Number = Field(1.0, description="a length")',
+        'range_bias: Number = Field(0.0, description="a length")',
+        'range_bias: Number = Field(1.0, description="a length")',
         "ranges are off by a length that nobody wrote",
     ),
     Mutant(
@@ -144,7 +144,7 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-equidistant-is-pinhole",
-        "session/calibration/pieces.py",
+        "session/intrinsics.py",
         '"equidistant": "fisheye"',
         '"equidistant": "pinhole"',
         "a fisheye calibration is used for a pinhole camera",

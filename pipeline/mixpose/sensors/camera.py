@@ -13,7 +13,7 @@ import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
-from mixpose.sensors.rays import Rays
+from mixpose.sensors.base import Rays
 
 _WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
 

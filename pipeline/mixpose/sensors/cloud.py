@@ -16,10 +16,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import Sensor
+from mixpose.sensors.base import Rays, Sensor
 from mixpose.sensors.camera import PlacedSensor
 from mixpose.sensors.parallel import ParallelBeam
-from mixpose.sensors.rays import Rays
 
 PLANES: tuple[tuple[str, tuple[int, int]], ...] = (("xy", (0, 1)), ("yz", (1, 2)), ("zx", (2, 0)))
 """What the three images are called, and the axes of the cloud that are theirs, u first."""
@@ -117,6 +116,27 @@ def from_planes(planes: Floats) -> Floats:
     """Points (..., 3) in the axes of a cloud of places (3, ..., 2) in its three images."""
     first, second, _ = planes
     return np.concatenate([first, second[..., 1:]], axis=-1)
+
+
+def facing(
+    sensor: Sensor,
+    T_world_object: Floats,
+    points_world: Floats,
+    normals: Floats | None,
+    edge_on: float = 0.0,
+) -> Mask:
+    """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
+
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4). In images a feature is `edge_on`
+    from that cosine of the angle to its normal; ranges are measured from all of its front. All
+    features face a cloud, whose system sees them from several sides.
+    """
+    if normals is None or isinstance(sensor, CloudPlane | CloudSensor):
+        return np.ones(points_world.shape[:-1], dtype=np.bool_)
+    outward = normals @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
+    towards = sensor.towards(points_world)
+    cosines = np.vecdot(outward, towards) / np.linalg.norm(towards, axis=-1)
+    return np.asarray(cosines > (edge_on if sensor.dimension > 1 else 0.0))
 
 
 def _turned(axes: tuple[int, int]) -> Floats:

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import hide, within
+from mixpose.sensors.base import Rays, hide, within
 from mixpose.sensors.camera import CentralCamera
-from mixpose.sensors.rays import Rays
 
 _WIDEST = np.radians(140.0)  # from the axis: no lens shows more, whatever its image has room for
 _NEWTON = 4  # steps from a table of angles, which is right to 1e-6

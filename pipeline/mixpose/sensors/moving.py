@@ -16,8 +16,7 @@ import numpy as np
 from mixpose.records import Floats, Mask
 from mixpose.rigid import cross, inverse, perturb
 from mixpose.sensors import batch
-from mixpose.sensors.base import Sensor
-from mixpose.sensors.rays import Rays
+from mixpose.sensors.base import Rays, Sensor
 
 
 @dataclass(frozen=True)

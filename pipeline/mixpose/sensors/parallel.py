@@ -8,9 +8,8 @@ import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
-from mixpose.sensors.base import hide, within
+from mixpose.sensors.base import Rays, hide, within
 from mixpose.sensors.camera import Camera
-from mixpose.sensors.rays import Rays
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import hide, within
+from mixpose.sensors.base import Rays, hide, within
 from mixpose.sensors.camera import CentralCamera
 from mixpose.sensors.distortion import LensDistortion
-from mixpose.sensors.rays import Rays
 
 # Of a strong lens OpenCV's five rounds leave a pixel.
 _UNDONE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)

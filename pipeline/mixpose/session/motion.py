@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, is_rigid, nearest_rigid
 from mixpose.session.messages import BadKeyError, one_of
-from mixpose.session.schema_common import Placement
+from mixpose.session.schema_sensors import Placement
 
 # A rotation written with four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4.
 ROUNDING = 2e-4

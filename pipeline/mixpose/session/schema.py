@@ -16,8 +16,8 @@ from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
-from mixpose.session.schema_common import ExtractTable, Motion, Placement, Positive, Table, Text
-from mixpose.session.schema_sensors import AnySensorTable
+from mixpose.session import schema_sensors as sensors
+from mixpose.session.schema_sensors import ExtractTable, Motion, Placement, Positive, Table, Text
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, Free, array_of
 from mixpose.units import Unit
 
@@ -187,7 +187,7 @@ class SessionTable(Table):
     """See `[estimator]`."""
     extract: ExtractTable = Field(ExtractTable.model_validate({}), description="a table [extract]")
     """See `[extract]`."""
-    sensor: list[AnySensorTable] = Field(
+    sensor: list[sensors.AnySensorTable] = Field(
         min_length=1, description="at least one table [[sensor]], in double brackets"
     )
     """See `[[sensor]]`; one for each sensor."""

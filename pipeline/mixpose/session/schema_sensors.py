@@ -1,4 +1,4 @@
-"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor.
+"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor, and ``[extract]``.
 
 How keys are described is said in `schema`.
 """
@@ -7,23 +7,99 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from mixpose.records import Floats
-from mixpose.session import schema_common as common
 from mixpose.session import values
-from mixpose.session.intrinsics import MATRIX_FORM
+from mixpose.session.values import array_of
 from mixpose.units import Unit
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
 
+Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
+Number: TypeAlias = Annotated[float, Field(ge=-values.LARGEST, le=values.LARGEST)]
+NotNegative: TypeAlias = Annotated[float, Field(ge=0, le=values.LARGEST)]
+Positive: TypeAlias = Annotated[float, Field(ge=values.SMALLEST, le=values.LARGEST)]
 
-class CalibrationTable(common.Table):
+Motion: TypeAlias = Annotated[
+    Floats | None, array_of((4, 4), "a 4x4 matrix, four rows of four numbers")
+]
+
+
+class Table(BaseModel):
+    """A TOML table: no keys but these, no text for numbers, no NaN and no infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Placement(Table):
+    """The forms of a rigid motion beside the 4x4 matrix."""
+
+    rotation_vector: Annotated[
+        Floats | None, array_of((3,), "three numbers: axis times angle in radians")
+    ] = None
+    """The rotation, in place of the matrix and together with `translation`.
+    Example: `rotation_vector = [0.1, -0.2, 1.0]`"""
+    quaternion_xyzw: Annotated[Floats | None, array_of((4,), "four numbers: x, y, z, w")] = None
+    """The same rotation as a quaternion of length 1, the real part last.
+    Example: `quaternion_xyzw = [0.0, 0.0, 0.7071068, 0.7071068]`"""
+    translation: Annotated[Floats | None, array_of((3,), "three numbers: x, y, z")] = None
+    """The last column of the matrix, in `unit`; beside a rotation.
+    Example: `translation = [20, 10, 900]`"""
+
+
+class ExtractTable(Table):
+    """How features are found in images. `[extract]` holds for all sensors; `[sensor.extract]`
+    below a `[[sensor]]` changes single keys for that sensor. In a table of detections features
+    are found already, and of these keys only `sigma` counts.
+    """
+
+    method: values.Method = None
+    """Centres of spots and disks (`"blobs"`), corners of a chessboard, the grey values themselves,
+    centres of unsharp or faint spots by the Laplacian of Gaussian (`"log"`, which needs
+    `spot_sigma`: about how wide they are), or a function of your own in a module beside the session
+    file.
+    Example: `method = "corners"`"""
+    polarity: Literal["bright", "dark"] | None = None
+    """Whether features are brighter or darker than what surrounds them.
+    Example: `polarity = "dark"`"""
+    threshold: values.Threshold = None
+    """Grey level that parts features from the background. `"auto"` goes by the noise of the image
+    and the brightest feature. `"triangle"` and `"li"` go by the histogram: they keep what is dim
+    beside something much brighter, and more of what is no feature. `"otsu"` parts two classes of
+    about the same size, whatever they are. `"local"` and `"sauvola"` compare each pixel with its
+    surroundings, `"sauvola"` also with how much these vary. A number is a level in grey values of
+    the image: all that is above it counts. `"corners"` and `"log"` take `"auto"` or a number: the
+    least step between fields, or height of a spot.
+    Example: `threshold = 120`"""
+    min_area: Number | None = Field(None, ge=0, description="an area in px, at least 0")
+    """Blobs smaller than this, in px, are no features.
+    Example: `min_area = 20`"""
+    max_area: Positive | None = Field(None, description="an area in px, greater than min_area")
+    """Blobs larger than this, in px, are no features; left out: there is no limit.
+    Example: `max_area = 500`"""
+    sigma: Positive | None = Field(
+        None, description="greater than 0: px for cameras, a length for lateration and clouds"
+    )
+    """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
+    a predicted and a found feature draw each other in the final fit. For ranges set it to what they
+    err by.
+    Example: `sigma = 2.0`"""
+    spot_sigma: Number | None = Field(
+        None, ge=0, description="at least 0: px for cameras, a length for lateration and clouds"
+    )
+    """Width (standard deviation) that features have already in grey values
+    (`method = "intensity"`) and in range profiles, in px or in `unit`; with `method = "log"` that
+    of the spots to look for, from 0.7 to 1.5 times the true one, 3 px if it is left out.
+    Example: `spot_sigma = 5.0`"""
+
+
+class CalibrationTable(Table):
     """A calibration file, and what to read in it. `calibration = "cam.yml"` is short for
     `calibration = { file = "cam.yml" }`.
     """
 
-    file: common.Text
+    file: Text
     """A file of OpenCV (YAML, XML or JSON), Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP,
     told apart by content. Where it says how cameras stand to each other, and `T_sensor_world` is
     left out, that is taken over; the world is then the one of the file.
@@ -47,7 +123,7 @@ class CalibrationTable(common.Table):
     Example: `unit = "mm"`"""
 
 
-class CalibrationErrorTable(common.Table):
+class CalibrationErrorTable(Table):
     """How far off a calibration may be, as standard deviations. Poses stay as they are; their
     covariances know of it, to first order. `mixpose calibrate` prints such numbers; where a rig was
     bumped or a lens refocused, they are yours to guess (`docs/sensors-in-time.md`).
@@ -56,21 +132,21 @@ class CalibrationErrorTable(common.Table):
     focal: float = Field(0.0, ge=0, le=0.5, description="a share, from 0 to 0.5")
     """Of the focal length, as a share of it; with parallel beams of `pixel_size`.
     Example: `focal = 0.001`"""
-    principal_point: common.NotNegative = Field(0.0, description="px, at least 0")
+    principal_point: NotNegative = Field(0.0, description="px, at least 0")
     """Of the principal point along each axis, in px.
     Example: `principal_point = 0.5`"""
     rotation_deg: float = Field(0.0, ge=0, le=45, description="degrees, from 0 to 45")
     """Of the orientation about each axis.
     Example: `rotation_deg = 0.05`"""
-    position: common.NotNegative = Field(0.0, description="a length, at least 0")
+    position: NotNegative = Field(0.0, description="a length, at least 0")
     """Of where the sensor stands along each axis, in `unit`.
     Example: `position = 0.5`"""
-    range_bias: common.NotNegative = Field(0.0, description="a length, at least 0")
+    range_bias: NotNegative = Field(0.0, description="a length, at least 0")
     """Of `range_bias`, with `model = "lateration"`.
     Example: `range_bias = 0.02`"""
 
 
-class SensorTable(common.Table):
+class SensorTable(Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
     name: values.SensorName
@@ -86,7 +162,7 @@ class SensorTable(common.Table):
     """When frames were taken, in seconds: a table with a row for each frame, beside the session
     file or relative to it.  Times must not go back from frame to frame.
     Example: `times = "times.csv"`"""
-    fps: common.Positive | None = Field(None, description="frames per second, greater than 0")
+    fps: Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
     Example: `fps = 25`"""
     delay: values.Delay = 0.0
@@ -100,15 +176,15 @@ class SensorTable(common.Table):
     """How far off the calibration may be: standard deviations that covariances are to know of. Left
     out: what residuals show of it.
     Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`"""
-    extract: common.ExtractTable | None = Field(None, description="a table [sensor.extract]")
+    extract: ExtractTable | None = Field(None, description="a table [sensor.extract]")
     """Keys of `[extract]` that differ for this sensor.
     Example: `extract = { polarity = "dark" }`"""
 
 
-class PlacedTable(SensorTable, common.Placement):
+class PlacedTable(SensorTable, Placement):
     """A sensor that stands somewhere and looks somewhere."""
 
-    T_sensor_world: common.Motion = None
+    T_sensor_world: Motion = None
     """Maps coordinates of the world to those of the sensor, which looks along +z with x to the
     right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
     the origin of the world.
@@ -133,7 +209,7 @@ class CameraTable(PlacedTable):
     """The lens: OpenCV's pinhole model, or its fisheye model. The latter sees beyond 90° from its
     axis, too, as far as the image goes.
     Example: `model = "pinhole"`"""
-    camera_matrix: Annotated[Floats | None, values.array_of((3, 3), MATRIX_FORM)] = None
+    camera_matrix: Annotated[Floats | None, array_of((3, 3), values.MATRIX_FORM)] = None
     """Focal lengths and principal point in px; pixel centres have integer coordinates.
     Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`"""
     distortion: Any = Field(None, description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
@@ -152,11 +228,11 @@ class ParallelTable(PlacedTable):
     model: Literal["parallel"]
     """Parallel beams.
     Example: `model = "parallel"`"""
-    pixel_size: common.Positive = Field(description="length per px, a number greater than 0")
+    pixel_size: Positive = Field(description="length per px, a number greater than 0")
     """Length in the world, in `unit`, that one px shows.
     Example: `pixel_size = 0.5`"""
     principal_point: Annotated[
-        Floats, values.array_of((2,), "[u, v], the px where the sensor's origin projects")
+        Floats, array_of((2,), "[u, v], the px where the sensor's origin projects")
     ]
     """Where the sensor's origin is in the image, in px.
     Example: `principal_point = [150, 160]`"""
@@ -168,25 +244,21 @@ class LaterationTable(SensorTable):
     model: Literal["lateration"]
     """Ranges, in `unit`.
     Example: `model = "lateration"`"""
-    position: Annotated[Floats, values.array_of((3,), "[x, y, z], the sensor's place in the world")]
+    position: Annotated[Floats, array_of((3,), "[x, y, z], the sensor's place in the world")]
     """Where ranges are measured from, in `unit`.
     Example: `position = [0, -1000, 0]`"""
-    range_bias: common.Number = Field(0.0, description="a length")
+    range_bias: Number = Field(0.0, description="a length")
     """What every reading is too long by, in `unit`.
     Example: `range_bias = 0.15`"""
-    range_min: common.Number | None = Field(
-        None, description="a length: range of a profile's first bin"
-    )
+    range_min: Number | None = Field(None, description="a length: range of a profile's first bin")
     """For range profiles: the range that their first bin stands for, in `unit`.
     Example: `range_min = 700`"""
-    bin_size: common.Positive | None = Field(
-        None, description="a length greater than 0: from bin to bin"
-    )
+    bin_size: Positive | None = Field(None, description="a length greater than 0: from bin to bin")
     """For range profiles: length from one bin to the next, in `unit`.
     Example: `bin_size = 1.0`"""
 
 
-class CloudTable(SensorTable, common.Placement):
+class CloudTable(SensorTable, Placement):
     """Points in space that nobody has labelled, from a system that triangulates by itself. The
     source is a table with columns `x,y,z`, in `unit`.
     """
@@ -194,7 +266,7 @@ class CloudTable(SensorTable, common.Placement):
     model: Literal["cloud"]
     """Points in space.
     Example: `model = "cloud"`"""
-    T_sensor_world: common.Motion = None
+    T_sensor_world: Motion = None
     """Maps coordinates of the world to the axes that the points are in; in place of a rotation with
     `translation`. Left out: the points are in the world's axes.
     Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""

@@ -16,12 +16,18 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
-from mixpose.session.schema_common import ExtractTable
-from mixpose.session.schema_sensors import AnySensorTable, CameraTable, CloudTable, LaterationTable
+from mixpose.session.schema_sensors import (
+    AnySensorTable,
+    CameraTable,
+    CloudTable,
+    ExtractTable,
+    LaterationTable,
+)
 from mixpose.session.setup import SensorSetup
+from mixpose.session.values import MATRIX_FORM
 from mixpose.units import Unit, length_ratio
 
 _WIDEST_PX = 1000

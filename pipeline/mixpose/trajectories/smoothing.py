@@ -28,7 +28,6 @@ from mixpose.trajectories.intensity import (
     logs_of_wrong,
     smooth_with_sudden_motion,
 )
-from mixpose.trajectories.lines import require_covariances, require_frames_once
 
 _ROUNDED_S = 1e-6  # of differences of times, which are since 1970 at worst
 _ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
@@ -81,7 +80,7 @@ def smooth_body(
     at = np.array([line.frame for line in ordered], float) if times is None else times
     ordered = unfolded(ordered, symmetries)
     posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
-    require_covariances([ordered[k] for k in posed])
+    tracks.require_covariances([ordered[k] for k in posed])
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
@@ -131,7 +130,7 @@ def _possible(label: str) -> Iterator[dict[int, Estimate]]:
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
     """Of all lines; None where one has none, or they do not ascend."""
-    require_frames_once(lines)
+    tracks.require_frames_once(lines)
     found = [line.time_s for line in lines if line.time_s is not None]
     times = np.array(found, dtype=np.float64)
     return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
@@ -155,29 +154,24 @@ def _segments(
     cuts = np.flatnonzero(np.diff(times[posed]) > longest + _ROUNDED_S) + 1
     segments = []
     for part in np.split(np.array(posed), cuts):
-        own: list[PoseLine | None] = []
-        known: list[PoseLine] = []  # the one before in place of those that are not there
-        frames: list[int] = []
-        moments: list[float] = []
+        # line, or none where one is filled in; the last line that is there; frame and time
+        rows: list[tuple[PoseLine | None, PoseLine, int, float]] = []
         for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
             line = lines[k]
-            if frames and times[k] - moments[-1] <= fill_s + _ROUNDED_S:
-                told = slice(last, k + 1)
-                at = [each.frame for each in lines[told]]
-                between = _between(frames[-1], line.frame, step, at[1:-1])
-                own += [None] * len(between)
-                known += [known[-1]] * len(between)
+            if rows and times[k] - rows[-1][3] <= fill_s + _ROUNDED_S:
+                told = lines[last : k + 1]
+                first, between = told[0].frame, [each.frame for each in told[1:-1]]
+                between = _between(rows[-1][2], line.frame, step, between)
                 # frame numbers may be beyond what numbers of NumPy hold
-                since = np.array([n - at[0] for n in at], dtype=np.float64)
-                moments += np.interp([n - at[0] for n in between], since, times[told]).tolist()
-                frames += between
-            own.append(line)
-            known.append(line)
-            frames.append(line.frame)
-            moments.append(float(times[k]))
+                since = np.array([each.frame - first for each in told], dtype=np.float64)
+                moments = np.interp([n - first for n in between], since, times[last : k + 1])
+                before = rows[-1][1]
+                rows += [(None, before, n, t) for n, t in zip(between, moments.tolist())]
+            rows.append((line, line, line.frame, float(times[k])))
+        own, known, frames, at = zip(*rows, strict=True)
         measured = np.array([each is not None for each in own])
-        track = replace(_track(known, np.array(moments)), measured=measured)
-        segments.append(_Segment(tuple(own), tuple(frames), track))
+        track = replace(_track(known, np.array(at)), measured=measured)
+        segments.append(_Segment(own, frames, track))
     return segments
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Indices, Mask
 from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
 
@@ -154,3 +158,22 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
 def without(track: Track, bad: Mask) -> Track:
     """A track in which some poses (N,) do not count."""
     return replace(track, measured=track.measured & ~bad)
+
+
+def require_frames_once(lines: Sequence[PoseLine]) -> None:
+    """Raise a RecordingError if a frame stands twice among lines in the order of frames."""
+    for before, line in pairwise(lines):
+        if before.frame == line.frame:
+            raise RecordingError(
+                f"frame {line.frame} of {line.label!r} stands twice; allowed: a line per frame"
+            )
+
+
+def require_covariances(lines: Sequence[PoseLine]) -> None:
+    """Raise a RecordingError if a pose has no covariance."""
+    for line in lines:
+        if line.covariance is None or not line.covariance.any():
+            raise RecordingError(
+                f"line {line.line}: the pose of {line.label!r} in frame {line.frame} has no "
+                "covariance; allowed: poses as mixpose run writes them"
+            )

@@ -15,8 +15,16 @@ import numpy as np
 from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
-from mixpose.session.calibration.pieces import model_of_distortion, plain, present, size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import (
+    CameraModel,
+    Intrinsics,
+    camera_matrix,
+    distortion,
+    model_of_distortion,
+    plain,
+    present,
+    size_of,
+)
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers

@@ -21,8 +21,14 @@ from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.calibration.pieces import model_of_distortion, motion_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import (
+    CameraModel,
+    Intrinsics,
+    camera_matrix,
+    distortion,
+    model_of_distortion,
+    motion_of,
+)
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers

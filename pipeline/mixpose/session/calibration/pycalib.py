@@ -6,8 +6,7 @@ from functools import partial
 from typing import Any
 
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
-from mixpose.session.calibration.pieces import motion_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion, motion_of
 from mixpose.session.messages import BadKeyError, under
 
 _DEEP = 3  # a list of matrices; one matrix alone is a camera of another format

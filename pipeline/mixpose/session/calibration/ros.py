@@ -9,8 +9,17 @@ from functools import partial
 from typing import Any
 
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.calibration.pieces import MODELS, model_of_distortion, plain, present, size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import (
+    MODELS,
+    CameraModel,
+    Intrinsics,
+    camera_matrix,
+    distortion,
+    model_of_distortion,
+    plain,
+    present,
+    size_of,
+)
 from mixpose.session.messages import BadKeyError, found, one_of, under
 
 _INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")

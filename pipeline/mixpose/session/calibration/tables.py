@@ -12,8 +12,15 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.calibration.pieces import motion_of, present, size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import (
+    CameraModel,
+    Intrinsics,
+    camera_matrix,
+    distortion,
+    motion_of,
+    present,
+    size_of,
+)
 from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.units import Unit
 
