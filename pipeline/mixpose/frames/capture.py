@@ -133,8 +133,7 @@ class ColourRoom:
     To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
     """
 
-    # (H, W, 3 or 4), the last coloured frame; None before the first
-    image: cv2.typing.MatLike | None = None
+    image: cv2.typing.MatLike | None = None  # (H, W, 3 or 4), the last coloured frame
 
 
 def retrieve(

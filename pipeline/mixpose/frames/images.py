@@ -45,11 +45,9 @@ class ImageSequence(Source):
     # the files and their frame numbers, ascending; at least one
     paths: tuple[Path, ...]
     numbers: tuple[int, ...]
-    # size of every image in px; None means that of the first one read
-    resolution: tuple[int, int] | None
+    resolution: tuple[int, int] | None  # px of every image; None means that of the first one read
     clock: Clock | None  # gives the time of a frame number
-    # whether the numbers are times in nanoseconds, which the clock goes by
-    is_stamped: bool = False
+    is_stamped: bool = False  # whether the numbers are times in ns, which the clock goes by
     has_fps: bool = False  # whether the session states a rate
 
     @property

@@ -78,9 +78,7 @@ class LiveSource(Source):
 
     address: str | int  # of a stream or a device, or the index of a camera
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    # gives the time of a frame number; None means when the frame was captured, or arrived where the
-    # source does not tell, in s since the start
-    clock: Clock | None
+    clock: Clock | None  # gives the time of a frame; None: since the start, by its moment, in s
 
     def describe(self) -> str:
         """One line for people."""

@@ -26,11 +26,8 @@ class RangeProfiles(Source):
     kind: ClassVar[SourceKind] = "profiles"
     ahead: ClassVar[int] = 0
 
-    # ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without a
-    # header, a row per frame
-    path: Path
-    # range of the first bin and distance from bin to bin, in length units
-    range_min: float
+    path: Path  # ``.npy`` (frames x bins) or ``.csv`` without a header, a row per frame
+    range_min: float  # range of the first bin, length units
     bin_size: float
     clock: Clock | None  # gives the time of a frame number
     bins: int  # number of bins in each profile

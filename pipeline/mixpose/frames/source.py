@@ -27,16 +27,11 @@ class SourceSpec:
     """What the session says about the recording of one sensor."""
 
     sensor: str  # name of the sensor; only for messages
-    # a glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a list
-    # of images
-    source: str | tuple[str, ...]
+    source: str | tuple[str, ...]  # glob, folder, file, pipe, address or ``camera:0``; or images
     base: Path  # folder that a relative `source` starts from
     kind: SensorKind  # what the sensor measures
-    # size of every image in px; None means like the first one
-    resolution: tuple[int, int] | None = None
-    # table ``frame,time_s`` that gives frames their times; as it is opened, `base` is not put
-    # before it
-    times: Path | None = None
+    resolution: tuple[int, int] | None = None  # px of every image; None means like the first one
+    times: Path | None = None  # table ``frame,time_s``, not relative to `base`
     fps: float | None = None  # frames per second: the time of frame n is n / fps
     # range of the first bin of a profile and distance from bin to bin, in length units
     range_min: float | None = None

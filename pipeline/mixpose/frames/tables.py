@@ -55,8 +55,7 @@ class DetectionTable(Source):
     ahead: ClassVar[int] = 0
 
     path: Path  # the CSV file
-    # its header: ``frame`` or ``time_s`` or both, the coordinates, perhaps ``weight``
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # its header
     coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
     clock: Clock | None  # gives the time of a frame number; None means the times in the table
     # numbers of its moments, where it has times alone and others have moments that it lacks

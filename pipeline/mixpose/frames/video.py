@@ -31,10 +31,8 @@ class Video(Source):
 
     address: str  # path of the file or pipe, or address of a stream (with ``://``)
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    # gives the time of a frame number; None means the times that the video holds
-    clock: Clock | None
-    # size that the container states; None for a stream, which is not opened in advance
-    size: tuple[int, int] | None
+    clock: Clock | None  # gives the time of a frame number; None: times that the video holds
+    size: tuple[int, int] | None  # that the container states; None for a stream
     promised: int | None  # number of frames that the container states or lets expect
     missing: int  # bytes that the file lacks; see `missing_bytes`
 

@@ -24,9 +24,7 @@ class Consistency:
     """Whether the covariances tell the truth, over "ok" frames that have one."""
 
     frames: int
-    # mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they promise
-    # too much
-    mean_per_dimension: float
+    mean_per_dimension: float  # mean NEES by its dimensions: above 1 if they promise too much
     inside_95: float  # share of frames whose truth lies inside the 95 % ellipsoid
 
 
@@ -67,11 +65,9 @@ def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float |
 class ConstantOffset:
     """A transform that takes all poses near to the truth."""
 
-    # whether it stands right of the poses, ``T_truth = T_pose T``, or left of them
-    of: Literal["object", "world"]
+    of: Literal["object", "world"]  # right of the poses, ``T_truth = T_pose T``, or left of them
     T: Floats  # (4, 4)
-    # errors that are left with it
-    rotation_deg_rms: float
+    rotation_deg_rms: float  # of errors that are left with it
     translation_rms: float
 
     def text(self, unit: str) -> str:

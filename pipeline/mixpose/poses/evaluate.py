@@ -42,15 +42,12 @@ class FrameError:
 
     frame: int
     object: str
-    # "missing" where the poses file has no line for a frame of the truth file
-    status: Status | Literal["missing"]
-    # (6,), from the right answer to the pose, ``(x, y, z, rx, ry, rz)``, lengths and radians
-    twist: Floats | None = None
+    status: Status | Literal["missing"]  # "missing" where the poses have no line for it
+    twist: Floats | None = None  # (6,), from the right answer to the pose, lengths and radians
     # (6,), the same for the best of an ambiguous frame's hypotheses; the pose is one of them
     best_twist: Floats | None = None
     nees: float | None = None  # normalised estimation error squared; None without a covariance
-    # directions in which the covariance lets the pose err; what `nees` is expected to be
-    dimensions: int = 0
+    dimensions: int = 0  # in which the covariance lets the pose err; what `nees` is expected to be
     pair: tuple[Floats, Floats] | None = field(default=None, compare=False)  # pose and right answer
 
 
@@ -80,9 +77,7 @@ class Evaluation:
     # over frames with a pose, "ambiguous" ones included; None without such a frame
     rotation_deg: Spread | None
     translation: Spread | None
-    # RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`; lengths and
-    # degrees
-    per_axis_rms: Mapping[str, float] | None
+    per_axis_rms: Mapping[str, float] | None  # by `TWIST_NAMES`, lengths and degrees
     # over "ok" frames alone; None without such a frame
     ok_rotation_deg: Spread | None
     ok_translation: Spread | None
@@ -90,13 +85,10 @@ class Evaluation:
     best_rotation_deg: Spread | None
     best_translation: Spread | None
     nees: consistency.Consistency | None  # None where no "ok" frame has a covariance
-    # each body by itself, where there are several
-    bodies: Mapping[str, Evaluation] = field(default_factory=dict)
+    bodies: Mapping[str, Evaluation] = field(default_factory=dict)  # each by itself, if several
     swaps: Swaps | None = None  # None where no bodies are identical
-    # the one transform that explains most of the errors of "ok" frames, if there is one
-    offset: consistency.ConstantOffset | None = None
-    # whether the truth has covariances, as estimates do, and the poses have none
-    exchanged: bool = False
+    offset: consistency.ConstantOffset | None = None  # that explains most errors of "ok" frames
+    exchanged: bool = False  # whether the truth has covariances and the poses have none
 
 
 def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:

@@ -24,9 +24,7 @@ class Header:
     seed: int
     # motions T_object_object that map the object's features onto themselves, identity included
     symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
-    # recordings given in place of the session's, by sensor name; the line has them only where there
-    # are any
-    sources: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)  # in place of the session's, by sensor
     # what else the run was asked for that its lines hang on, as `step` and `labels`; the line has
     # it only where that is not the default
     options: Mapping[str, int | bool] = field(default_factory=dict)
@@ -37,8 +35,7 @@ class Header:
     # Names of all bodies with how many there are of each, in the order of their pose lines; the
     # line has them only where there are several.  Empty: not known.
     objects: Mapping[str, int] = field(default_factory=dict)
-    # by which model the poses of each body were smoothed; empty where they were not
-    smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # models, by body
 
     @property
     def labels(self) -> tuple[str, ...]:

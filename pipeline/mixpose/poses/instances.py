@@ -30,9 +30,7 @@ class Swaps:
     """How often identical bodies changed places."""
 
     count: int = 0  # bodies that are followed where another one of the truth is, at each change
-    # of these, those where the body was not ok in the frame itself or in one since it last was
-    # nearest to the one before
-    announced: int = 0
+    announced: int = 0  # of these, of bodies not ok then, or since they last were where they belong
 
 
 def renumbered(

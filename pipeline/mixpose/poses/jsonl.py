@@ -187,9 +187,8 @@ class ResumePoint:
 
     frame: int  # its frame
     lines: int  # lines of this frame
-    # of the file up to its end: bytes and CRC-32
-    size: int
-    checksum: int
+    size: int  # of the file up to its end, bytes
+    checksum: int  # CRC-32 of these
     first: int  # frame of the first line
 
 

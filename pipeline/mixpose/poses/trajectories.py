@@ -48,8 +48,7 @@ class Trajectories:
 
     names: tuple[str, ...]  # N, all different
     places: Floats  # (F, N, 3), in the world; NaN where a marker is not known
-    # (F, N), of places that sensors measured, a length; NaN of those that are not, or by the pose
-    residuals: Floats
+    residuals: Floats  # (F, N), a length; NaN of places that sensors did not measure
     by_sensor: Mask  # (F, N, L), which sensors measured it
     first: int  # number of the first frame
     rate: float  # frames per second

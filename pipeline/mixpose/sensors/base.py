@@ -36,9 +36,7 @@ class Rays:
     central: bool  # whether all start at one centre, in front of which alone the camera sees
     offset: float
     slope: float
-    # Of lines that images of one cloud of points give: the same for each of its images, in which
-    # the lines of one point have the same number.
-    cloud: object = None
+    cloud: object = None  # the same for the images of one cloud, whose rows are the same points
 
     def __len__(self) -> int:
         return len(self.origins)

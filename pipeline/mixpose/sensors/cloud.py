@@ -39,8 +39,7 @@ class CloudPlane(ParallelBeam):
 class CloudSensor(PlacedSensor):
     """Measures points in space."""
 
-    # (4, 4) to the axes that the points are in
-    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
 
     dimension: ClassVar[int] = 3
     unit: ClassVar[Literal["px", "length"]] = "length"

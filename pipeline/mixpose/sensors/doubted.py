@@ -21,8 +21,7 @@ from mixpose.sensors.pinhole import PinholeCamera
 class CalibrationError:
     """Standard deviations of what a calibration says of a sensor."""
 
-    # of the focal length, as a share of it; of the pixel size, with parallel beams
-    focal: float = 0.0
+    focal: float = 0.0  # of the focal length, as a share; of the pixel size, with parallel beams
     principal_point: float = 0.0  # along each axis, px
     rotation_deg: float = 0.0  # of the orientation, about each axis
     position: float = 0.0  # along each axis, length units

@@ -38,8 +38,7 @@ class Intrinsics:
 
     camera_matrix: Floats  # (3, 3)
     distortion: Floats  # (k,), OpenCV's order; empty for none
-    # width and height in px; None where the calibration does not say
-    resolution: tuple[int, int] | None = None
+    resolution: tuple[int, int] | None = None  # width and height, px; None where it is not said
     model: CameraModel | None = None  # the kind of camera; None where the calibration does not say
 
 

@@ -195,12 +195,9 @@ class Markers:
     """What a marker table holds."""
 
     points: Floats  # (N, 3)
-    # per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them; None
-    # where the table has no such columns
-    sigma: list[Any] | None
+    sigma: list[Any] | None  # of each, as the key ``sigma`` has it; None without such columns
     names: tuple[str, ...] = ()  # of the markers, where the file has names
-    # (N, 3), outward directions of flat markers, where the file has them
-    normals: Floats | None = None
+    normals: Floats | None = None  # (N, 3), outward, of flat markers, where the file has them
 
 
 def read_markers(path: Path) -> Markers:

@@ -19,8 +19,7 @@ class Start:
     """Where the object is at first, ``[start]``."""
 
     T_world_object: Floats  # (4, 4)
-    # half-width of the search around it in degrees; None where the file gives none
-    rotation_deg: float | None = None
+    rotation_deg: float | None = None  # half-width in degrees; None where not given
     distance: float | None = None  # half-width in length units; None where the file gives none
 
 
@@ -65,8 +64,7 @@ class SensorSetup:
     # seconds from a camera's first row to its last, and for which a row collects light
     readout: float = 0.0
     exposure: float = 0.0
-    # how far off the geometry may be; None: exact
-    calibration_error: CalibrationError | None = None
+    calibration_error: CalibrationError | None = None  # of the geometry; None: exact
     own: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets, whatever ``[extract]``
 
     @property

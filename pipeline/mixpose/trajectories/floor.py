@@ -26,10 +26,8 @@ class Floor:
 
     T_old_new: Floats  # (4, 4): maps coordinates of the new world to those of the old one
     by: str  # what it was found by
-    # root mean square distance of the points from the floor; None where any would fit
-    off: float | None = None
-    # standard deviation of its tilt about the axis that is known least; 0 of true poses
-    tilt_deg: float = 0.0
+    off: float | None = None  # RMS distance of the points from it; None where any would fit
+    tilt_deg: float = 0.0  # standard deviation about the axis known least; 0 of true poses
 
 
 def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:

@@ -43,10 +43,8 @@ class States(NamedTuple):
     """States of a body at one time, as G filters that run side by side know them."""
 
     poses: Floats  # (G, 4, 4)
-    # (G, p - 1, 6): derivatives of the pose, lengths and radians per second to the power of 1 on
-    rates: Floats
-    # (G, 6 p, 6 p): of the pose and of its derivatives, in this order, six numbers of each
-    covariances: Floats
+    rates: Floats  # (G, p - 1, 6): derivatives of the pose, lengths and radians per s, s² ...
+    covariances: Floats  # (G, 6 p, 6 p): of the pose and of its derivatives, in this order
 
     @property
     def order(self) -> int:

@@ -71,8 +71,7 @@ class Tip:
     residual: float  # root mean square distance of tip and point
     expected: float  # the same by the covariances of the poses
     held_out: float  # and of poses that were held out
-    # squared residuals by their covariances; what is above 1 is in the covariance of the tip
-    scale: float
+    scale: float  # squared residuals by covariances; above 1 it is in the covariance of the tip
     # variance of the tip by parts of the recording that are held out, against that by residuals;
     # above 1 where errors last, and then in the covariance, with what so few parts tell it to
     lasting: float

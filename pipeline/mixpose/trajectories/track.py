@@ -25,8 +25,7 @@ class Track:
     times: Floats  # (N,): s, or numbers of frames
     poses: Floats  # (N, 4, 4)
     covariances: Floats  # (N, 6, 6): as `mixpose.rigid` has them; of directions that are held, any
-    # (N,): whether there is a pose at that time; what stands in `poses` does not count where not
-    measured: Mask
+    measured: Mask  # (N,): whether there is a pose; what stands in `poses` counts there only
     free: Mask  # (6,): directions of the world in which the body is estimated
 
     def __len__(self) -> int:
@@ -83,9 +82,7 @@ class MotionModel:
 
     order: int  # p, of the derivative that takes white noise
     intensities: Floats  # (2,): q, of lengths and of turns
-    # share of the covariances that is independent from frame to frame; above 1 where poses scatter
-    # more than their covariances say
-    white: float = 1.0
+    white: float = 1.0  # share of covariances that is independent from frame to frame
 
 
 def noise_of(track: Track, intensities: Floats) -> Floats:

@@ -35,8 +35,7 @@ class CalibratedCamera:
     # (4, 4), maps coordinates that all cameras of the file share to those of the camera; None where
     # the file does not say
     T_camera_rig: Floats | None = None
-    # of the translation; None where the format leaves that to whoever wrote the file
-    unit: Unit | None = None
+    unit: Unit | None = None  # of the translation; None where the format does not fix it
     note: str = ""  # what a person should know of it; mostly empty
 
 
