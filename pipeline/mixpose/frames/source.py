@@ -15,11 +15,8 @@ SensorKind: TypeAlias = Literal["camera", "lateration", "cloud"]
 SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profiles"]
 Frames: TypeAlias = Generator[RawFrame, None, None]
 
-# Frame numbers come from file names, which hold at most 255 digits.
-_BEYOND_ALL_NUMBERS = 10**256
-
-ALL_NUMBERS = range(-_BEYOND_ALL_NUMBERS, _BEYOND_ALL_NUMBERS)
-"""The numbers of all frames that there may be."""
+ALL_NUMBERS = range(-(10**256), 10**256)
+"""The numbers of all frames that there may be: those of file names have at most 255 digits."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +68,10 @@ class Source(Protocol):
         """
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Frames by ascending number, those of ``range(start, stop, step)`` only.
+        """Frames by ascending number, those of ``range(start, stop, step)`` only, as `selection`.
 
-        Skipped frames are not decoded. Without `start` the range begins at the first frame. Raises
-        RecordingError in place of the first frame that cannot be read.
+        Skipped frames are not decoded. A RecordingError comes in place of the first frame that
+        cannot be read.
         """
 
 
@@ -91,7 +88,7 @@ def selection(start: int | None, stop: int | None, step: int, first: int | None)
         raise SessionError(f"step: found {step}, allowed is a whole number from 1")
     if start is None:
         start = first or 0
-    return range(start, _BEYOND_ALL_NUMBERS if stop is None else stop, step)
+    return range(start, ALL_NUMBERS.stop if stop is None else stop, step)
 
 
 def numbers_text(first: int, last: int, count: int) -> str:

@@ -130,7 +130,9 @@ def read_astertrack(content: bytes) -> Markers:
     for number, line in enumerate(as_text(content).splitlines(), start=1):
         word, *cells = line.split() or [""]
         if word == "v":
-            vertices.append(_coordinates(cells, number))
+            vertices.append([as_number(cell) for cell in cells[:3]])
+            if len(vertices[-1]) != 3 or not all(map(is_number, vertices[-1])):
+                raise BadKeyError(f"line {number}: {found(' '.join(cells), 'v x y z')}")
         elif word in ("g", "o"):
             group = " ".join(cells)
         elif word == "f":
@@ -149,13 +151,6 @@ def read_astertrack(content: bytes) -> Markers:
     points, normals = (np.array(part) for part in zip(*placed, strict=True))
     names = tuple(str(k + 1) for k in range(len(points)))
     return Markers(points, None, names, normals)
-
-
-def _coordinates(cells: list[str], line: int) -> list[float]:
-    values = [as_number(cell) for cell in cells[:3]]
-    if len(values) != 3 or not all(map(is_number, values)):
-        raise BadKeyError(f"line {line}: {found(' '.join(cells), 'v x y z')}")
-    return values
 
 
 def _corners(cells: list[str], line: int) -> list[int]:
@@ -216,7 +211,12 @@ def read_markers(path: Path) -> Markers:
         if not rows:
             raise BadKeyError("the file is empty; allowed: a header name,x,y,z and a row per point")
         header = [cell.strip() for cell in rows[0][1]]
-        _check_header(header)
+        words = [name.lower() for name in header]
+        if words[:4] != _HEADER or len(words) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
+            raise BadKeyError(
+                f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
+                "columns of sigma"
+            )
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
         values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
         if not len(values):
@@ -225,15 +225,6 @@ def read_markers(path: Path) -> Markers:
     spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
     sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
     return Markers(values[:, :3], sigma, names)
-
-
-def _check_header(header: list[str]) -> None:
-    names = [name.lower() for name in header]
-    if names[:4] != _HEADER or len(names) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
-        raise BadKeyError(
-            f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
-            "columns of sigma"
-        )
 
 
 def _learnt(header: list[str]) -> int:

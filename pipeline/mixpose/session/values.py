@@ -60,7 +60,6 @@ def array_of(shape: tuple[int | None, ...], description: str) -> ReadBy:
 
 
 def _read_sensor_name(name: str) -> str:
-    """A sensor's name: text that can stand in NAME=PATH."""
     if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
         raise BadKeyError(
             found(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
@@ -69,14 +68,12 @@ def _read_sensor_name(name: str) -> str:
 
 
 def _read_method(value: Any) -> str:
-    """A method's name, or a function of one's own."""
     if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
         return value
     raise BadKeyError(found(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
 
 
 def _read_threshold(value: Any) -> str | float:
-    """A rule's name, or a grey level."""
     if isinstance(value, str) and value in THRESHOLDS:
         return value
     if is_number(value):
@@ -95,7 +92,6 @@ def _read_source(value: Any) -> str | tuple[str, ...]:
 
 
 def _read_delay(value: Any) -> float | Literal["estimate"]:
-    """Seconds, or the word that asks for them."""
     if value == "estimate":
         return "estimate"
     if not is_number(value) or not -LONGEST_DELAY_S <= value <= LONGEST_DELAY_S:
@@ -118,6 +114,7 @@ def _read_free(value: Any) -> tuple[str, ...]:
 SensorName: TypeAlias = Annotated[
     str, AfterValidator(_read_sensor_name), Field(description="a name for the sensor, as text")
 ]
+"""It can stand in NAME=PATH."""
 Method: TypeAlias = Annotated[str | None, ReadBy(_read_method, _METHOD_ALLOWED)]
 Threshold: TypeAlias = Annotated[str | float | None, ReadBy(_read_threshold, _THRESHOLD_ALLOWED)]
 Source: TypeAlias = Annotated[str | tuple[str, ...], ReadBy(_read_source, _SOURCE_ALLOWED)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,11 @@ def _read(
             stated = present(camera, "distortion_model")
             model = model_of_distortion(stated) or "pinhole"
         with under("intrinsics"):
-            K = _matrix(plain(camera["intrinsics"]))
+            intrinsics = plain(camera["intrinsics"])
+            if not isinstance(intrinsics, list) or len(intrinsics) != 4:
+                raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
+            fu, fv, pu, pv = intrinsics
+            K = camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
             coefficients = [] if stated == "none" else present(camera, "distortion_coeffs")
             D = distortion(plain(coefficients), model)
@@ -64,24 +69,14 @@ def _read(
     return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
 
 
-def _matrix(intrinsics: Any) -> Floats:
-    if not isinstance(intrinsics, list) or len(intrinsics) != 4:
-        raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
-    fu, fv, pu, pv = intrinsics
-    return camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
-
-
 def _pose(chain: dict[str, Any], names: list[str], wanted: str) -> Floats | None:
     """From the first camera's coordinates to those of another; None where a link is missing."""
     T = np.eye(4)
-    for before, name in zip([None, *names], names):
-        if before is not None:
-            step = _step(chain, before, name)
-            if step is None:
-                return None
-            T = step @ T
-        if name == wanted:
-            break
+    for before, name in pairwise(names[: names.index(wanted) + 1]):
+        step = _step(chain, before, name)
+        if step is None:
+            return None
+        T = step @ T
     # a camera alone has no place in anything
     return T if len(names) > 1 else None
 

@@ -63,9 +63,8 @@ class _Nodes:
 
 
 def _recognises(content: Content) -> bool:
-    head = content.text.lstrip()
-    starts = head.startswith(("%YAML:", "%YAML ", "<?xml", "<opencv_storage"))
-    return starts or "opencv-matrix" in content.text
+    starts = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
+    return content.text.lstrip().startswith(starts) or "opencv-matrix" in content.text
 
 
 def _open(group: Iterable[Content]) -> _Nodes:
