@@ -78,8 +78,6 @@ def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
             key.append(step)
             field = table.model_fields.get(step)
             choices = _tables(field.annotation) if field else []
-    if field is None and len(choices) > 1:
-        table = choices[0]
     return _Place(tuple(key), table, field)
 
 

@@ -15,17 +15,9 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
+from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
-from mixpose.session.intrinsics import (
-    CameraModel,
-    Intrinsics,
-    camera_matrix,
-    distortion,
-    model_of_distortion,
-    plain,
-    present,
-    size_of,
-)
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
@@ -53,19 +45,19 @@ def _read(
         if camera.get("camera_model", "pinhole") != "pinhole":
             raise BadKeyError(found(camera["camera_model"], '"pinhole"'), "camera_model")
         with under("distortion_model"):
-            stated = present(camera, "distortion_model")
-            model = model_of_distortion(stated) or "pinhole"
+            stated = pieces.present(camera, "distortion_model")
+            model = pieces.model_of_distortion(stated) or "pinhole"
         with under("intrinsics"):
-            intrinsics = plain(camera["intrinsics"])
+            intrinsics = pieces.plain(camera["intrinsics"])
             if not isinstance(intrinsics, list) or len(intrinsics) != 4:
                 raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
             fu, fv, pu, pv = intrinsics
-            K = camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+            K = pieces.camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
-            coefficients = [] if stated == "none" else present(camera, "distortion_coeffs")
-            D = distortion(plain(coefficients), model)
+            coefficients = [] if stated == "none" else pieces.present(camera, "distortion_coeffs")
+            D = pieces.distortion(pieces.plain(coefficients), model)
         with under("resolution"):
-            size = size_of(camera.get("resolution"))
+            size = pieces.size_of(camera.get("resolution"))
     return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
 
 
@@ -102,7 +94,7 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
         return None
     with under(name):
         with under(key):
-            matrix = numbers(plain(chain[name][key]), (4, 4), _MATRIX)
+            matrix = numbers(pieces.plain(chain[name][key]), (4, 4), _MATRIX)
         return rigid(matrix, key)
 
 

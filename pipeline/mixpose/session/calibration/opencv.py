@@ -20,15 +20,9 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
+from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import (
-    CameraModel,
-    Intrinsics,
-    camera_matrix,
-    distortion,
-    model_of_distortion,
-    motion_of,
-)
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
@@ -172,9 +166,9 @@ def _intrinsics(
     distortion_node = choose_node(opened, "distortion", coefficients)
     stated = _stated_model(opened)
     with under(matrix_node):
-        K = camera_matrix(_values(opened.nodes[matrix_node]))
+        K = pieces.camera_matrix(_values(opened.nodes[matrix_node]))
     with under(distortion_node):
-        D = distortion(_values(opened.nodes[distortion_node]), stated or model)
+        D = pieces.distortion(_values(opened.nodes[distortion_node]), stated or model)
     return Intrinsics(K, D, _resolution(opened), stated)
 
 
@@ -202,7 +196,7 @@ def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
         return None
     if name == names[0]:
         return np.eye(4)
-    return motion_of(_values(opened.nodes["R"]), _values(opened.nodes["T"]), key="R")
+    return pieces.motion_of(_values(opened.nodes["R"]), _values(opened.nodes["T"]), key="R")
 
 
 def _own_pose(own: _Nodes) -> Floats | None:
@@ -249,7 +243,7 @@ def _stated_model(opened: _Nodes) -> CameraModel | None:
     name = opened.nodes.get("distortion_model")
     if name is not None and name.isString():
         with under("distortion_model"):
-            return model_of_distortion(name.string())
+            return pieces.model_of_distortion(name.string())
     return None
 
 

@@ -8,18 +8,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import (
-    MODELS,
-    CameraModel,
-    Intrinsics,
-    camera_matrix,
-    distortion,
-    model_of_distortion,
-    plain,
-    present,
-    size_of,
-)
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, found, one_of, under
 
 _INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")
@@ -35,22 +26,23 @@ def _camera(group: Group) -> dict[str, Reader]:
 def _read(content: dict[str, Any], name: str, model: CameraModel) -> CalibratedCamera:
     _whole_image(content)
     with under("distortion_model"):
-        stated = model_of_distortion(content.get("distortion_model"))
+        stated = pieces.model_of_distortion(content.get("distortion_model"))
     matrix_key = _first(content, ("camera_matrix", "K", "k"))
     with under(matrix_key):
-        K = camera_matrix(_matrix_data(content[matrix_key]))
+        K = pieces.camera_matrix(_matrix_data(content[matrix_key]))
     distortion_key = _first(content, ("distortion_coefficients", "D", "d"))
     with under(distortion_key):
-        D = distortion(_matrix_data(present(content, distortion_key)), stated or model)
+        coefficients = _matrix_data(pieces.present(content, distortion_key))
+        D = pieces.distortion(coefficients, stated or model)
         if D.size and stated is None:
             raise BadKeyError(
                 f"found {D.size} coefficients without a distortion_model; "
-                f"allowed: one of {one_of(MODELS)}"
+                f"allowed: one of {one_of(pieces.MODELS)}"
             )
     width = content.get(_first(content, ("image_width", "width")))
     height = content.get(_first(content, ("image_height", "height")))
     with under("image_width"):
-        size = None if width is None and height is None else size_of([width, height])
+        size = None if width is None and height is None else pieces.size_of([width, height])
     return CalibratedCamera(name, Intrinsics(K, D, size, stated))
 
 
@@ -79,7 +71,7 @@ def _first(content: dict[str, Any], keys: tuple[str, ...]) -> str:
 
 def _matrix_data(value: Any) -> Any:
     """The numbers of a matrix, written as rows, cols and data or as a plain list."""
-    return plain(value.get("data") if isinstance(value, dict) else value)
+    return pieces.plain(value.get("data") if isinstance(value, dict) else value)
 
 
 def _ini_camera(group: Group) -> dict[str, Reader]:
@@ -91,12 +83,12 @@ def _ini_camera(group: Group) -> dict[str, Reader]:
 def _read_ini(content: Content, name: str, _: CameraModel) -> CalibratedCamera:
     values = _ini_values(content)
     with under("camera matrix"):
-        K = camera_matrix(values.get("camera matrix"))
+        K = pieces.camera_matrix(values.get("camera matrix"))
     with under("distortion"):
         # five coefficients of the plumb bob, eight of the rational model: both are OpenCV's
-        D = distortion(values.get("distortion", []), "pinhole")
+        D = pieces.distortion(values.get("distortion", []), "pinhole")
     with under("[image]"):
-        size = size_of([_integer(values, word) for word in ("width", "height")])
+        size = pieces.size_of([_integer(values, word) for word in ("width", "height")])
     return CalibratedCamera(name, Intrinsics(K, D, size, "pinhole"))
 
 

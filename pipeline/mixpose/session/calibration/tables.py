@@ -11,16 +11,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
 
+from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import (
-    CameraModel,
-    Intrinsics,
-    camera_matrix,
-    distortion,
-    motion_of,
-    present,
-    size_of,
-)
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.units import Unit
 
@@ -55,14 +48,14 @@ def _read(table: dict[str, Any], name: str, unit: Unit | None, _: CameraModel) -
         raise BadKeyError(found(fisheye, "true or false"), "fisheye")
     model: CameraModel = "fisheye" if fisheye else "pinhole"
     with under("matrix"):
-        K = camera_matrix(table["matrix"])
+        K = pieces.camera_matrix(table["matrix"])
     with under("distortions"):
-        D = distortion(table["distortions"], model)
+        D = pieces.distortion(table["distortions"], model)
     with under("size"):
-        size = size_of(present(table, "size"))
+        size = pieces.size_of(pieces.present(table, "size"))
     pose = None
     if table.get("rotation") is not None and table.get("translation") is not None:
-        pose = motion_of(table["rotation"], table["translation"])
+        pose = pieces.motion_of(table["rotation"], table["translation"])
     return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, unit)
 
 
