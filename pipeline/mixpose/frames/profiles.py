@@ -71,11 +71,7 @@ class RangeProfiles(Source):
 
 
 def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
-    """Open a file of range profiles, frames x bins, and learn its shape.
-
-    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid, and
-    RecordingError if the file is no such array.
-    """
+    """Open range profiles; a SessionError without a grid, a RecordingError if not frames x bins."""
     range_min = _option(spec, "range_min", spec.range_min)
     bin_size = _option(spec, "bin_size", spec.bin_size)
     if bin_size <= 0:

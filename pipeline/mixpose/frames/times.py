@@ -107,8 +107,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
 
-    Raises RecordingError if the file cannot be read as text, or a row has more or fewer cells than
-    the first.
+    Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
     """
     width = None
     cannot = reporting(RecordingError, f"{path}: cannot be read")

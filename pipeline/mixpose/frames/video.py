@@ -147,9 +147,8 @@ class Video(Source):
 
 
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
-    """Open a video to learn its size and length; a stream or a pipe is left for later.
-
-    Raises RecordingError if it does not open.
+    """Open a video for its size and length, a stream or a pipe later; a RecordingError if it does
+    not.
     """
     if captures.is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)

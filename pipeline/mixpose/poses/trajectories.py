@@ -114,8 +114,8 @@ def rate_of(lines: Sequence[PoseLine], numbers: Mapping[int, int]) -> tuple[floa
 def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """Write trajectories in mm; the format cannot say which places sensors measured.
 
-    What is not known is NaN: an empty cell would shift the row where readers split at any space.
-    The name `called` of the file stands in its first line.
+    Unknown is NaN: an empty cell would shift the row where readers split at any space. The file's
+    name `called` stands in its first line.
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space

@@ -168,11 +168,7 @@ class RollingBatch:
         return y, by_point.transpose(2, 3, 1, 0), visible
 
     def _moved(self, arms: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points (3, L, n) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
-
-        Of arms (3, L, n) from the body's origin. Velocities are those of points of the body, but
-        for how far its origin moved; turns are rotation vectors (3, L, n) or (3, L, 1).
-        """
+        """Where arms (3, L, n) are after seconds (L, n) or (L, 1), their velocities, and turns."""
         more = seconds * self._acceleration
         twists = (self._velocity + 0.5 * more) * seconds
         rates, turned = self._velocity + more, twists[3:]

@@ -25,8 +25,8 @@ _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
-    The marker file's path is relative to `folder`; lengths of other programs' files are converted
-    into `unit`. There must be three features or more, none repeated, that spread and normals fit.
+    The marker file is below `folder`; lengths of other programs' files are converted into `unit`.
+    Raises BadKeyError unless there are three features or more, none repeated, that the rest fits.
     """
     markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points

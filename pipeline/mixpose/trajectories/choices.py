@@ -67,10 +67,7 @@ def choices(
 def _followed(
     track: Track, alternatives: Sequence[Alternatives], model: MotionModel, rules: SmoothingRules
 ) -> tuple[list[tuple[int, ...]], Floats]:
-    """The likeliest paths, each a choice per time, and their log likelihoods.
-
-    A path begins at the first time, or later, where all before show something else.
-    """
+    """The likeliest paths, each a choice per time, _NONE before it begins, and log likelihoods."""
     white = white_parts(track, np.array([model.white]))
     noise = noise_of(track, model.intensities[None])
 

@@ -111,11 +111,7 @@ def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
 
 
 def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float, float]:
-    """Upward normal of the plane of least squared distances of points (n, 3), and their RMS.
-
-    And the root of the summed squares of how far points are from their middle where they spread
-    least within the plane. A RecordingError where points of a covariance (3, 3) each span none.
-    """
+    """Upward normal of the plane nearest to points (n, 3), their RMS off it, spread in it."""
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle)
     errors = np.sqrt(len(points) * (directions[1] @ covariance @ directions[1]))

@@ -241,11 +241,9 @@ def _chosen(
 def _without_foreign(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """A track without poses that lie where those around them forbid, and the track smoothed.
-
-    The first is one of them if it is the last of the way back, which tells where it should be.
-    """
+    """A track without poses that lie where those around them forbid, and that smoothed."""
     if _off(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
+        # is the first wrong? as the last of the way back it is told where it should be
         reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
         left, back = _without_foreign_after_first(reversed_track, model, rules)
         if not left.measured[-1]:
@@ -294,11 +292,7 @@ def _without_foreign_after_first(
 def _off(
     track: tracks.Track, result: tracks.SmoothedTrack, model: tracks.MotionModel, sign: int
 ) -> Floats:
-    """Squared distance (N,) of each pose from what all others say.
-
-    rᵀ(R − P)⁻¹r where the pose took part in the result, with the sign −1, and rᵀ(R + P)⁻¹r where
-    it did not.
-    """
+    """rᵀ(R ± P)⁻¹r (N,), of poses and what others say; the sign is -1 where they took part in P."""
     free = np.flatnonzero(track.free)
     inner = np.ix_(np.arange(len(track)), free, free)
     rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]

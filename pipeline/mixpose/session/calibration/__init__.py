@@ -42,7 +42,7 @@ def read_calibration(
 
 
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
-    """Read all cameras of several files; files that belong together may be among them.
+    """Read all cameras of several files, among which may be some that belong together.
 
     `also` says what may be given besides, for the message about a file in no known format.
     """
