@@ -159,10 +159,5 @@ def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
     clock = source.clock
     assert clock is not None, "stamps tell the time"
     times = {new: clock(old) for new, old in zip(numbers, source.numbers, strict=True)}
-    order = sorted(range(len(numbers)), key=numbers.__getitem__)
-    return replace(
-        source,
-        paths=tuple(source.paths[i] for i in order),
-        numbers=tuple(numbers[i] for i in order),
-        clock=times.__getitem__,
-    )
+    ordered, paths = zip(*sorted(zip(numbers, source.paths, strict=True)), strict=True)
+    return replace(source, paths=paths, numbers=ordered, clock=times.__getitem__)

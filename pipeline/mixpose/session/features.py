@@ -29,7 +29,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     Raises BadKeyError unless there are three features or more, none repeated, that the rest fits.
     """
     markers = _markers(table, folder, unit)
-    points = np.zeros((0, 3)) if markers is None else markers.points
+    points = markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
     nodes = len(points) + SEGMENT_NODES * len(segments)
@@ -76,21 +76,21 @@ def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, ke
     parts += [] if normals is None else [normals[: len(points)]]
     rows = np.concatenate(parts, axis=1)
     _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    again = np.flatnonzero(first[back.ravel()] != np.arange(len(rows)))
+    before = first[back.ravel()]
+    again = np.flatnonzero(before != np.arange(len(rows)))
     if len(again):
         k = int(again[0])
-        before = int(first[back.ravel()][k])
         raise BadKeyError(
-            f"point {k + 1} is where point {before + 1} is, alike in all; allowed: each point once",
+            f"point {k + 1} is where point {before[k] + 1} is, alike in all; allowed: each point "
+            "once",
             key,
         )
 
 
-def _names(table: ObjectTable, markers: Markers | None) -> tuple[str, ...]:
+def _names(table: ObjectTable, markers: Markers) -> tuple[str, ...]:
     """What people call the points; nothing where a file gives some no name, or two the same."""
-    given = markers.names if markers is not None and table.names is None else table.names or ()
-    names = tuple(" ".join(name.split()) for name in given)
-    count = 0 if markers is None else len(markers.points)
+    given = markers.names if table.names is None else table.names
+    names, count = tuple(" ".join(name.split()) for name in given), len(markers.points)
     if table.names is None:
         return names if all(names) and len({*names}) == len(names) == count else ()
     if table.file is not None:
@@ -135,22 +135,20 @@ def _gravity(table: ObjectTable) -> Gravity | None:
     return Gravity(table.gravity.direction, table.gravity.sigma)
 
 
-def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers | None:
+def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers:
     if table.file is not None:
         if table.points is not None:
             raise BadKeyError("stands beside points; allowed: one of the two", "file")
         with under("file"):
             return read_marker_file(folder / table.file, unit)
-    if table.points is not None:
-        return Markers(table.points, None)
-    if table.segments is None:
+    if table.points is None and table.segments is None:
         raise BadKeyError('missing; allowed: points, file = "markers.csv" or segments', "points")
-    return None
+    return Markers(np.zeros((0, 3)) if table.points is None else table.points, None)
 
 
-def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
+def _spreads(table: ObjectTable, markers: Markers, count: int) -> Floats:
     """Covariances (N, 3, 3) of all features."""
-    if markers is None or markers.sigma is None:
+    if markers.sigma is None:
         with under("sigma"):
             return covariances(0.0 if table.sigma is None else table.sigma, count)
     if table.sigma is not None:
@@ -241,13 +239,13 @@ def _positive(covariance: Floats) -> Floats:
     return covariance
 
 
-def _normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+def _normals(table: ObjectTable, markers: Markers, count: int) -> Floats | None:
     """Unit normals (N, 3), else those of the marker file where it has all features."""
     normals = table.normals
-    if normals is None and markers is not None and markers.normals is not None:
-        normals = markers.normals if len(markers.normals) == count else None
     if normals is None:
-        return None
+        normals = markers.normals
+        if normals is None or len(normals) != count:
+            return None
     allowed = "one per feature, points first and then segments"
     _require_count(len(normals), "normals", count, "features", allowed, "normals")
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)

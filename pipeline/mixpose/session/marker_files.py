@@ -217,10 +217,10 @@ def read_markers(path: Path) -> Markers:
                 f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
                 "columns of sigma"
             )
-        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
-        values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
-        if not len(values):
+        if len(rows) == 1:
             raise BadKeyError("found no markers below the header")
+        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
+        values = values[:, : len(header) - 1 - _learnt(header)]
         names = _names_of([(line, row[0]) for line, row in rows[1:]])
     spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
     sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
