@@ -20,14 +20,9 @@ from mixpose.errors import RecordingError
 from mixpose.frames.containers import container_of
 from mixpose.records import Image
 
-# How long a stream may take to open, and then to deliver its next frame.
-PATIENCE_S = 10.0
-
-# Of a pipe: a raw frame in one piece; else writer and reader take turns for each 64 kB of it.
-_PIPE_BYTES = 2**20
-
-# Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
-_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
+PATIENCE_S = 10.0  # that a stream may take to open, and then to deliver its next frame
+_PIPE_BYTES = 2**20  # a raw frame in one piece; else writer and reader take turns for each 64 kB
+_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")  # of videos as FFmpeg tags them: 8 and 16 bits
 
 
 class NotOpenedError(RecordingError):

@@ -17,8 +17,7 @@ _MP4_BOXES = frozenset(
     b"ftyp moov mdat free skip wide moof mfra sidx styp uuid meta udta pnot prft emsg PICT".split()
 )
 _EBML_HEADER = b"\x1a\x45\xdf\xa3"
-# Writers pad and count differently; frames are never this small.
-_SLACK_BYTES = 8
+_SLACK_BYTES = 8  # writers pad and count differently; frames are never this small
 
 
 def container_of(path: Path) -> Container | None:

@@ -33,17 +33,12 @@ _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"
 _FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
 _FAREWELL_S = 1.0
 
-STALLED_S = 3.0
-"""How long the others wait for a source that has given frames before."""
-
-RETURN_S = 60.0
-"""How long a source that has given frames may be away, until the run ends."""
-
+STALLED_S = 3.0  # that the others wait for a source that has given frames before
+RETURN_S = 60.0  # that a source that has given frames may be away, until the run ends
 _KEPT = 8  # frames of each source to choose from where several are paired
 _AGAIN_S = 0.5  # between two attempts to open it
 
-# RTP and MPEG transport streams carry the sender's clock; multipart JPEG and bare streams do not,
-# and FFmpeg makes their stamps up from a nominal rate
+# these carry the sender's clock; stamps of other streams FFmpeg makes up from a nominal rate
 _STAMPED = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
 
 

@@ -24,9 +24,7 @@ from mixpose.frames.tables import DetectionTable, open_table
 from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
-# A scheme has two letters or more; one letter is a drive.
-_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
-
+_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # one letter is a drive
 _SHOWN = 4  # names of files that a message lists
 
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {

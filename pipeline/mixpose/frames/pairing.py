@@ -25,12 +25,8 @@ from mixpose.frames.source import Source, selection
 from mixpose.frames.tables import DetectionTable
 from mixpose.records import FrameSet, RawFrame
 
-READY_BYTES = 2**24
-"""Memory for further frames of a source that wait, decoded."""
-
-MOST_MORE = 13
-"""Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
-
+READY_BYTES = 2**24  # for further frames of a source that wait, decoded
+MOST_MORE = 13  # of these: a pose may then take as long as sixteen others and delay no decoder
 _PART = 2  # of the usual distance of frames a half: farther apart they are different moments
 
 

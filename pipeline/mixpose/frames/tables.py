@@ -28,12 +28,10 @@ _COORDINATES: dict[SensorKind, tuple[str, ...]] = {
     "cloud": ("x", "y", "z"),
 }
 
-# Squares of larger numbers overflow; shares of smaller weights are lost beside others.
-_LARGEST = 1e12
-_SMALLEST_WEIGHT = 1e-12
+_LARGEST = 1e12  # squares of larger numbers overflow
+_SMALLEST_WEIGHT = 1e-12  # shares of smaller ones are lost beside others
 
-# Frame number or time, line in the file, cells.
-_Row: TypeAlias = tuple[float, int, list[str]]
+_Row: TypeAlias = tuple[float, int, list[str]]  # frame number or time, line in the file, cells
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,8 @@ Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
 _LISTED = 5  # frame numbers that a message names
-
-# As many digits as a file name may have.
-_LARGEST_NUMBER = 10**255
-
-# Characters: a profile of a million bins.
-_LONGEST_LINE = 16_000_000
+_LARGEST_NUMBER = 10**255  # as many digits as a file name may have
+_LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
 
 
 @dataclass(frozen=True)

@@ -132,10 +132,7 @@ def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | Non
 
 def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) -> Evaluation:
     compared = {(error.frame, error.object) for error in errors}
-    twists = [(error.frame, error.twist) for error in errors if error.twist is not None]
     trusted = [error for error in errors if error.status == "ok"]
-    sure = [(error.frame, error.twist) for error in trusted if error.twist is not None]
-    best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
     counts = Counter(error.status for error in errors)
     return Evaluation(
         unit=poses.unit or truth.unit,
@@ -145,10 +142,10 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         lost=counts["lost"],
         missing=counts["missing"],
         without_truth=sum((line.frame, line.label) not in compared for line in poses.poses),
-        **_spreads(twists),
-        per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
-        **_spreads(sure, "ok_"),
-        **_spreads(best, "best_"),
+        **_spreads([(error.frame, error.twist) for error in errors]),
+        per_axis_rms=_per_axis_rms([error.twist for error in errors if error.twist is not None]),
+        **_spreads([(error.frame, error.twist) for error in trusted], "ok_"),
+        **_spreads([(error.frame, error.best_twist) for error in errors], "best_"),
         nees=consistency.consistency(
             [(e.nees, e.dimensions) for e in trusted if e.nees is not None]
         ),
@@ -244,12 +241,12 @@ def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
     return twists[nearest], answers[nearest // len(poses)]
 
 
-def _spreads(twists: Sequence[tuple[int, Floats]], of: str = "") -> dict[str, Any]:
+def _spreads(twists: Sequence[tuple[int, Floats | None]], of: str = "") -> dict[str, Any]:
     """Spread of the angles in degrees and of the distances of errors, by their field."""
-    errors = np.array([twist for _, twist in twists]).reshape(-1, 2, 3)
+    frames = [frame for frame, twist in twists if twist is not None]
+    errors = np.array([twist for _, twist in twists if twist is not None]).reshape(-1, 2, 3)
     distance, angle = np.linalg.norm(errors, axis=2).T
     found = {f"{of}rotation_deg": np.degrees(angle), f"{of}translation": distance}
-    frames = [frame for frame, _ in twists]
     return {name: _spread(frames, values) for name, values in found.items()}
 
 

@@ -22,8 +22,7 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 
-_GAP = 2.5
-"""Intervals of frames that a body is followed through: one frame may be missing."""
+_GAP = 2.5  # intervals of frames that a body is followed through: one frame may be missing
 
 
 def truth_of_then(truth: PoseFile, poses: PoseFile) -> PoseFile:

@@ -15,8 +15,7 @@ from mixpose.poses.header import FORMAT, VERSION
 from mixpose.records import Estimate, Floats, Hypothesis, Label, MeasuredPoint, SensorReport, Status
 from mixpose.units import UNITS_PER_METRE
 
-# Files by other people round their rotations to a few digits.
-RIGID_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-3  # files by other people round their rotations to a few digits
 _LARGEST = 1e100  # squares of larger lengths would overflow
 
 

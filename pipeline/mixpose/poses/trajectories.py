@@ -26,15 +26,11 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Mask
 from mixpose.units import length_ratio
 
-TRC_MARK = "by mixpose"
-"""In the first line of files that mixpose wrote."""
-
+TRC_MARK = "by mixpose"  # in the first line of files that mixpose wrote
 MARKS = {"trc": ("PathFileType\t", TRC_MARK), "c3d": ("\x02P", "mixpose")}
 """How files of a format begin, and what stands further on in those that mixpose wrote."""
 
-LAST_FRAME = 2**16 - 2
-"""Frames are numbered from 1, in 16 bits; some readers count one beyond the last."""
-
+LAST_FRAME = 2**16 - 2  # numbers from 1, in 16 bits; some readers count one beyond the last
 _STAMPED = 1000  # from frame to frame, as a rule: these are stamps, in us or ns
 _FARTHEST = 10**15  # frames that a gap counts as, more than fit in any file
 _SENSORS = 7  # that a bit each says of whether they measured a point

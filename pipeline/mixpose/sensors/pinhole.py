@@ -14,7 +14,6 @@ from mixpose.sensors.distortion import LensDistortion
 
 # Of a strong lens OpenCV's five rounds leave a pixel.
 _UNDONE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-
 NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
 
 

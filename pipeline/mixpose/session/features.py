@@ -18,7 +18,6 @@ from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, is_number, num
 from mixpose.units import Unit
 
 FEWEST_FEATURES = 3
-
 _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 
 

@@ -32,14 +32,11 @@ _ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterT
 NDI_MARK = b"NDI\0"
 _CHECKSUM, _SUMMED_FROM, _COUNT, _POSITIONS = 4, 6, 28, 72
 _MOST_NDI = 20
-
 _VICON_TARGET = "TargetLocalPointToWorldPoint"
-
 _HEADER = ["name", "x", "y", "z"]
 _SIGMA_COLUMNS = (0, 1, 3, 9)
-
+# of a table that `mixpose learn` wrote: how well markers are known, for people
 LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
-"""Columns of a table that `mixpose learn` wrote: how well markers are known, for people."""
 
 
 def read_marker_file(path: Path, unit: Unit) -> Markers:

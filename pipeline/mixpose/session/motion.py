@@ -10,11 +10,8 @@ from mixpose.rigid import from_parts, is_rigid, nearest_rigid
 from mixpose.session.messages import BadKeyError, one_of
 from mixpose.session.schema_sensors import Placement
 
-# A rotation written with four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4.
-ROUNDING = 2e-4
-# Scaling a quaternion to length 1 leaves its rotation as it is, so three decimals will do.
-_QUATERNION_LENGTH = 2e-3
-
+ROUNDING = 2e-4  # a rotation of four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4
+_QUATERNION_LENGTH = 2e-3  # scaling one leaves its rotation as it is: three decimals will do
 _ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
 
 

@@ -21,8 +21,7 @@ from mixpose.session.schema_sensors import ExtractTable, Motion, Placement, Posi
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, Free, array_of
 from mixpose.units import Unit
 
-MOST_ALIKE = 1000
-"""Identical bodies that a session may have."""
+MOST_ALIKE = 1000  # identical bodies that a session may have
 
 
 class GravityTable(Table):

@@ -32,7 +32,6 @@ _SOURCE_ALLOWED = (
 )
 LONGEST_DELAY_S = 1.0
 _THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
-
 MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 RESOLUTION_FORM = "[width, height], two positive integers"
 

@@ -27,9 +27,8 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from mixpose import rigid
 from mixpose.records import Floats, Indices, Mask
 
+# what takes white noise, and the order of that derivative
 ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
-"""What takes white noise, and the order of that derivative."""
-
 # [ω] of x -> ω × x is ω of these, row by row
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
