@@ -7,7 +7,6 @@ lose half a pixel.  Lengths are in no unit, as structure from motion has none.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import PurePosixPath
 from typing import TypeAlias
@@ -30,29 +29,18 @@ _Placed: TypeAlias = dict[str, tuple[str, Floats | None]]
 """By name: the number of the camera, and where it stands."""
 
 
-@dataclass(frozen=True)
-class _Lens:
-    """Where the parameters of a model stand: one or two focal lengths, and its distortion."""
-
-    model: CameraModel
-    focal_lengths: int
-    distortion: tuple[int | None, ...]  # places in OpenCV's order; None for a zero
-
-    @property
-    def count(self) -> int:
-        return self.focal_lengths + 2 + sum(place is not None for place in self.distortion)
-
-
-_LENSES = {
-    "SIMPLE_PINHOLE": _Lens("pinhole", 1, ()),
-    "PINHOLE": _Lens("pinhole", 2, ()),
-    "SIMPLE_RADIAL": _Lens("pinhole", 1, (0, None, None, None)),
-    "RADIAL": _Lens("pinhole", 1, (0, 1, None, None)),
-    "OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "SIMPLE_RADIAL_FISHEYE": _Lens("fisheye", 1, (0, None, None, None)),
-    "RADIAL_FISHEYE": _Lens("fisheye", 1, (0, 1, None, None)),
-    "OPENCV_FISHEYE": _Lens("fisheye", 2, (0, 1, 2, 3)),
+# of a model: that of OpenCV; how many focal lengths and coefficients it has, and of how many these
+# are the first, the others being zero
+_LENSES: dict[str, tuple[CameraModel, int, int, int]] = {
+    "SIMPLE_PINHOLE": ("pinhole", 1, 0, 0),
+    "PINHOLE": ("pinhole", 2, 0, 0),
+    "SIMPLE_RADIAL": ("pinhole", 1, 1, 4),
+    "RADIAL": ("pinhole", 1, 2, 4),
+    "OPENCV": ("pinhole", 2, 4, 4),
+    "FULL_OPENCV": ("pinhole", 2, 8, 8),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, 1, 4),
+    "RADIAL_FISHEYE": ("fisheye", 1, 2, 4),
+    "OPENCV_FISHEYE": ("fisheye", 2, 4, 4),
 }
 
 
@@ -193,17 +181,15 @@ def _intrinsics(row: list[str]) -> Intrinsics:
         raise BadKeyError(found(" ".join(row), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"))
     if row[1] not in _LENSES:
         raise BadKeyError(found(row[1], one_of(_LENSES)))
-    lens = _LENSES[row[1]]
-    values = _floats(row[4:])
-    if len(values) != lens.count:
-        raise BadKeyError(
-            f"found {len(values)} parameters of {row[1]}; allowed: {lens.count} of them"
-        )
-    fx, fy = values[0], values[lens.focal_lengths - 1]
-    cx, cy, *rest = values[lens.focal_lengths :]
+    model, focal_lengths, given, of = _LENSES[row[1]]
+    values, count = _floats(row[4:]), focal_lengths + 2 + given
+    if len(values) != count:
+        raise BadKeyError(f"found {len(values)} parameters of {row[1]}; allowed: {count} of them")
+    fx, fy = values[0], values[focal_lengths - 1]
+    cx, cy, *rest = values[focal_lengths:]
     K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
-    D = np.array([0.0 if place is None else rest[place] for place in lens.distortion])
-    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), lens.model)
+    D = np.array([*rest, *[0.0] * (of - given)])
+    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), model)
 
 
 COLMAP = Format(
