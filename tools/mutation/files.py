@@ -312,7 +312,7 @@ _FORMATS = (
     Mutant(
         "poses-csv-lower-triangle",
         "poses/csvtable.py",
-        "plain(estimate.covariance[_UPPER])",
+        "plain(estimate.covariance[np.triu_indices(6)])",
         "plain(estimate.covariance[np.tril_indices(6)])",
         "covariances stand under the names of others",
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from itertools import combinations_with_replacement as pairs
 from typing import Any, TextIO
 
 import numpy as np
@@ -14,20 +15,13 @@ from mixpose.poses.header import Header
 from mixpose.poses.writing import PoseWriter, plain, pose_of
 from mixpose.records import Estimate
 
-_UPPER = np.triu_indices(6)
-
 FRAME_COLUMNS = ("frame", "time_s", "object", "status", "unit")
 POSE_COLUMNS = (
     *("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     *("rotvec_x", "rotvec_y", "rotvec_z"),  # radians
 )
-COVARIANCE_COLUMNS = tuple(
-    f"cov_{rigid.TWIST_NAMES[i]}_{rigid.TWIST_NAMES[j]}" for i, j in zip(*_UPPER)
-)
-TIP_COLUMNS = (
-    *("tip_x", "tip_y", "tip_z"),
-    *("tip_cov_x_x", "tip_cov_x_y", "tip_cov_x_z", "tip_cov_y_y", "tip_cov_y_z", "tip_cov_z_z"),
-)
+COVARIANCE_COLUMNS = tuple(f"cov_{a}_{b}" for a, b in pairs(rigid.TWIST_NAMES, 2))
+TIP_COLUMNS = ("tip_x", "tip_y", "tip_z", *(f"tip_cov_{a}_{b}" for a, b in pairs("xyz", 2)))
 SENSOR_COLUMNS = ("used", "explained", "rms")
 
 
@@ -98,7 +92,9 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
     numbers = np.concatenate([T[:3, 3], turn, Rotation.from_quat(turn).as_rotvec()])
     cells = dict(zip(POSE_COLUMNS, plain(numbers), strict=True))
     if estimate.covariance is not None:
-        cells |= zip(COVARIANCE_COLUMNS, plain(estimate.covariance[_UPPER]), strict=True)
+        cells |= zip(
+            COVARIANCE_COLUMNS, plain(estimate.covariance[np.triu_indices(6)]), strict=True
+        )
     return cells
 
 
