@@ -42,9 +42,8 @@ class ImageSequence(Source):
     kind: ClassVar[SourceKind] = "images"
     ahead: ClassVar[int] = 3
 
-    # the files and their frame numbers, ascending; at least one
-    paths: tuple[Path, ...]
-    numbers: tuple[int, ...]
+    paths: tuple[Path, ...]  # at least one
+    numbers: tuple[int, ...]  # of the frames, ascending
     resolution: tuple[int, int] | None  # px of every image; None means that of the first one read
     clock: Clock | None  # gives the time of a frame number
     is_stamped: bool = False  # whether the numbers are times in ns, which the clock goes by

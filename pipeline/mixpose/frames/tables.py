@@ -56,8 +56,7 @@ class DetectionTable(Source):
     columns: tuple[str, ...]  # its header
     coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
     clock: Clock | None  # gives the time of a frame number; None means the times in the table
-    # numbers of its moments, where it has times alone and others have moments that it lacks
-    places: Sequence[int] = range(2**62)
+    places: Sequence[int] = range(2**62)  # numbers of its moments, where it has times alone
     has_fps: bool = False  # whether the session states a rate, which times of its own stand for
 
     @property

@@ -51,9 +51,7 @@ class Pivoting(NamedTuple):
 
     poses: Floats  # (N, 4, 4): of the body
     covariances: Floats  # (N, 6, 6)
-    # (N, 4, 4): of the body that the point is fixed in; of the world these are the identity, and
-    # their covariances zero
-    references: Floats
+    references: Floats  # (N, 4, 4): of the body that the point is fixed in; identities: the world
     reference_covariances: Floats  # (N, 6, 6)
 
     def part(self, some: Mask) -> Pivoting:
@@ -72,9 +70,7 @@ class Tip:
     expected: float  # the same by the covariances of the poses
     held_out: float  # and of poses that were held out
     scale: float  # squared residuals by covariances; above 1 it is in the covariance of the tip
-    # variance of the tip by parts of the recording that are held out, against that by residuals;
-    # above 1 where errors last, and then in the covariance, with what so few parts tell it to
-    lasting: float
+    lasting: float  # variance by parts held out, against that by residuals; above 1: errors last
     frames: int  # poses that count
     left_out: int  # those that lie too far off
     turns_deg: Floats  # (3,): root mean square turns across the three directions, least first

@@ -32,9 +32,7 @@ class CalibratedCamera:
 
     name: str
     intrinsics: Intrinsics
-    # (4, 4), maps coordinates that all cameras of the file share to those of the camera; None where
-    # the file does not say
-    T_camera_rig: Floats | None = None
+    T_camera_rig: Floats | None = None  # (4, 4), from what the file's cameras share; None: not said
     unit: Unit | None = None  # of the translation; None where the format does not fix it
     note: str = ""  # what a person should know of it; mostly empty
 
