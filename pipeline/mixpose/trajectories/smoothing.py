@@ -158,15 +158,13 @@ def _segments(
         rows: list[tuple[PoseLine | None, PoseLine, int, float]] = []
         for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
             line = lines[k]
-            if rows and times[k] - rows[-1][3] <= fill_s + _ROUNDED_S:
-                told = lines[last : k + 1]
-                first, between = told[0].frame, [each.frame for each in told[1:-1]]
-                between = _between(rows[-1][2], line.frame, step, between)
+            if rows and times[k] - times[last] <= fill_s + _ROUNDED_S:
+                told, first = lines[last : k + 1], lines[last].frame
+                between = _between(first, line.frame, step, [each.frame for each in told[1:-1]])
                 # frame numbers may be beyond what numbers of NumPy hold
                 since = np.array([each.frame - first for each in told], dtype=np.float64)
                 moments = np.interp([n - first for n in between], since, times[last : k + 1])
-                before = rows[-1][1]
-                rows += [(None, before, n, t) for n, t in zip(between, moments.tolist())]
+                rows += [(None, lines[last], n, t) for n, t in zip(between, moments.tolist())]
             rows.append((line, line, line.frame, float(times[k])))
         own, known, frames, at = zip(*rows, strict=True)
         measured = np.array([each is not None for each in own])
