@@ -243,10 +243,10 @@ class CaptureTimes:
     took longer.
     """
 
-    def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:
+    def __init__(self, address: str | int) -> None:
         self._is_device = isinstance(address, int) or captures.is_device(address)
         self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
-        self._rules = rules
+        self._rules = ClockRules()
         self._last: tuple[float, float] | None = None  # stamp, and least difference
 
     def moment(self, stamp_s: float, arrived: float | None = None) -> Moment:

@@ -143,11 +143,7 @@ def _track(lines: Sequence[PoseLine], times: Floats) -> tracks.Track:
 
 
 def _segments(
-    lines: Sequence[PoseLine],
-    times: Floats,
-    posed: Sequence[int],
-    longest: float,
-    fill_s: float,
+    lines: Sequence[PoseLine], times: Floats, posed: Sequence[int], longest: float, fill_s: float
 ) -> list[_Segment]:
     """Lines with poses, cut at the longest gaps, with the frames between that are to be filled."""
     step = int(np.median(np.diff([lines[k].frame for k in posed])))
