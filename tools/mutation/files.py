@@ -160,7 +160,7 @@ _CALIBRATIONS = (
         "session-binned-images-pass",
         "session/calibration/ros.py",
         "if table.get(key, 0) not in whole:",
-        "if table.get(key, 0) < 0:",
+        'if kind == "cropped" and table.get(key, 0) not in whole:',
         "the camera matrix of the whole image is used for binned ones",
     ),
     Mutant(
