@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from mixpose.session import load_session
-from mixpose.session.schema_common import Table
+from mixpose.session.schema_sensors import Table
 from mixpose.tracking import Rules
 
 ROOT = Path(__file__).resolve().parents[1]

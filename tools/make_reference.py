@@ -33,16 +33,18 @@ from mixpose.session.schema import (
     SessionTable,
     StartTable,
 )
-from mixpose.session.schema_common import ExtractTable, Placement, Table
 from mixpose.session.schema_sensors import (
     CalibrationErrorTable,
     CalibrationTable,
     CameraTable,
     CloudTable,
+    ExtractTable,
     LaterationTable,
     ParallelTable,
     PlacedTable,
+    Placement,
     SensorTable,
+    Table,
 )
 from mixpose.session.validation import allowed_for
 

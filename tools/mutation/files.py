@@ -144,7 +144,7 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-equidistant-is-pinhole",
-        "session/calibration/pieces.py",
+        "session/intrinsics.py",
         '"equidistant": "fisheye"',
         '"equidistant": "pinhole"',
         "a fisheye calibration is used for a pinhole camera",
@@ -159,8 +159,8 @@ _CALIBRATIONS = (
     Mutant(
         "session-binned-images-pass",
         "session/calibration/ros.py",
-        "if content.get(key, 0) not in (0, 1):",
-        "if content.get(key, 0) < 0:",
+        "if table.get(key, 0) not in whole:",
+        'if kind == "cropped" and table.get(key, 0) not in whole:',
         "the camera matrix of the whole image is used for binned ones",
     ),
     Mutant(
@@ -312,7 +312,7 @@ _FORMATS = (
     Mutant(
         "poses-csv-lower-triangle",
         "poses/csvtable.py",
-        "plain(estimate.covariance[_UPPER])",
+        "plain(estimate.covariance[np.triu_indices(6)])",
         "plain(estimate.covariance[np.tril_indices(6)])",
         "covariances stand under the names of others",
     ),
@@ -333,7 +333,7 @@ _FORMATS = (
     Mutant(
         "poses-beside-a-body-that-errs-in-nothing",
         "poses/estimates.py",
-        "C = line.covariance + moved @ reference.covariance @ moved.T",
+        "C = line.covariance + rigid.covariance_at(reference.covariance, arm)",
         "C = line.covariance",
         "a tool on a patient is told surer than it is",
         (_RELATIVE,),
@@ -341,8 +341,8 @@ _FORMATS = (
     Mutant(
         "poses-beside-a-body-that-does-not-turn-them",
         "poses/estimates.py",
-        "moved[:3, 3:] = np.cross(np.eye(3), arm).T",
-        "pass",
+        "rigid.covariance_at(reference.covariance, arm)",
+        "reference.covariance",
         "what a turn of the patient moves at the tool is not in the covariance",
         (_RELATIVE,),
     ),

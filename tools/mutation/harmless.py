@@ -216,7 +216,7 @@ HARMLESS: tuple[Harmless, ...] = (
         "any width that a line has room for will do",
     ),
     Harmless(
-        "sensors/facing.py",
+        "sensors/cloud.py",
         "return np.asarray(cosines > (edge_on if sensor.dimension > 1 else 0.0))",
         "return np.asarray(cosines >= (edge_on if sensor.dimension > 1 else 0.0))",
         "a face is exactly edge-on only by rounding",

@@ -68,21 +68,21 @@ _FORMATS = (
 _IMPORTING = (
     Mutant(
         "importing-translations-keep-their-unit",
-        "importing/gather.py",
+        "importing.py",
         "from_parts(T[:3, :3], factor * T[:3, 3])",
         "from_parts(T[:3, :3], T[:3, 3])",
         "a rig in metres is written as millimetres",
     ),
     Mutant(
         "importing-copies-pass",
-        "importing/gather.py",
+        "importing.py",
         "if _same(a, b):",
         "if False:",
         "a camera that was copied by mistake is not noticed",
     ),
     Mutant(
         "importing-worlds-mixed",
-        "importing/gather.py",
+        "importing.py",
         "if len(placed) > 1:",
         "if len(placed) > 2:",
         "cameras of two rigs are put into one world",

@@ -152,7 +152,7 @@ MUTANTS = (
     Mutant(
         "poses-resumed-with-another-step",
         "poses/jsonl.py",
-        '        "options": header.options,\n',
+        '        **_sometimes("options", dict(header.options)),\n',
         "",
         "one file has poses of every frame and of every second one, with labels and without",
         ("test_cli_messages.py",),
@@ -167,7 +167,7 @@ MUTANTS = (
     ),
     Mutant(
         "importing-lengths-of-tables-in-silence",
-        "importing/gather.py",
+        "importing.py",
         "    if lengths in (None, unit):",
         "    if True:",
         "a body in metres is a thousand times too small, though its unit was said",

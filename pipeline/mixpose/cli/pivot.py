@@ -15,8 +15,8 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.session import load_session
 from mixpose.session.rewriting import document_of, objects_of, plain, put, text_of
-from mixpose.trajectories.lines import require_covariances, require_frames_once
 from mixpose.trajectories.pivot import Pivoting, PivotRules, Tip, find_tip, fixed_in, fixed_in_world
+from mixpose.trajectories.track import require_covariances, require_frames_once
 
 _DIGITS = 8
 _SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few percent, parts 1.7

@@ -20,14 +20,9 @@ from mixpose.errors import RecordingError
 from mixpose.frames.containers import container_of
 from mixpose.records import Image
 
-# How long a stream may take to open, and then to deliver its next frame.
-PATIENCE_S = 10.0
-
-# Of a pipe: a raw frame in one piece; else writer and reader take turns for each 64 kB of it.
-_PIPE_BYTES = 2**20
-
-# Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
-_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
+PATIENCE_S = 10.0  # that a stream may take to open, and then to deliver its next frame
+_PIPE_BYTES = 2**20  # a raw frame in one piece; else writer and reader take turns for each 64 kB
+_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")  # of videos as FFmpeg tags them: 8 and 16 bits
 
 
 class NotOpenedError(RecordingError):
@@ -61,11 +56,10 @@ def _is(kind: Callable[[int], bool], address: str) -> bool:
 
 @contextmanager
 def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
-    """A capture that is released at the end; grey videos keep their depth.
+    """A capture of a file, pipe, device, address (with ``://``) or camera's index, for a while.
 
-    `address` is the path of a file, a pipe or a device, the address of a stream (with ``://``), or
-    the index of a camera. Raises RecordingError if it does not open, a stream or a pipe within
-    `PATIENCE_S`.
+    Grey videos keep their depth. Raises RecordingError if it does not open, a stream or a pipe
+    within `PATIENCE_S`.
     """
     quieten_opencv()
     with contextlib.ExitStack() as stack:
@@ -117,10 +111,7 @@ def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
 
 
 def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
-    """Go to the next frame; False where there is none.
-
-    Raises SilentError if a stream falls silent without ending.
-    """
+    """Go to the next frame; False at the end, SilentError where a stream falls silent without."""
     began = time.monotonic()
     found = capture.grab()
     silence = time.monotonic() - began
@@ -137,8 +128,7 @@ class ColourRoom:
     To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
     """
 
-    # (H, W, 3 or 4), the last coloured frame; None before the first
-    image: cv2.typing.MatLike | None = None
+    image: cv2.typing.MatLike | None = None  # (H, W, 3 or 4), the last coloured frame
 
 
 def retrieve(
@@ -177,13 +167,10 @@ def name_of(address: str | int) -> str:
 
 
 def quieten_opencv() -> None:
-    """Turn off the messages of OpenCV and of its FFmpeg backend.
+    """Turn off the messages of OpenCV and of its FFmpeg backend, but for whoever set their levels.
 
-    A recording that cannot be read is one line on standard error, written by mixpose; the
-    decoders' own account of the same fault would surround it with dozens more.  Whoever set
-    ``OPENCV_LOG_LEVEL`` or ``OPENCV_FFMPEG_LOGLEVEL`` wants to see it and keeps it.
-
-    FFmpeg's level counts only before the first video is opened, so call this before that.
+    They would surround mixpose's own line on what cannot be read with dozens more. FFmpeg's level
+    counts only before the first video is opened.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     if "OPENCV_LOG_LEVEL" not in os.environ:

@@ -1,9 +1,8 @@
 """Whether a video file is whole, told from its outermost structure.
 
-A decoder reads a truncated file as far as it goes and reports its end like any other.  How many
-frames a container promises does not tell either: some only estimate it, and a trimmed MP4 still
-counts the frames that its edit list hides.  But AVI, MP4 and Matroska files state the sizes of
-their outermost parts, and these must fit into the file.
+A decoder reports the end of a truncated file like any other, and how many frames a container
+promises may be an estimate.  But AVI, MP4 and Matroska files state the sizes of their outermost
+parts, and these must fit into the file.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ _MP4_BOXES = frozenset(
     b"ftyp moov mdat free skip wide moof mfra sidx styp uuid meta udta pnot prft emsg PICT".split()
 )
 _EBML_HEADER = b"\x1a\x45\xdf\xa3"
-# Writers pad and count differently; frames are never this small.
-_SLACK_BYTES = 8
+_SLACK_BYTES = 8  # writers pad and count differently; frames are never this small
 
 
 def container_of(path: Path) -> Container | None:
@@ -34,10 +32,9 @@ def container_of(path: Path) -> Container | None:
 
 
 def missing_bytes(path: Path) -> int:
-    """How many bytes a video file lacks of those that its outermost parts promise.
+    """How many bytes a video file lacks of those that its outermost parts promise, as far as known.
 
-    0 for a whole file, and for one whose structure does not say. Raises OSError if it cannot be
-    read.
+    Raises OSError if it cannot be read.
     """
     container = container_of(path)
     if container is None:

@@ -42,14 +42,11 @@ class ImageSequence(Source):
     kind: ClassVar[SourceKind] = "images"
     ahead: ClassVar[int] = 3
 
-    # the files and their frame numbers, ascending; at least one
-    paths: tuple[Path, ...]
-    numbers: tuple[int, ...]
-    # size of every image in px; None means that of the first one read
-    resolution: tuple[int, int] | None
+    paths: tuple[Path, ...]  # at least one
+    numbers: tuple[int, ...]  # of the frames, ascending
+    resolution: tuple[int, int] | None  # px of every image; None means that of the first one read
     clock: Clock | None  # gives the time of a frame number
-    # whether the numbers are times in nanoseconds, which the clock goes by
-    is_stamped: bool = False
+    is_stamped: bool = False  # whether the numbers are times in ns, which the clock goes by
     has_fps: bool = False  # whether the session states a rate
 
     @property
@@ -138,10 +135,9 @@ def _time_of_stamp(stamp: int) -> float:
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
-    """Frame numbers of images.
+    """Frame numbers of images: what names without extension end in, if all do and no two alike.
 
-    The number that a name without its extension ends in, where every name ends in one and no two
-    are alike; else the place in `paths`, from 0.
+    Else the place in `paths`, from 0.
     """
     numbers = [number for number in _endings(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
@@ -175,11 +171,9 @@ def natural_order(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_image(path: Path) -> Image:
-    """Read one image file as grey values (H, W): uint8, uint16 or float32, as deep as the file has
-    them.
+    """Read an image file as grey values (H, W): uint8, uint16 or float32, as deep as the file is.
 
-    Raises RecordingError if the file cannot be read, is cut short, damaged or no image, or holds
-    NaN.
+    Raises RecordingError if it cannot be read, is cut short, damaged or no image, or holds NaN.
     """
     quieten_opencv()
     data = _bytes_of(path)

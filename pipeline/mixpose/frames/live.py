@@ -1,10 +1,8 @@
 """Live sources: cameras and streams that do not wait, of which only the newest frame counts.
 
-A pose that comes late is worth little, so a frame that arrives while the one before it is still
-being estimated is passed over when a newer one is there.  Numbers count all frames that arrived,
-so that those passed over leave gaps.
-
-A source that falls silent is opened again for a while; meanwhile the others go on without it.
+A frame that arrives while the one before it is still being estimated is passed over when a newer
+one is there.  Numbers count all frames that arrived, so that those passed over leave gaps.  A
+source that falls silent is opened again for a while; meanwhile the others go on without it.
 """
 
 from __future__ import annotations
@@ -24,17 +22,8 @@ import cv2
 
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
-from mixpose.frames.capture import (
-    NotOpenedError,
-    SilentError,
-    grab,
-    is_device,
-    is_pipe,
-    name_of,
-    opened,
-    retrieve,
-)
-from mixpose.frames.source import Frames, Source, SourceKind, selection
+from mixpose.frames import capture as captures
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, Moment, RawFrame
 
@@ -44,17 +33,12 @@ _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"
 _FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
 _FAREWELL_S = 1.0
 
-STALLED_S = 3.0
-"""How long the others wait for a source that has given frames before."""
-
-RETURN_S = 60.0
-"""How long a source that has given frames may be away, until the run ends."""
-
+STALLED_S = 3.0  # that the others wait for a source that has given frames before
+RETURN_S = 60.0  # that a source that has given frames may be away, until the run ends
 _KEPT = 8  # frames of each source to choose from where several are paired
 _AGAIN_S = 0.5  # between two attempts to open it
 
-# RTP and MPEG transport streams carry the sender's clock; multipart JPEG and bare streams do not,
-# and FFmpeg makes their stamps up from a nominal rate
+# these carry the sender's clock; stamps of other streams FFmpeg makes up from a nominal rate
 _STAMPED = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
 
 
@@ -62,13 +46,20 @@ def live_address(source: str) -> str | int | None:
     """The camera's index or address where a source is live; None where it is a recording."""
     if camera := _CAMERA.fullmatch(source):
         return int(camera[1])
-    if is_device(source):
+    if captures.is_device(source):
         return source
     scheme, _, rest = source.partition("://")
     if not rest or scheme.lower() not in _SCHEMES:
         return None
     suffix = PurePosixPath(urlsplit(source).path).suffix.lower()
     return None if scheme.lower().startswith("http") and suffix in _FILES else source
+
+
+def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
+    """A camera or a stream, opened when its frames are asked for."""
+    address = live_address(source)
+    assert address is not None, "recognised as live"
+    return LiveSource(address, spec.resolution, clock)
 
 
 @dataclass(frozen=True)
@@ -82,19 +73,17 @@ class LiveSource(Source):
 
     address: str | int  # of a stream or a device, or the index of a camera
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    # gives the time of a frame number; None means when the frame was captured, or arrived where the
-    # source does not tell, in s since the start
-    clock: Clock | None
+    clock: Clock | None  # gives the time of a frame; None: since the start, by its moment, in s
 
     def describe(self) -> str:
         """One line for people."""
-        return f"live {name_of(self.address)}, opened when it is needed"
+        return f"live {captures.name_of(self.address)}, opened when it is needed"
 
     def check_times(self, wanted: range) -> None:
         """Nothing to look for: nobody knows which frames will come."""
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Each time the newest frame, once there is one that has not been given yet.
+        """The newest frame, each time there is one that has not been given yet.
 
         Raises RecordingError if the source does not open or falls silent.
         """
@@ -106,11 +95,10 @@ class LiveSource(Source):
 def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[FrameSet, None, None]:
     """The newest frames of all sources, once each has one that was not given yet.
 
-    The frames of a set are those that were captured nearest to the latest moment which all have
-    reached: at most half a period apart, however long each was on its way. Sets are numbered by the
-    source that has given most frames. One that has ended is left out of further sets, and one that
-    is silent until it gives frames again. Raises RecordingError if a source does not open or falls
-    silent.
+    Those of a set were captured nearest to the latest moment which all have reached: at most half a
+    period apart. Sets are numbered by the source that has given most frames. One that has ended is
+    left out of further sets, and one that is silent until it gives frames again. Raises
+    RecordingError if a source does not open or falls silent.
     """
     began = time.monotonic()
     with ExitStack() as stack:
@@ -207,10 +195,12 @@ class _Reader:
             try:
                 self._read_on()
                 return
-            except (SilentError, NotOpenedError):
+            except (captures.SilentError, captures.NotOpenedError):
                 heard = time.monotonic() if self._count > before else heard
                 address = self._source.address
-                lost = isinstance(address, str) and is_pipe(address)  # what it held is gone
+                lost = isinstance(address, str) and captures.is_pipe(
+                    address
+                )  # what it held is gone
                 if lost or not self._count or time.monotonic() - heard > RETURN_S:
                     raise
             if self._stop.wait(_AGAIN_S):
@@ -219,18 +209,18 @@ class _Reader:
     def _read_on(self) -> None:
         address, clock = self._source.address, self._source.clock
         times = CaptureTimes(address)
-        with opened(address) as capture:
-            while not self._stop.is_set() and grab(capture, address):
+        with captures.opened(address) as capture:
+            while not self._stop.is_set() and captures.grab(capture, address):
                 number = self._count
                 moment = times.moment(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-                image = retrieve(capture, address, number, self._source.resolution)
+                image = captures.retrieve(capture, address, number, self._source.resolution)
                 time_s = moment.seconds - self._began if clock is None else clock(number)
                 with self._changed:
                     self._frames.append(RawFrame(number, time_s, image, moment))
                     self._changed.notify_all()
                 self._count += 1
         if isinstance(address, int) and not self._stop.is_set():
-            raise RecordingError(f"{name_of(address)}: gives no frames any more")
+            raise RecordingError(f"{captures.name_of(address)}: gives no frames any more")
 
 
 @dataclass(frozen=True)
@@ -246,17 +236,17 @@ class ClockRules:
 class CaptureTimes:
     """Tells from the stamps of a live source when its frames were captured.
 
-    A camera at this machine (V4L2) stamps frames by the machine's own clock. Stamps of a stream are
-    of a clock that is off by an unknown time; as no frame arrives before it was captured, the least
-    difference seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor
-    Synchronization Problem*, IROS 2010). Moments are then late by the shortest transmission, and
-    free of what others took longer.
+    A camera at this machine (V4L2) stamps frames by the machine's own clock, a stream by a clock
+    that is off by an unknown time. As no frame arrives before it was captured, the least difference
+    seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor Synchronization
+    Problem*, IROS 2010): moments are late by the shortest transmission, and free of what others
+    took longer.
     """
 
-    def __init__(self, address: str | int, rules: ClockRules = ClockRules()) -> None:
-        self._is_device = isinstance(address, int) or is_device(address)
+    def __init__(self, address: str | int) -> None:
+        self._is_device = isinstance(address, int) or captures.is_device(address)
         self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
-        self._rules = rules
+        self._rules = ClockRules()
         self._last: tuple[float, float] | None = None  # stamp, and least difference
 
     def moment(self, stamp_s: float, arrived: float | None = None) -> Moment:

@@ -17,22 +17,20 @@ import numpy as np
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.capture import is_pipe
 from mixpose.frames.images import IMAGE_SUFFIXES, ImageSequence, natural_order, open_images
-from mixpose.frames.live import LiveSource, live_address
+from mixpose.frames.live import live_address, open_live
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
 from mixpose.frames.tables import DetectionTable, open_table
 from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
-# A scheme has two letters or more; one letter is a drive.
-_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
-
+_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # one letter is a drive
 _SHOWN = 4  # names of files that a message lists
 
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
     "video": lambda spec, places, clock: open_video(spec, places[0], clock),
-    "live": lambda spec, places, clock: _open_live(spec, places[0], clock),
+    "live": lambda spec, places, clock: open_live(spec, places[0], clock),
     "detections": lambda spec, places, clock: open_table(spec, Path(places[0]), clock),
     "profiles": lambda spec, places, clock: open_profiles(spec, Path(places[0]), clock),
 }
@@ -68,8 +66,8 @@ def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
 def open_source(spec: SourceSpec) -> Source:
     """Find the recording of a sensor and open it, without reading more than its beginning.
 
-    Raises SessionError if the options of the source contradict each other, or do not fit the
-    recording. Raises RecordingError if there is no such recording or its beginning cannot be read.
+    Raises SessionError if its options contradict each other or do not fit it, and RecordingError if
+    it is not there or cannot be read.
     """
     clock = clock_of(spec)
     try:
@@ -88,18 +86,8 @@ def open_source(spec: SourceSpec) -> Source:
 
 
 def files_of(spec: SourceSpec) -> list[str]:
-    """The files that a recording is read from, or the address of a camera or stream.
-
-    Raises RecordingError if there is no such recording.
-    """
+    """The files of a recording, or the address of a live one; RecordingError if there is none."""
     return _recognise(spec)[1]
-
-
-def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
-    """A camera or a stream, opened when its frames are asked for."""
-    address = live_address(source)
-    assert address is not None, "recognised as live"
-    return LiveSource(address, spec.resolution, clock)
 
 
 def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
@@ -107,33 +95,25 @@ def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
     source = spec.source
     if not isinstance(source, str) and len(source) == 1:
         source = source[0]
-    if isinstance(source, str) and live_address(source) is not None:
-        return "live", [source]
-    if isinstance(source, str) and _STREAM.match(source):
-        return "video", [source]
-    kind, paths = _recognise_files(spec, source)
-    return kind, [str(path) for path in paths]
-
-
-def _recognise_files(
-    spec: SourceSpec, source: str | tuple[str, ...]
-) -> tuple[SourceKind, list[Path]]:
     if not isinstance(source, str):
         return "images", _listed(spec, source)
+    if live_address(source) is not None:
+        return "live", [source]
+    if _STREAM.match(source):
+        return "video", [source]
     path = spec.base / source
     if source and path.is_dir():
         images = [each for each in path.iterdir() if _is_image(each) and each.is_file()]
         if not images:
             raise RecordingError(f"{path}: no images in this folder; {_looked_in(path / '*')}")
-        return "images", natural_order(images)
-    if is_pipe(str(path)):
-        return "video", [path]
-    if path.is_file():
-        return _kind_of_file(spec, path), [path]
-    return _matches(spec, source)
+        return "images", list(map(str, natural_order(images)))
+    if is_pipe(str(path)) or path.is_file():
+        return _kind_of_file(spec, path), [str(path)]
+    kind, files = _matches(spec, source)
+    return kind, list(map(str, files))
 
 
-def _listed(spec: SourceSpec, source: Sequence[str]) -> list[Path]:
+def _listed(spec: SourceSpec, source: Sequence[str]) -> list[str]:
     """Files of a list, in its own order."""
     if not source:
         raise SessionError(f"sensor {spec.sensor!r}: source: found an empty list of images")
@@ -143,7 +123,7 @@ def _listed(spec: SourceSpec, source: Sequence[str]) -> list[Path]:
             raise RecordingError(
                 f"{path}: no such file, named in the source of {spec.sensor!r}; {_looked_in(path)}"
             )
-    return paths
+    return list(map(str, paths))
 
 
 def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
@@ -203,7 +183,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _kind_of_file(spec: SourceSpec, path: Path) -> SourceKind:
-    suffix = path.suffix.casefold()
+    suffix = "" if is_pipe(str(path)) else path.suffix.casefold()
     if suffix in IMAGE_SUFFIXES:
         return "images"
     if suffix == ".npy":

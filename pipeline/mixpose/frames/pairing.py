@@ -1,8 +1,8 @@
 """Frames of several sensors, joined by their numbers, or by the stamps that they go by.
 
-Robots' recorders name images after the nanosecond they were taken in.  The names then say when, and
-cameras that were triggered together differ by some microseconds: their frames are paired by the
-nearest stamp instead of by equal numbers.  So are those of tables that have times and no numbers.
+Robots' recorders name images after the nanosecond they were taken in, and cameras that were
+triggered together differ by microseconds: such frames, and those of tables that have times and no
+numbers, are paired by the nearest stamp.
 """
 
 from __future__ import annotations
@@ -25,12 +25,8 @@ from mixpose.frames.source import Source, selection
 from mixpose.frames.tables import DetectionTable
 from mixpose.records import FrameSet, RawFrame
 
-READY_BYTES = 2**24
-"""Memory for further frames of a source that wait, decoded."""
-
-MOST_MORE = 13
-"""Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
-
+READY_BYTES = 2**24  # for further frames of a source that wait, decoded
+MOST_MORE = 13  # of these: a pose may then take as long as sixteen others and delay no decoder
 _PART = 2  # of the usual distance of frames a half: farther apart they are different moments
 
 
@@ -40,10 +36,9 @@ def pair(
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
     Numbers are those of ``range(start, stop, step)``, without `start` from the first that there is.
-    One that some sources lack yields a set without them; the time of a set is that of the first
-    sensor, in the order of `sources`, that has one. Of each source only a few frames are in memory,
-    more of small ones, decoded ahead in a thread of its own where that pays; the threads end with
-    this generator.
+    A set lacks the sources that lack its number; its time is that of the first sensor, in the order
+    of `sources`, that has one. Only a few frames of each source are in memory, decoded ahead in a
+    thread where that pays; threads end with this generator.
 
     Raises at once: SessionError if `step` is less than 1, or live sources and recordings are mixed;
     RecordingError if a table of times lacks rows for frames of that range. What cannot be read is a
@@ -160,10 +155,5 @@ def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
     clock = source.clock
     assert clock is not None, "stamps tell the time"
     times = {new: clock(old) for new, old in zip(numbers, source.numbers, strict=True)}
-    order = sorted(range(len(numbers)), key=numbers.__getitem__)
-    return replace(
-        source,
-        paths=tuple(source.paths[i] for i in order),
-        numbers=tuple(numbers[i] for i in order),
-        clock=times.__getitem__,
-    )
+    ordered, paths = zip(*sorted(zip(numbers, source.paths, strict=True)), strict=True)
+    return replace(source, paths=paths, numbers=ordered, clock=times.__getitem__)

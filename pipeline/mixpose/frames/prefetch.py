@@ -16,11 +16,10 @@ def prefetch(
 ) -> Generator[T, None, None]:
     """Yield `items` in order while a worker thread fetches the next ones.
 
-    Pays where fetching releases the interpreter lock, as decoding images does. The thread starts
-    with the first ``next`` and has ended when this generator is exhausted, closed or collected;
-    `items` is advanced, and closed if it can be, in that thread only. An exception of theirs comes
-    out in its place, after the items before it. At most `depth` items wait, one more may be on its
-    way; `more`, told the first item, says how many more may wait.
+    The thread has ended when this generator is exhausted, closed or collected; `items` is advanced,
+    and closed if it can be, in that thread only. An exception of theirs comes out in its place. At
+    most `depth` items wait, one more may be on its way; `more`, told the first item, says how many
+    more may wait.
     """
     # items, each by itself in a tuple, and in the end what was raised, or None
     waiting: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()

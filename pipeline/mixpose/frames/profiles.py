@@ -26,11 +26,8 @@ class RangeProfiles(Source):
     kind: ClassVar[SourceKind] = "profiles"
     ahead: ClassVar[int] = 0
 
-    # ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without a
-    # header, a row per frame
-    path: Path
-    # range of the first bin and distance from bin to bin, in length units
-    range_min: float
+    path: Path  # ``.npy`` (frames x bins) or ``.csv`` without a header, a row per frame
+    range_min: float  # range of the first bin, length units
     bin_size: float
     clock: Clock | None  # gives the time of a frame number
     bins: int  # number of bins in each profile
@@ -74,11 +71,7 @@ class RangeProfiles(Source):
 
 
 def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
-    """Open a file of range profiles and learn its shape.
-
-    Raises SessionError if `range_min` or `bin_size` is not given or makes no grid. Raises
-    RecordingError if the file is no array of frames x bins.
-    """
+    """Open range profiles; a SessionError without a grid, a RecordingError if not frames x bins."""
     range_min = _option(spec, "range_min", spec.range_min)
     bin_size = _option(spec, "bin_size", spec.bin_size)
     if bin_size <= 0:

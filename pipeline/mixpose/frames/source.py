@@ -15,11 +15,8 @@ SensorKind: TypeAlias = Literal["camera", "lateration", "cloud"]
 SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profiles"]
 Frames: TypeAlias = Generator[RawFrame, None, None]
 
-# Frame numbers come from file names, which hold at most 255 digits.
-_BEYOND_ALL_NUMBERS = 10**256
-
-ALL_NUMBERS = range(-_BEYOND_ALL_NUMBERS, _BEYOND_ALL_NUMBERS)
-"""The numbers of all frames that there may be."""
+ALL_NUMBERS = range(-(10**256), 10**256)
+"""The numbers of all frames that there may be: those of file names have at most 255 digits."""
 
 
 @dataclass(frozen=True)
@@ -27,16 +24,11 @@ class SourceSpec:
     """What the session says about the recording of one sensor."""
 
     sensor: str  # name of the sensor; only for messages
-    # a glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a list
-    # of images
-    source: str | tuple[str, ...]
+    source: str | tuple[str, ...]  # glob, folder, file, pipe, address or ``camera:0``; or images
     base: Path  # folder that a relative `source` starts from
     kind: SensorKind  # what the sensor measures
-    # size of every image in px; None means like the first one
-    resolution: tuple[int, int] | None = None
-    # table ``frame,time_s`` that gives frames their times; as it is opened, `base` is not put
-    # before it
-    times: Path | None = None
+    resolution: tuple[int, int] | None = None  # px of every image; None means like the first one
+    times: Path | None = None  # table ``frame,time_s``, not relative to `base`
     fps: float | None = None  # frames per second: the time of frame n is n / fps
     # range of the first bin of a profile and distance from bin to bin, in length units
     range_min: float | None = None
@@ -72,15 +64,14 @@ class Source(Protocol):
     def check_times(self, wanted: range) -> None:
         """Look for a time for each frame in a range of numbers, without decoding frames.
 
-        Raises RecordingError if the table of times lacks rows, as far as the frame numbers are
-        known in advance.
+        Raises RecordingError if the table of times lacks rows, as far as numbers are known before.
         """
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Frames by ascending number, those of ``range(start, stop, step)`` only.
+        """Frames by ascending number, those of ``range(start, stop, step)`` only, as `selection`.
 
-        Skipped frames are not decoded. Without `start` the range begins at the first frame. Raises
-        RecordingError in place of the first frame that cannot be read.
+        Skipped frames are not decoded. A RecordingError comes in place of the first frame that
+        cannot be read.
         """
 
 
@@ -97,7 +88,7 @@ def selection(start: int | None, stop: int | None, step: int, first: int | None)
         raise SessionError(f"step: found {step}, allowed is a whole number from 1")
     if start is None:
         start = first or 0
-    return range(start, _BEYOND_ALL_NUMBERS if stop is None else stop, step)
+    return range(start, ALL_NUMBERS.stop if stop is None else stop, step)
 
 
 def numbers_text(first: int, last: int, count: int) -> str:

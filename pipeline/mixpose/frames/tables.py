@@ -28,12 +28,10 @@ _COORDINATES: dict[SensorKind, tuple[str, ...]] = {
     "cloud": ("x", "y", "z"),
 }
 
-# Squares of larger numbers overflow; shares of smaller weights are lost beside others.
-_LARGEST = 1e12
-_SMALLEST_WEIGHT = 1e-12
+_LARGEST = 1e12  # squares of larger numbers overflow
+_SMALLEST_WEIGHT = 1e-12  # shares of smaller ones are lost beside others
 
-# Frame number or time, line in the file, cells.
-_Row: TypeAlias = tuple[float, int, list[str]]
+_Row: TypeAlias = tuple[float, int, list[str]]  # frame number or time, line in the file, cells
 
 
 @dataclass(frozen=True)
@@ -49,22 +47,16 @@ class _Contents:
 
 @dataclass(frozen=True)
 class DetectionTable(Source):
-    """Detections of one sensor, a row each.
-
-    A table whose frames ascend is streamed, whatever its length.  One with its rows in another
-    order is read whole and sorted.
-    """
+    """Detections of one sensor, a row each; streamed where frames ascend, else read whole."""
 
     kind: ClassVar[SourceKind] = "detections"
     ahead: ClassVar[int] = 0
 
     path: Path  # the CSV file
-    # its header: ``frame`` or ``time_s`` or both, the coordinates, perhaps ``weight``
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # its header
     coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
     clock: Clock | None  # gives the time of a frame number; None means the times in the table
-    # numbers of its moments, where it has times alone and others have moments that it lacks
-    places: Sequence[int] = range(2**62)
+    places: Sequence[int] = range(2**62)  # numbers of its moments, where it has times alone
     has_fps: bool = False  # whether the session states a rate, which times of its own stand for
 
     @property
@@ -125,8 +117,8 @@ class DetectionTable(Source):
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Group the rows to frames; skipped frames are not converted.
 
-        The time of a frame is that of its earliest detection.  A row of weight 0 says no more
-        than that its frame exists.
+        The time of a frame is that of its earliest detection; a row of weight 0 only says that it
+        exists.
         """
         wanted = source.selection(start, stop, step, self.first)
         rows: Iterator[_Row] = self._rows()
@@ -226,10 +218,7 @@ class DetectionTable(Source):
 
 
 def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTable:
-    """Read the header of a table of detections.
-
-    Raises RecordingError if the file cannot be read or its header names other columns than it may.
-    """
+    """Open a table of detections; RecordingError if its header has other columns than it may."""
     coordinates = _COORDINATES[spec.kind]
     _, cells = next(csv_rows(path), (0, []))
     columns = header(cells)

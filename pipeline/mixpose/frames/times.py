@@ -20,12 +20,8 @@ Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
 _LISTED = 5  # frame numbers that a message names
-
-# As many digits as a file name may have.
-_LARGEST_NUMBER = 10**255
-
-# Characters: a profile of a million bins.
-_LONGEST_LINE = 16_000_000
+_LARGEST_NUMBER = 10**255  # as many digits as a file name may have
+_LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
 
 
 @dataclass(frozen=True)
@@ -73,10 +69,7 @@ def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
 
 
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Refuse a table of times that lacks a row for one of some frames.
-
-    Raises RecordingError in one line: the table, which frames it lacks and what is allowed.
-    """
+    """Raise a RecordingError if a table of times lacks a row for one of some frames."""
     missing = untimed(clock, numbers)
     if not missing:
         return
@@ -92,7 +85,7 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 def clock_of(spec: SourceSpec) -> Clock | None:
     """What gives the frames of a source their times; None where the session does not say.
 
-    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number. Raises
+    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number, and
     RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:
@@ -110,8 +103,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
 
-    Raises RecordingError if the file cannot be read as text, or a row has more or fewer cells than
-    the first.
+    Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
     """
     width = None
     cannot = reporting(RecordingError, f"{path}: cannot be read")

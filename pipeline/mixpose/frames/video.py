@@ -13,15 +13,7 @@ from typing import ClassVar
 import cv2
 
 from mixpose.errors import RecordingError, reporting
-from mixpose.frames.capture import (
-    ColourRoom,
-    NotOpenedError,
-    grab,
-    is_pipe,
-    is_stream,
-    opened,
-    retrieve,
-)
+from mixpose.frames import capture as captures
 from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
@@ -39,10 +31,8 @@ class Video(Source):
 
     address: str  # path of the file or pipe, or address of a stream (with ``://``)
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    # gives the time of a frame number; None means the times that the video holds
-    clock: Clock | None
-    # size that the container states; None for a stream, which is not opened in advance
-    size: tuple[int, int] | None
+    clock: Clock | None  # gives the time of a frame number; None: times that the video holds
+    size: tuple[int, int] | None  # that the container states; None for a stream
     promised: int | None  # number of frames that the container states or lets expect
     missing: int  # bytes that the file lacks; see `missing_bytes`
 
@@ -61,11 +51,7 @@ class Video(Source):
         return f"{size}, {numbers_text(0, self.promised - 1, self.promised)}"
 
     def check_times(self, wanted: range) -> None:
-        """See that each frame in the range has a time.
-
-        Containers may promise more frames than there are, so where rows are missing the frames
-        are counted.
-        """
+        """See that each frame in the range has a time; where rows are missing, count the frames."""
         promised = [number for number in range(self.promised or 0) if number in wanted]
         if untimed(self.clock, promised):
             there = self._count(min(promised[-1] + 1, wanted.stop))
@@ -75,24 +61,24 @@ class Video(Source):
         """Number of frames that can be read, counted up to a number that is enough."""
         with _opened(self.address) as capture:
             count = 0
-            while count < enough and grab(capture, self.address):
+            while count < enough and captures.grab(capture, self.address):
                 count += 1
         return count
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
         """Decode the frames in the range; those between are passed over, not converted.
 
-        Raises RecordingError after the frames that can be read: if the file is cut short or frames
-        are lost. The last frame of a file that is cut short may be half a frame and is left out.
+        Raises RecordingError after the frames that can be read; the last one of a file that is cut
+        short may be half a frame and is left out.
         """
         wanted = selection(start, stop, step, self.first)
         with _opened(self.address) as capture:
             number = 0
             time_s = None
             held: RawFrame | None = None
-            room = ColourRoom()
+            room = captures.ColourRoom()
             while number < wanted.stop or held is not None:
-                if not grab(capture, self.address):
+                if not captures.grab(capture, self.address):
                     self._check_end(capture, number, time_s)
                     return
                 if held is not None:
@@ -108,10 +94,14 @@ class Video(Source):
                 number += 1
 
     def _frame(
-        self, capture: cv2.VideoCapture, number: int, time_s: float | None, room: ColourRoom
+        self,
+        capture: cv2.VideoCapture,
+        number: int,
+        time_s: float | None,
+        room: captures.ColourRoom,
     ) -> RawFrame:
         moment = Moment(time.monotonic(), "arrival") if self.size is None else None
-        image = retrieve(capture, self.address, number, self.resolution or self.size, room)
+        image = captures.retrieve(capture, self.address, number, self.resolution or self.size, room)
         if self.clock is not None:
             time_s = self.clock(number)
         return RawFrame(number, time_s, image, moment)
@@ -123,7 +113,7 @@ class Video(Source):
                 f"{self.address}: cut short, {self.missing} bytes are missing; "
                 f"{self._reached(count - 1)}"
             )
-        if count == 0 and is_pipe(self.address):
+        if count == 0 and captures.is_pipe(self.address):
             raise RecordingError(
                 f"{self.address}: no frame could be read from this pipe; an .mp4 or .mov has its "
                 "index at its end as a rule and cannot be read from a pipe then: name the file "
@@ -157,11 +147,10 @@ class Video(Source):
 
 
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
-    """Open a video to learn its size and length; a stream or a pipe is left for later.
-
-    Raises RecordingError if it does not open.
+    """Open a video for its size and length, a stream or a pipe later; a RecordingError if it does
+    not.
     """
-    if is_stream(address):
+    if captures.is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)
     with _opened(address) as capture:
         width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
@@ -186,10 +175,10 @@ def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
 def _opened(address: str) -> Iterator[cv2.VideoCapture]:
     """A capture of a file, a pipe or a stream; why a file does not open is told from its bytes."""
     try:
-        with opened(address) as capture:
+        with captures.opened(address) as capture:
             yield capture
-    except NotOpenedError as error:
-        if is_stream(address):
+    except captures.NotOpenedError as error:
+        if captures.is_stream(address):
             raise
         raise RecordingError(_unopened(address)) from error
 

@@ -21,15 +21,10 @@ BOP_COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 
 class TumWriter(PoseWriter):
-    """Writes one line per frame that has a pose; lost frames are left out.
-
-    The first line is a comment, which tells own files from those of others.
-    """
+    """Writes one line per frame that has a pose; lost frames are left out."""
 
     def __init__(self, stream: TextIO, header: Header) -> None:
-        super().__init__(stream, header)
-        self._stream.write(TUM_COLUMNS + "\n")
-        self._stream.flush()
+        super().__init__(stream, header, TUM_COLUMNS)
         self._stamps = Stamps(stream, "tum")
 
     def _write(self, estimate: Estimate) -> None:
@@ -45,40 +40,35 @@ class TumWriter(PoseWriter):
 class BopWriter(PoseWriter):
     """Writes one row per frame that has a pose; lost frames are left out.
 
-    R (row by row) and t (mm) are those of `T_world_object`. The toolkit takes them for object to
+    R (row by row) and t (mm) are those of `T_world_object`; the toolkit takes them for object to
     camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
-    the estimate took in seconds, as BOP has it, or -1 where that was not measured. BOP numbers its
-    objects: the first one of the header is `obj_id`, the next one more; names that it does not have
-    follow as they occur.
+    the estimate took in seconds, or -1 where that was not measured. The first object of the header
+    is `obj_id`, the next one more; names that it does not have follow as they occur.
     """
 
     def __init__(
         self, stream: TextIO, header: Header, *, scene_id: int = 0, obj_id: int = 1
     ) -> None:
-        super().__init__(stream, header)
+        super().__init__(stream, header, BOP_COLUMNS)
         self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
         self._scene_id = scene_id
         self._first_obj_id = obj_id
         self._obj_ids = {name: obj_id + k for k, name in enumerate(header.objects)}
-        self._stream.write(BOP_COLUMNS + "\n")
-        self._stream.flush()
 
     def _write(self, estimate: Estimate) -> None:
         obj_id = self._obj_ids.setdefault(estimate.object, self._first_obj_id + len(self._obj_ids))
         T = pose_of(estimate)
         if T is None:
             return
-        R = plain(T[:3, :3].ravel())
-        t_mm = plain(T[:3, 3] * self._mm_per_unit)
-        latency_ms = estimate.latency_ms or 0.0
-        seconds = latency_ms / 1000.0 if latency_ms > 0 else -1.0
+        latency_ms = estimate.latency_ms
+        seconds = latency_ms / 1000.0 if latency_ms and latency_ms > 0 else -1.0
         cells = (
             str(self._scene_id),
             str(estimate.frame),
             str(obj_id),
             repr(plain(1.0 if estimate.score is None else estimate.score)),
-            " ".join(map(repr, R)),
-            " ".join(map(repr, t_mm)),
+            " ".join(map(repr, plain(T[:3, :3].ravel()))),
+            " ".join(map(repr, plain(T[:3, 3] * self._mm_per_unit))),
             repr(plain(seconds)),
         )
         self._stream.write(",".join(cells) + "\n")

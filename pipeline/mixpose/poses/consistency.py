@@ -24,9 +24,7 @@ class Consistency:
     """Whether the covariances tell the truth, over "ok" frames that have one."""
 
     frames: int
-    # mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they promise
-    # too much
-    mean_per_dimension: float
+    mean_per_dimension: float  # mean NEES by its dimensions: above 1 if they promise too much
     inside_95: float  # share of frames whose truth lies inside the 95 % ellipsoid
 
 
@@ -44,11 +42,10 @@ def consistency(measured: Sequence[tuple[float, int]]) -> Consistency | None:
 
 
 def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
-    """Mahalanobis distance squared of an error (6,), and its dimensions: the rank of the
-    covariance.
+    """Mahalanobis distance squared of an error (6,), and its dimensions: the covariance's rank.
 
-    Only directions that the covariance leaves free count: an axis that is held at the start pose
-    has no variance, and its error no measure. None where it leaves none free.
+    Only directions that the covariance (6, 6) leaves free count: one that is held at the start pose
+    has no variance. None where it leaves none free.
     """
     variance = np.diag(covariance)
     kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)
@@ -68,11 +65,9 @@ def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float |
 class ConstantOffset:
     """A transform that takes all poses near to the truth."""
 
-    # whether it stands right of the poses, ``T_truth = T_pose T``, or left of them
-    of: Literal["object", "world"]
+    of: Literal["object", "world"]  # right of the poses, ``T_truth = T_pose T``, or left of them
     T: Floats  # (4, 4)
-    # errors that are left with it
-    rotation_deg_rms: float
+    rotation_deg_rms: float  # of errors that are left with it
     translation_rms: float
 
     def text(self, unit: str) -> str:
@@ -93,10 +88,7 @@ class ConstantOffset:
 
 
 def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | None:
-    """The transform that explains most of the errors of poses with their truths, where one does.
-
-    Bodies that hardly move tell nothing.
-    """
+    """The transform that explains most of the errors of poses with their truths, if one does."""
     if len(pairs) < _FEWEST:
         return None
     poses, truth = (np.stack(each) for each in zip(*pairs, strict=True))

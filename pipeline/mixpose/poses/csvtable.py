@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from itertools import combinations_with_replacement as pairs
 from typing import Any, TextIO
 
 import numpy as np
@@ -11,35 +12,26 @@ from scipy.spatial.transform import Rotation
 
 from mixpose import rigid
 from mixpose.poses.header import Header
-from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
+from mixpose.poses.writing import PoseWriter, plain, pose_of
 from mixpose.records import Estimate
-
-_UPPER = np.triu_indices(6)
 
 FRAME_COLUMNS = ("frame", "time_s", "object", "status", "unit")
 POSE_COLUMNS = (
     *("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
     *("rotvec_x", "rotvec_y", "rotvec_z"),  # radians
 )
-COVARIANCE_COLUMNS = tuple(
-    f"cov_{rigid.TWIST_NAMES[i]}_{rigid.TWIST_NAMES[j]}" for i, j in zip(*_UPPER)
-)
-TIP_COLUMNS = (
-    *("tip_x", "tip_y", "tip_z"),
-    *("tip_cov_x_x", "tip_cov_x_y", "tip_cov_x_z", "tip_cov_y_y", "tip_cov_y_z", "tip_cov_z_z"),
-)
+COVARIANCE_COLUMNS = tuple(f"cov_{a}_{b}" for a, b in pairs(rigid.TWIST_NAMES, 2))
+TIP_COLUMNS = ("tip_x", "tip_y", "tip_z", *(f"tip_cov_{a}_{b}" for a, b in pairs("xyz", 2)))
 SENSOR_COLUMNS = ("used", "explained", "rms")
 
 
 class CsvWriter(PoseWriter):
     """Writes one row per frame; what a frame does not have is an empty cell.
 
-    Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
-    behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
-    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; where a body has a tip,
-    where it is and its covariance, ``tip_<a>`` and ``tip_cov_<a>_<b>``; confidence; score;
-    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor, which the header
-    names or else the first frame; latency_ms.
+    Columns: `FRAME_COLUMNS` (where bodies are identical also instance, behind object),
+    `POSE_COLUMNS`, the upper triangle of the covariance, row by row, in the axes of
+    `mixpose.rigid`; where a body has a tip `TIP_COLUMNS`; confidence; score; `SENSOR_COLUMNS` of
+    each sensor, which the header names or else the first frame; latency_ms.
     """
 
     def __init__(self, stream: TextIO, header: Header) -> None:
@@ -63,13 +55,13 @@ class CsvWriter(PoseWriter):
         self._rows = self._rows or self._begun(tuple(estimate.sensors))
         row = {
             "frame": estimate.frame,
-            "time_s": plain_or_none(estimate.time_s),
+            "time_s": plain(estimate.time_s),
             "object": estimate.object,
             "status": estimate.status,
             "unit": self._header.unit,
             **_pose_cells(estimate),
             **(_tip_cells(estimate) if self._header.tips else {}),
-            "confidence": plain_or_none(estimate.confidence),
+            "confidence": plain(estimate.confidence),
             "score": plain(1.0 if estimate.score is None else estimate.score),
             "latency_ms": plain(estimate.latency_ms or 0.0),
         }
@@ -77,8 +69,8 @@ class CsvWriter(PoseWriter):
             row["instance"] = estimate.instance
         for name, report in estimate.sensors.items():
             row[f"{name}_used"] = "true" if report.used else "false"
-            row[f"{name}_explained"] = plain_or_none(report.explained)
-            row[f"{name}_rms"] = plain_or_none(report.rms)
+            row[f"{name}_explained"] = plain(report.explained)
+            row[f"{name}_rms"] = plain(report.rms)
         columns = set(self._rows.fieldnames)
         unknown = [name for name in estimate.sensors if f"{name}_used" not in columns]
         if unknown:
@@ -100,16 +92,14 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
     numbers = np.concatenate([T[:3, 3], turn, Rotation.from_quat(turn).as_rotvec()])
     cells = dict(zip(POSE_COLUMNS, plain(numbers), strict=True))
     if estimate.covariance is not None:
-        cells |= zip(COVARIANCE_COLUMNS, plain(estimate.covariance[_UPPER]), strict=True)
+        cells |= zip(
+            COVARIANCE_COLUMNS, plain(estimate.covariance[np.triu_indices(6)]), strict=True
+        )
     return cells
 
 
 def _tip_cells(estimate: Estimate) -> dict[str, Any]:
     """Cells of the tip, as far as there is one."""
     tip, C = estimate.tip, estimate.tip_covariance
-    if tip is None:
-        return {}
-    cells = dict(zip(TIP_COLUMNS, plain(tip)))
-    if C is not None:
-        cells |= zip(TIP_COLUMNS[3:], plain(C[np.triu_indices(3)]), strict=True)
-    return cells
+    upper = [] if C is None else plain(C[np.triu_indices(3)])
+    return {} if tip is None else dict(zip(TIP_COLUMNS, [*plain(tip), *upper]))

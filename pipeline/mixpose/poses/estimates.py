@@ -55,17 +55,12 @@ def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
 def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
     """A pose in the axes of another body, T_reference_object, as sure as both; lost without it.
 
-    Errors of the two are taken for independent of each other.  What else either may be is left out.
+    Errors of the two are taken for independent. What else either may be is left out.
     """
     T = line.T_world_object
     if reference is None or T is None or reference.T_world_object is None:
         return replace(
-            line,
-            status="lost",
-            T_world_object=None,
-            covariance=None,
-            hypotheses=(),
-            confidence=0.0,
+            line, status="lost", T_world_object=None, covariance=None, hypotheses=(), confidence=0.0
         )
     T_reference, own, other = reference.T_world_object, line.confidence, reference.confidence
     return replace(
@@ -85,9 +80,7 @@ def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
     if line.covariance is None or reference.covariance is None:
         return None
     turn = np.kron(np.eye(2), reference.T_world_object[:3, :3].T)
-    moved = np.eye(6)  # a turn w of the reference moves what is `arm` away from it by w × arm
-    moved[:3, 3:] = np.cross(np.eye(3), arm).T
-    C = line.covariance + moved @ reference.covariance @ moved.T
+    C = line.covariance + rigid.covariance_at(reference.covariance, arm)
     return np.asarray(turn @ C @ turn.T)
 
 

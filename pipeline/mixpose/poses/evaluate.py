@@ -1,23 +1,14 @@
 """Poses against the truth, modulo the object's symmetries.
 
-Which right answer a pose is held against
-    A frame may have several right answers: several lines in the truth file, and each of them
-    times every symmetry S of the object, ``T_truth @ S``.  The pose is held against the one that
-    is nearest in *rotation*.  Position could not tell: where the symmetry axis passes through the
-    object's origin, all answers share one position; and where it passes beside the origin (a
-    board measured from its corner), the answers' positions differ just because their rotations
-    do, so that a small turn of a long object could tip the balance.  A sum of both would need a
-    length that says how many millimetres a degree is worth.  The rotations of a symmetry group
-    differ by many degrees, so the nearest is never in doubt for a pose that is any good.
-    Answers whose rotations are alike (within `TIE_DEG`: marks in a row, taken for their
-    neighbours) differ in position; the nearest of these counts.
-
-A pose that was foretold is held against the truth of the moment that it is for (see
-`mixpose.poses.foretold`).
+A frame may have several right answers: several lines in the truth file, and each of them times
+every symmetry S of the object, ``T_truth @ S``.  A pose is held against the one that is nearest in
+rotation: positions of answers are all alike, or differ just because their rotations do, which in a
+symmetry group is by many degrees.  Of answers whose rotations are alike (within `TIE_DEG`: marks in
+a row, taken for their neighbours) the one nearest in position counts.
 
 Rotation and position errors of a frame belong to the same right answer.  The error is the twist
-that leads from the right answer to the pose, in the order and axes of `mixpose.rigid`; the
-position error is that of the object's origin.
+that leads from it to the pose, in the order and axes of `mixpose.rigid`; the position error is that
+of the object's origin.
 """
 
 from __future__ import annotations
@@ -32,13 +23,7 @@ import numpy as np
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.consistency import (
-    Consistency,
-    ConstantOffset,
-    consistency,
-    constant_offset,
-    normalised_error_squared,
-)
+from mixpose.poses import consistency
 from mixpose.poses.estimates import in_unit
 from mixpose.poses.foretold import truth_of_then
 from mixpose.poses.instances import Swaps, renumbered
@@ -57,15 +42,12 @@ class FrameError:
 
     frame: int
     object: str
-    # "missing" where the poses file has no line for a frame of the truth file
-    status: Status | Literal["missing"]
-    # (6,), from the right answer to the pose, ``(x, y, z, rx, ry, rz)``, lengths and radians
-    twist: Floats | None = None
+    status: Status | Literal["missing"]  # "missing" where the poses have no line for it
+    twist: Floats | None = None  # (6,), from the right answer to the pose, lengths and radians
     # (6,), the same for the best of an ambiguous frame's hypotheses; the pose is one of them
     best_twist: Floats | None = None
     nees: float | None = None  # normalised estimation error squared; None without a covariance
-    # directions in which the covariance lets the pose err; what `nees` is expected to be
-    dimensions: int = 0
+    dimensions: int = 0  # in which the covariance lets the pose err; what `nees` is expected to be
     pair: tuple[Floats, Floats] | None = field(default=None, compare=False)  # pose and right answer
 
 
@@ -95,23 +77,18 @@ class Evaluation:
     # over frames with a pose, "ambiguous" ones included; None without such a frame
     rotation_deg: Spread | None
     translation: Spread | None
-    # RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`; lengths and
-    # degrees
-    per_axis_rms: Mapping[str, float] | None
+    per_axis_rms: Mapping[str, float] | None  # by `TWIST_NAMES`, lengths and degrees
     # over "ok" frames alone; None without such a frame
     ok_rotation_deg: Spread | None
     ok_translation: Spread | None
     # over ambiguous frames: the error of the best hypothesis
     best_rotation_deg: Spread | None
     best_translation: Spread | None
-    nees: Consistency | None  # None where no "ok" frame has a covariance
-    # each body by itself, where there are several
-    bodies: Mapping[str, Evaluation] = field(default_factory=dict)
+    nees: consistency.Consistency | None  # None where no "ok" frame has a covariance
+    bodies: Mapping[str, Evaluation] = field(default_factory=dict)  # each by itself, if several
     swaps: Swaps | None = None  # None where no bodies are identical
-    # the one transform that explains most of the errors of "ok" frames, if there is one
-    offset: ConstantOffset | None = None
-    # whether the truth has covariances, as estimates do, and the poses have none
-    exchanged: bool = False
+    offset: consistency.ConstantOffset | None = None  # that explains most errors of "ok" frames
+    exchanged: bool = False  # whether the truth has covariances and the poses have none
 
 
 def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
@@ -120,13 +97,11 @@ def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
 
 
 def evaluate(poses: PoseFile, truth: PoseFile, *, numbered: bool = False) -> Evaluation:
-    """Compare poses with the truth.
+    """Compare poses with the truth, in the unit of the poses, or else of the truth.
 
-    `numbered` says that identical bodies have the numbers of the truth already.
-
-    Errors are given in the unit of the poses; a file that states no unit is taken to be in that of
-    the other. Raises RecordingError if the truth holds no pose, the files have no object in
-    common, or a frame stands twice in the poses.
+    `numbered` says that identical bodies have the numbers of the truth already. Raises
+    RecordingError if the truth holds no pose, the files have no object in common, or a frame stands
+    twice in the poses.
     """
     swaps = None
     if not numbered:
@@ -157,10 +132,7 @@ def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | Non
 
 def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) -> Evaluation:
     compared = {(error.frame, error.object) for error in errors}
-    twists = [(error.frame, error.twist) for error in errors if error.twist is not None]
     trusted = [error for error in errors if error.status == "ok"]
-    sure = [(error.frame, error.twist) for error in trusted if error.twist is not None]
-    best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
     counts = Counter(error.status for error in errors)
     return Evaluation(
         unit=poses.unit or truth.unit,
@@ -170,12 +142,14 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         lost=counts["lost"],
         missing=counts["missing"],
         without_truth=sum((line.frame, line.label) not in compared for line in poses.poses),
-        **_spreads(twists),
-        per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
-        **_spreads(sure, "ok_"),
-        **_spreads(best, "best_"),
-        nees=consistency([(e.nees, e.dimensions) for e in trusted if e.nees is not None]),
-        offset=constant_offset([error.pair for error in trusted if error.pair is not None]),
+        **_spreads([(error.frame, error.twist) for error in errors]),
+        per_axis_rms=_per_axis_rms([error.twist for error in errors if error.twist is not None]),
+        **_spreads([(error.frame, error.twist) for error in trusted], "ok_"),
+        **_spreads([(error.frame, error.best_twist) for error in errors], "best_"),
+        nees=consistency.consistency(
+            [(e.nees, e.dimensions) for e in trusted if e.nees is not None]
+        ),
+        offset=consistency.constant_offset([e.pair for e in trusted if e.pair is not None]),
         exchanged=any(line.covariance is not None for line in truth.poses)
         and all(line.covariance is None for line in poses.poses),
     )
@@ -185,9 +159,8 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
     """Compare poses with the truth, one by one: per frame and body of the truth, in its order.
 
     They are in the unit of the poses; identical bodies are taken by their numbers. Truth lines
-    without a pose say nothing and are passed over. Symmetries of an object are those that the
-    truth's header names; if it names none, those of the poses' header. Raises RecordingError as
-    `evaluate`.
+    without a pose are passed over. Symmetries of an object are those of the truth's header; if it
+    names none, those of the poses' header. Raises RecordingError as `evaluate`.
     """
     unit = poses.unit or truth.unit
     truth = in_unit(truth_of_then(truth, poses), unit)
@@ -253,7 +226,7 @@ def _frame_error(key: FrameKey, line: PoseLine | None, answers: Floats) -> Frame
         best_twist, _ = _nearest_twist(answers, np.stack(rivals))
     nees, dimensions = None, 0
     if line.covariance is not None:
-        nees, dimensions = normalised_error_squared(twist, line.covariance)
+        nees, dimensions = consistency.normalised_error_squared(twist, line.covariance)
     pair = (line.T_world_object, answer)
     return FrameError(frame, name, line.status, twist, best_twist, nees, dimensions, pair)
 
@@ -268,12 +241,12 @@ def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
     return twists[nearest], answers[nearest // len(poses)]
 
 
-def _spreads(twists: Sequence[tuple[int, Floats]], of: str = "") -> dict[str, Any]:
+def _spreads(twists: Sequence[tuple[int, Floats | None]], of: str = "") -> dict[str, Any]:
     """Spread of the angles in degrees and of the distances of errors, by their field."""
-    errors = np.array([twist for _, twist in twists]).reshape(-1, 2, 3)
+    frames = [frame for frame, twist in twists if twist is not None]
+    errors = np.array([twist for _, twist in twists if twist is not None]).reshape(-1, 2, 3)
     distance, angle = np.linalg.norm(errors, axis=2).T
     found = {f"{of}rotation_deg": np.degrees(angle), f"{of}translation": distance}
-    frames = [frame for frame, _ in twists]
     return {name: _spread(frames, values) for name, values in found.items()}
 
 

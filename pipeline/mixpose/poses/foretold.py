@@ -1,9 +1,8 @@
 """Where a body truly is at the moments that poses were foretold for.
 
 A pose that ``mixpose run --publish --predict`` sent bears the number of the frame that it was
-foretold from, and says how much later it is for, ``ahead_s``. What it is held against is the truth
-of then: between the frames of the truth file the body moves on cubic splines, of position and of
-rotation.
+foretold from, and says how much later it is for, ``ahead_s``. It is held against the truth of then:
+between frames the body moves on cubic splines, of position and of rotation.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
+from operator import attrgetter
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -22,30 +22,24 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 
-_GAP = 2.5
-"""Intervals of frames that a body is followed through: one frame may be missing."""
+_GAP = 2.5  # intervals of frames that a body is followed through: one frame may be missing
 
 
 def truth_of_then(truth: PoseFile, poses: PoseFile) -> PoseFile:
     """The truth with each body where it is at the moment that the poses of a frame are for.
 
-    Where that is between frames too far apart, or after the last one, nothing is known: the line
-    says that it is lost. Raises RecordingError if the truth has no times, or several right answers
-    for a frame.
+    Where that is between frames too far apart, or after the last one, the line says that it is
+    lost. Raises RecordingError if the truth has no times, or several right answers for a frame.
     """
     ahead_s = {line.frame: line.ahead_s for line in poses.poses if line.ahead_s}
     if not ahead_s:
         return truth
-    by_body = sorted((one for one in truth.poses if one.T_world_object is not None), key=_label)
+    posed = (line for line in truth.poses if line.T_world_object is not None)
     moved: dict[int, PoseLine] = {}
-    for _, each in groupby(by_body, key=_label):
-        lines = sorted(each, key=lambda line: line.frame)
+    for _, each in groupby(sorted(posed, key=attrgetter("label", "frame")), attrgetter("label")):
+        lines = list(each)
         moved |= _moved(lines, _times(truth, lines), ahead_s)
     return replace(truth, poses=tuple(moved.get(id(line), line) for line in truth.poses))
-
-
-def _label(line: PoseLine) -> str:
-    return line.label
 
 
 def _times(truth: PoseFile, lines: Sequence[PoseLine]) -> Floats:

@@ -10,9 +10,7 @@ from mixpose.poses.jsonl import JsonlWriter
 from mixpose.poses.ros import RosWriter
 from mixpose.poses.writing import PoseWriter
 
-ONE_TRAJECTORY = ("tum", "ros")
-"""Formats whose files hold one body each."""
-
+ONE_TRAJECTORY = ("tum", "ros")  # formats whose files hold one body each
 # each is called with a text stream and a `Header`; BOP and ROS have options of their own
 FORMATS: Mapping[str, Callable[..., PoseWriter]] = {
     "jsonl": JsonlWriter,

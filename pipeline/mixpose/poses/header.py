@@ -24,21 +24,12 @@ class Header:
     seed: int
     # motions T_object_object that map the object's features onto themselves, identity included
     symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
-    # recordings given in place of the session's, by sensor name; the line has them only where there
-    # are any
-    sources: Mapping[str, str] = field(default_factory=dict)
-    # what else the run was asked for that its lines hang on, as `step` and `labels`; the line has
-    # it only where that is not the default
-    options: Mapping[str, int | bool] = field(default_factory=dict)
-    # Names of all sensors of the session, in its order, and whether any body has a tip.  Only the
-    # CSV table needs them, for its columns; they are not written into JSON lines.
-    sensors: tuple[str, ...] = ()
-    tips: bool = False
-    # Names of all bodies with how many there are of each, in the order of their pose lines; the
-    # line has them only where there are several.  Empty: not known.
-    objects: Mapping[str, int] = field(default_factory=dict)
-    # by which model the poses of each body were smoothed; empty where they were not
-    smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)  # in place of the session's, by sensor
+    options: Mapping[str, int | bool] = field(default_factory=dict)  # what else was asked for
+    sensors: tuple[str, ...] = ()  # of the session, in its order; for columns of a CSV table only
+    tips: bool = False  # whether any body has one; likewise
+    objects: Mapping[str, int] = field(default_factory=dict)  # names with counts; empty: not known
+    smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # models, by body
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -1,8 +1,7 @@
 """Which of identical bodies in the poses is which in the truth, and how often they change places.
 
-Numbers of identical bodies mean nothing by themselves.  Over a whole file they are assigned once,
-so that as many poses as possible are nearest to the truth of their number.  Where a body is
-followed into another's place, and called by its own number there, that is a swap.
+Numbers are assigned once for a whole file, so that as many poses as possible are nearest to the
+truth of theirs.  Where a body is followed into another's place, that is a swap.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from operator import attrgetter
 from typing import TypeAlias
 
 import numpy as np
@@ -30,9 +30,7 @@ class Swaps:
     """How often identical bodies changed places."""
 
     count: int = 0  # bodies that are followed where another one of the truth is, at each change
-    # of these, those where the body was not ok in the frame itself or in one since it last was
-    # nearest to the one before
-    announced: int = 0
+    announced: int = 0  # of these, of bodies not ok then, or since they last were where they belong
 
 
 def renumbered(
@@ -84,8 +82,8 @@ def _distance(a: PoseLine, b: PoseLine, symmetries: Floats | None) -> float:
 
 
 def _by_frame(lines: Sequence[PoseLine]) -> dict[int, list[PoseLine]]:
-    ordered = sorted(lines, key=lambda line: line.frame)
-    return {frame: list(some) for frame, some in groupby(ordered, key=lambda line: line.frame)}
+    frame_of = attrgetter("frame")
+    return {frame: list(some) for frame, some in groupby(sorted(lines, key=frame_of), frame_of)}
 
 
 def _assigned(

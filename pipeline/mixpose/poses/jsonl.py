@@ -16,7 +16,7 @@ from mixpose.errors import MixposeError, RecordingError, SessionError, reporting
 from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
-from mixpose.poses.writing import PoseWriter, plain, plain_or_none, pose_of
+from mixpose.poses.writing import PoseWriter, plain, pose_of
 from mixpose.records import Estimate, Floats, Label
 
 _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
@@ -29,27 +29,16 @@ class JsonlWriter(PoseWriter):
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
-        super().__init__(stream, header)
-        if not resume:
-            self._write_line(header_line(header))
-            self._stream.flush()
+        first_line = "" if resume else json.dumps(header_line(header), allow_nan=False)
+        super().__init__(stream, header, first_line)
 
     def _write(self, estimate: Estimate) -> None:
-        self._write_line(pose_line(estimate))
-
-    def _write_line(self, line: Mapping[str, Any]) -> None:
         # One call for the whole line: an interruption rarely leaves half of it.
-        self._stream.write(json.dumps(line, allow_nan=False) + "\n")
+        self._stream.write(json.dumps(pose_line(estimate), allow_nan=False) + "\n")
 
 
 def header_line(header: Header) -> dict[str, Any]:
     """The first line of a poses file, as what JSON holds."""
-    sometimes = {
-        "objects": header.objects if len(header.labels) > 1 else {},
-        "sources": header.sources,
-        "options": header.options,
-        "smoothed": header.smoothed,
-    }
     return {
         "type": "header",
         "format": FORMAT,
@@ -61,78 +50,79 @@ def header_line(header: Header) -> dict[str, Any]:
         "mixpose": header.mixpose,
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
-        **{key: dict(held) for key, held in sometimes.items() if held},
+        **_sometimes("objects", dict(header.objects) if len(header.labels) > 1 else {}),
+        **_sometimes("sources", dict(header.sources)),
+        **_sometimes("options", dict(header.options)),
+        **_sometimes("smoothed", dict(header.smoothed)),
     }
 
 
 def pose_line(estimate: Estimate) -> dict[str, Any]:
     """The line of an estimate, as what JSON holds."""
     T = pose_of(estimate)
-    covariance = estimate.covariance if T is not None else None
-    turn = None if T is None else rigid.quaternion_xyzw(T)
     points = {
-        name: {"at": plain(point.at), "residual": float(f"{point.residual:.4g}")}
+        name: {"at": plain(point.at), "residual": _rounded(point.residual)}
         for name, point in estimate.points.items()
     }
     return {
         "type": "pose",
         "frame": int(estimate.frame),  # NumPy integers are no JSON
-        "time_s": plain_or_none(estimate.time_s),
+        "time_s": plain(estimate.time_s),
         "object": estimate.object,
         **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
-        **({"why": estimate.doubt} if estimate.doubt else {}),
-        "T_world_object": plain_or_none(T),
-        "quaternion_xyzw": plain_or_none(turn),
-        "covariance": plain_or_none(covariance),
-        "confidence": plain_or_none(estimate.confidence),
+        **_sometimes("why", estimate.doubt),
+        "T_world_object": plain(T),
+        "quaternion_xyzw": None if T is None else plain(rigid.quaternion_xyzw(T)),
+        "covariance": None if T is None else plain(estimate.covariance),
+        "confidence": plain(estimate.confidence),
         "score": plain(1.0 if estimate.score is None else estimate.score),
         "sensors": {
             name: {
                 "used": bool(report.used),
-                "explained": plain_or_none(report.explained),
-                "rms": plain_or_none(report.rms),
-                **({"why": report.why} if report.why else {}),
-                **({"residuals": _rounded(report.residuals)} if report.residuals else {}),
-                **({"labels": _labels(report.labels)} if report.labels else {}),
+                "explained": plain(report.explained),
+                "rms": plain(report.rms),
+                **_sometimes("why", report.why),
+                **_sometimes("residuals", {k: _rounded(r) for k, r in report.residuals.items()}),
+                **_sometimes("labels", {k: _label(met) for k, met in report.labels.items()}),
             }
             for name, report in estimate.sensors.items()
         },
-        **({"points": points} if points else {}),
+        **_sometimes("points", points),
         "hypotheses": [
             {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
-        **({"filled": True} if estimate.filled else {}),
-        **({"ahead_s": estimate.ahead_s} if estimate.ahead_s else {}),
+        **_sometimes("filled", estimate.filled),
+        **_sometimes("ahead_s", estimate.ahead_s),
     }
+
+
+def _sometimes(key: str, value: Any) -> dict[str, Any]:
+    """A key that is there only where there is something to say."""
+    return {key: value} if value else {}
 
 
 def _tip_of(estimate: Estimate) -> dict[str, Any]:
     """Where the tip is, of a body that has one."""
     if estimate.tip_object is None:
         return {}
-    is_lost = estimate.status == "lost"
-    tip, covariance = (None, None) if is_lost else (estimate.tip, estimate.tip_covariance)
-    return {"tip": plain_or_none(tip), "tip_covariance": plain_or_none(covariance)}
+    if estimate.status == "lost":
+        return {"tip": None, "tip_covariance": None}
+    return {"tip": plain(estimate.tip), "tip_covariance": plain(estimate.tip_covariance)}
 
 
-def _rounded(residuals: Mapping[str, float | None]) -> dict[str, float | None]:
+def _rounded(residual: float | None) -> float | None:
     """To the digits that anybody looks at."""
-    return {k: None if r is None else float(f"{r:.4g}") for k, r in residuals.items()}
+    return None if residual is None else float(f"{residual:.4g}")
 
 
-def _labels(labels: Mapping[str, Label]) -> dict[str, Any]:
-    """What features were met by, exactly as it was detected."""
-    return {
-        name: {
-            "at": plain(label.at),
-            **({} if label.detection is None else {"detection": label.detection}),
-        }
-        for name, label in labels.items()
-    }
+def _label(met: Label) -> dict[str, Any]:
+    """What a feature was met by, exactly as it was detected."""
+    place = {"at": plain(met.at)}
+    return place if met.detection is None else {**place, "detection": met.detection}
 
 
 @dataclass(frozen=True)
@@ -163,20 +153,18 @@ class PoseFile:
 def read_poses(path: str | Path) -> PoseFile:
     """Read a poses or truth file.
 
-    A line needs `frame`, `object` and `T_world_object`; everything else, the header included, may
-    be left out, and unknown keys are passed over. Raises RecordingError with file and line, if the
-    file or a line of it is not as the format says, a last line cut off by an interruption
-    included.
+    A line needs `frame`, `object` and `T_world_object`; all else, the header included, may be left
+    out, and unknown keys are passed over. Raises RecordingError with file and line if one is not as
+    the format says, a last line cut off by an interruption included.
     """
     path = Path(path)
     return _parse(path, _read_bytes(path))
 
 
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
-    """Read a poses file that a run may still be writing, or was interrupted in.
+    """Read a poses file that a run may still be writing, and whether its last line was cut off.
 
-    A last line that was cut off is left out; whether there was one is said beside the poses. Raises
-    RecordingError as `read_poses`, for every other line.
+    Such a line is left out. Raises RecordingError as `read_poses`, for every other line.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -199,9 +187,8 @@ class ResumePoint:
 
     frame: int  # its frame
     lines: int  # lines of this frame
-    # of the file up to its end: bytes and CRC-32
-    size: int
-    checksum: int
+    size: int  # of the file up to its end, bytes
+    checksum: int  # CRC-32 of these
     first: int  # frame of the first line
 
 
@@ -209,9 +196,8 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
     """Find the frame that an interrupted run wrote last, for a run with this header to go on.
 
     What follows it is a half-written line, to be cut off. None where no frame is whole or no file
-    is there: the caller writes the file afresh. Raises SessionError if the file is of another
-    session, seed, unit, recording, step or version of mixpose, or if one of the two has labels, and
-    RecordingError if it is not a poses file.
+    is there. Raises SessionError if the file is of another session, seed, unit, recording, options
+    or version of mixpose, and RecordingError if it is not a poses file.
     """
     path = Path(path)
     if not path.exists():
@@ -230,8 +216,7 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
     if frame is None:
         return None
     lines = sum(line.frame == frame for line in so_far.poses)
-    first = so_far.poses[0].frame
-    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]), first)
+    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]), so_far.poses[0].frame)
 
 
 def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | None, int]:
@@ -275,11 +260,10 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
 
 def _options_text(header: Mapping[str, Any]) -> str:
     """What a run was asked for, as it is typed."""
-    sources, options = (header.get(key) for key in ("sources", "options"))
-    each = sorted(sources.items()) if isinstance(sources, dict) else []
-    words = [f"--source {name}={path}" for name, path in each]
-    each = sorted(options.items()) if isinstance(options, dict) else []
-    words += [f"--{name}" if value is True else f"--{name} {value}" for name, value in each]
+    found = (header.get(key) for key in ("sources", "options"))
+    sources, options = (sorted(each.items()) if isinstance(each, dict) else [] for each in found)
+    words = [f"--source {name}={path}" for name, path in sources]
+    words += [f"--{name}" if value is True else f"--{name} {value}" for name, value in options]
     return " ".join(words) or "no --source, --step or --labels"
 
 

@@ -15,8 +15,7 @@ from mixpose.poses.header import FORMAT, VERSION
 from mixpose.records import Estimate, Floats, Hypothesis, Label, MeasuredPoint, SensorReport, Status
 from mixpose.units import UNITS_PER_METRE
 
-# Files by other people round their rotations to a few digits.
-RIGID_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-3  # files by other people round their rotations to a few digits
 _LARGEST = 1e100  # squares of larger lengths would overflow
 
 
@@ -96,10 +95,7 @@ _Checked = TypeVar("_Checked", bound=_Line)
 
 
 def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
-    """Check the JSON object of a pose line, `where` being ``file:line`` for messages.
-
-    Raises RecordingError.
-    """
+    """Check the JSON object of a pose line; a RecordingError begins with `where`, file and line."""
     pose = _checked(_Pose, values, where)
     matrix = pose.T_world_object
     T = None if matrix is None else _motion(matrix, f"{where}: T_world_object")
@@ -142,10 +138,7 @@ def _report(sensor: _Sensor) -> SensorReport:
 
 
 def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:
-    """Check the JSON object of a header line and return its unit and symmetries.
-
-    Raises RecordingError.
-    """
+    """The unit and the symmetries of the JSON object of a header line, or a RecordingError."""
     header = _checked(_Header, values, where)
     if header.format != FORMAT:
         raise RecordingError(f"{where}: format is {header.format!r}; allowed is {FORMAT!r}")

@@ -15,9 +15,8 @@ _STATISTICS = ("rms", "median", "p95", "max")
 def as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """The evaluation as plain values for JSON; what could not be measured is None.
 
-    ``per_axis`` holds the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees)
-    the world's axes; ``ok_frames`` the errors of frames that are ok alone; ``best_hypothesis``
-    those of the best hypothesis of ambiguous frames.
+    ``per_axis`` is the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees) the
+    world's axes; ``best_hypothesis`` the errors of the best hypothesis of ambiguous frames.
     """
     nees, per_axis = evaluation.nees, evaluation.per_axis_rms
     best = {"frames": evaluation.ambiguous, **_errors(evaluation, "best_")}
@@ -34,16 +33,14 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
 
 def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
     """What an evaluation says only where there are several bodies, or something is odd."""
-    found: dict[str, Any] = {}
-    if evaluation.offset is not None:
-        found["constant_offset"] = asdict(evaluation.offset) | {"T": evaluation.offset.T.tolist()}
-    if evaluation.exchanged:
-        found["exchanged"] = True
-    if evaluation.bodies:
-        found["bodies"] = {label: as_dict(one) for label, one in evaluation.bodies.items()}
-    if evaluation.swaps is not None:
-        found["swaps"] = asdict(evaluation.swaps)
-    return found
+    offset, swaps = evaluation.offset, evaluation.swaps
+    told = {
+        "constant_offset": offset and asdict(offset) | {"T": offset.T.tolist()},
+        "exchanged": evaluation.exchanged,
+        "bodies": {label: as_dict(one) for label, one in evaluation.bodies.items()},
+        "swaps": swaps and asdict(swaps),
+    }
+    return {key: value for key, value in told.items() if value}
 
 
 def as_table(evaluation: Evaluation) -> str:
@@ -122,10 +119,12 @@ def _spread_lines(evaluation: Evaluation, unit: str) -> list[str]:
         f"position, {unit}": evaluation.translation,
     }
     if evaluation.best_rotation_deg is not None:
-        rows["ok alone, deg"] = evaluation.ok_rotation_deg
-        rows[f"ok alone, {unit}"] = evaluation.ok_translation
-        rows["best hypothesis, deg"] = evaluation.best_rotation_deg
-        rows[f"best hypothesis, {unit}"] = evaluation.best_translation
+        rows |= {
+            "ok alone, deg": evaluation.ok_rotation_deg,
+            f"ok alone, {unit}": evaluation.ok_translation,
+            "best hypothesis, deg": evaluation.best_rotation_deg,
+            f"best hypothesis, {unit}": evaluation.best_translation,
+        }
     lines = [_row("error", [*_STATISTICS, "in frame"])]
     for name, spread in rows.items():
         if spread is not None:

@@ -16,7 +16,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import Header
 from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate
 from mixpose.units import UNITS_PER_METRE
 
 _LARGEST_SECOND = 2**31 - 1  # builtin_interfaces/Time counts them in an int32
@@ -72,6 +72,8 @@ def pose_message(
             f"{_LARGEST_SECOND} s; give the sensors times in seconds"
         )
     second, nanosecond = divmod(round(1e9 * seconds), 10**9)
+    covariance = np.zeros((6, 6)) if estimate.covariance is None else estimate.covariance
+    scale = np.array([1 / per_metre] * 3 + [1.0] * 3)
     return {
         "header": {"stamp": {"sec": second, "nanosec": nanosecond}, "frame_id": frame_id},
         "pose": {
@@ -79,14 +81,6 @@ def pose_message(
                 "position": dict(zip("xyz", plain(T[:3, 3] / per_metre))),
                 "orientation": dict(zip("xyzw", plain(rigid.quaternion_xyzw(T)))),
             },
-            "covariance": plain(_covariance(estimate, per_metre)),
+            "covariance": plain((covariance * np.outer(scale, scale)).ravel()),
         },
     }
-
-
-def _covariance(estimate: Estimate, per_metre: float) -> Floats:
-    """The covariance in m and rad, (36,)."""
-    if estimate.covariance is None:
-        return np.zeros(36)
-    scale = np.array([1 / per_metre] * 3 + [1.0] * 3)
-    return np.asarray(estimate.covariance * np.outer(scale, scale)).ravel()

@@ -26,15 +26,11 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Mask
 from mixpose.units import length_ratio
 
-TRC_MARK = "by mixpose"
-"""In the first line of files that mixpose wrote."""
-
+TRC_MARK = "by mixpose"  # in the first line of files that mixpose wrote
 MARKS = {"trc": ("PathFileType\t", TRC_MARK), "c3d": ("\x02P", "mixpose")}
 """How files of a format begin, and what stands further on in those that mixpose wrote."""
 
-LAST_FRAME = 2**16 - 2
-"""Frames are numbered from 1, in 16 bits; some readers count one beyond the last."""
-
+LAST_FRAME = 2**16 - 2  # numbers from 1, in 16 bits; some readers count one beyond the last
 _STAMPED = 1000  # from frame to frame, as a rule: these are stamps, in us or ns
 _FARTHEST = 10**15  # frames that a gap counts as, more than fit in any file
 _SENSORS = 7  # that a bit each says of whether they measured a point
@@ -48,8 +44,7 @@ class Trajectories:
 
     names: tuple[str, ...]  # N, all different
     places: Floats  # (F, N, 3), in the world; NaN where a marker is not known
-    # (F, N), of places that sensors measured, a length; NaN of those that are not, or by the pose
-    residuals: Floats
+    residuals: Floats  # (F, N), a length; NaN of places that sensors did not measure
     by_sensor: Mask  # (F, N, L), which sensors measured it
     first: int  # number of the first frame
     rate: float  # frames per second
@@ -70,7 +65,7 @@ def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
     """Numbers that frames of pose lines have in such a file, by their own.
 
     The same, but where frames are numbered by stamps: these count from 0, at the usual step of
-    their times, or of the stamps where there are none. Gaps stay gaps.
+    their times, else of the stamps. Gaps stay gaps.
     """
     stamps = sorted({line.frame for line in lines})
     steps = [after - before for before, after in pairwise(stamps)]
@@ -115,8 +110,8 @@ def rate_of(lines: Sequence[PoseLine], numbers: Mapping[int, int]) -> tuple[floa
 def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
     """Write trajectories in mm; the format cannot say which places sensors measured.
 
-    What is not known is NaN: an empty cell would shift the row where readers split at any space.
-    The name `called` of the file stands in its first line.
+    Unknown is NaN: an empty cell would shift the row where readers split at any space. The file's
+    name `called` stands in its first line.
     """
     frames, markers = trajectories.places.shape[:2]
     # columns are told apart by tabs, and by some readers at any white space
@@ -146,10 +141,10 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:
     """Write trajectories in mm, and tell whether frame n of mixpose is frame n + 1 there.
 
-    Where numbers are too large for that, frames begin at 1. A measured point has its residual, and
-    the bits of the sensors that measured it, of the first seven; one by the pose has the residual 0
-    and no bit, as C3D has it for points that are computed; one that is not known the residual -1.
-    Raises RecordingError if there are more frames than a file can number.
+    Else numbers are too large, and frames begin at 1. A measured point has its residual, and the
+    bits of the first seven sensors that measured it; one by the pose has the residual 0 and no bit,
+    as C3D has it for points that are computed; one that is not known the residual -1. Raises
+    RecordingError if there are more frames than a file can number.
     """
     import ezc3d  # noqa: PLC0415 - not everybody has it
 

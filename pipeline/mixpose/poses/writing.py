@@ -17,8 +17,11 @@ from mixpose.records import Estimate, Floats
 class PoseWriter(ABC):
     """Writes estimates to a text stream, each as soon as it is given; the stream stays open."""
 
-    def __init__(self, stream: TextIO, header: Header) -> None:
+    def __init__(self, stream: TextIO, header: Header, first_line: str = "") -> None:
         self._stream, self._header = stream, header
+        if first_line:
+            self._stream.write(f"{first_line}\n")
+            self._stream.flush()
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame and flush it. Raises ValueError if it holds what is not finite."""
@@ -35,15 +38,12 @@ class PoseWriter(ABC):
         """Write one frame."""
 
 
-def plain(values: ArrayLike) -> Any:
-    """Nested lists of floats (or one float) without negative zeros; any shape."""
+def plain(values: ArrayLike | None) -> Any:
+    """Nested lists of floats (or one float) of any shape without negative zeros; None of None."""
+    if values is None:
+        return None
     # -0.0 + 0.0 is 0.0: equal poses are equal bytes.
     return (np.asarray(values, dtype=np.float64) + 0.0).tolist()
-
-
-def plain_or_none(values: ArrayLike | None) -> Any:
-    """`plain`, with None left as None."""
-    return None if values is None else plain(values)
 
 
 def pose_of(estimate: Estimate) -> Floats | None:
@@ -52,10 +52,9 @@ def pose_of(estimate: Estimate) -> Floats | None:
 
 
 def require_finite(estimate: Estimate) -> None:
-    """Refuse an estimate that holds a NaN or an infinity.
+    """Raise a ValueError, naming frame and field, if an estimate holds a NaN or an infinity.
 
-    Raises ValueError naming frame and field.  No format has a place for such values, and an
-    estimate that holds one is a fault of the program, not of its user.
+    No format has a place for these: such an estimate is a fault of the program.
     """
     values: dict[str, Floats | float | None] = {
         "time_s": estimate.time_s,
@@ -93,10 +92,7 @@ class Stamps:
         self._has_times: bool | None = None  # the first frame decides
 
     def time_of(self, estimate: Estimate) -> float:
-        """Time in s, or the frame number.
-
-        Raises RecordingError if some frames have a time and others have none.
-        """
+        """Time in s, or the frame number; RecordingError if frames before it differ in that."""
         has_time = estimate.time_s is not None
         if self._has_times is None:
             self._has_times = has_time

@@ -8,6 +8,7 @@ from __future__ import annotations
 from mixpose.sensors.base import (
     OUTSIDE as OUTSIDE,
     AffineSensor as AffineSensor,
+    Rays as Rays,
     Sensor as Sensor,
     hide as hide,
 )
@@ -18,6 +19,7 @@ from mixpose.sensors.cloud import (
     CloudSensor as CloudSensor,
     as_images as as_images,
     clouds_among as clouds_among,
+    facing as facing,
     from_planes as from_planes,
 )
 from mixpose.sensors.doubted import (
@@ -26,7 +28,6 @@ from mixpose.sensors.doubted import (
     by_lenses as by_lenses,
     doubted as doubted,
 )
-from mixpose.sensors.facing import facing as facing
 from mixpose.sensors.fisheye import FisheyeCamera as FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor as RangeSensor
 from mixpose.sensors.moving import (
@@ -38,7 +39,6 @@ from mixpose.sensors.moving import (
 )
 from mixpose.sensors.parallel import ParallelBeam as ParallelBeam
 from mixpose.sensors.pinhole import PinholeCamera as PinholeCamera
-from mixpose.sensors.rays import Rays as Rays
 
 SENSOR_MODELS: dict[str, type[Sensor]] = {
     "pinhole": PinholeCamera,

@@ -12,14 +12,43 @@ Conventions
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, Self, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.rays import Rays
 
 OUTSIDE = -1.0e6
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Half-lines (lines, for parallel beams) in the world, one per detection.
+
+    A px covers ``offset + slope * d`` of length across the ray at a distance d from its origin.
+    """
+
+    origins: Floats  # (M, 3) centre of projection, or a point on the sensor's plane
+    directions: Floats  # (M, 3) unit vectors away from the sensor
+    pixels: Floats  # (M, 2) the detections
+    central: bool  # whether all start at one centre, in front of which alone the camera sees
+    offset: float
+    slope: float
+    cloud: object = None  # the same for the images of one cloud, whose rows are the same points
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def select(self, chosen: NDArray[Any]) -> Rays:
+        """The rays of some detections."""
+        return replace(
+            self,
+            origins=self.origins[chosen],
+            directions=self.directions[chosen],
+            pixels=self.pixels[chosen],
+        )
 
 
 @runtime_checkable
@@ -29,48 +58,33 @@ class Sensor(Protocol):
     @property
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
-        ...
 
     @property
     def unit(self) -> Literal["px", "length"]:
         """What the sensor coordinates count."""
-        ...
 
     @property
     def lower(self) -> Floats:
         """Smallest measurable coordinates (m,); minus infinity where unknown."""
-        ...
 
     @property
     def upper(self) -> Floats:
         """Largest measurable coordinates (m,); infinity where unknown."""
-        ...
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Map world points (..., 3) to sensor coordinates (..., m) and a visibility mask (...)."""
-        ...
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `project`, with the Jacobian (..., m, 3) by world coordinates in between."""
-        ...
 
     def towards(self, points_world: Floats) -> Floats:
         """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
-        ...
 
     def rays(self, y: Floats) -> Rays | None:
-        """Lines of sight of detections (M, m); None where a detection leaves no line in space.
-
-        Detections that no point in space can cause are left out.
-        """
-        ...
+        """Lines of sight of detections (M, m) that a point can cause; None if they leave none."""
 
     def moved(self, motion: Floats) -> Self:
-        """The sensor that measures of points x what this one measures of ``motion @ x``.
-
-        `motion` is a rigid motion (4, 4) of the world.
-        """
-        ...
+        """The sensor that measures of x what this one does of ``motion @ x``, rigid (4, 4)."""
 
 
 @runtime_checkable
@@ -80,14 +94,6 @@ class AffineSensor(Sensor, Protocol):
     @property
     def affine(self) -> Floats:
         """Sensor coordinates as rows (m, 4) that are multiplied by (x, y, z, 1) in the world."""
-        ...
-
-
-def image_bounds(resolution: tuple[int, int] | None) -> tuple[Floats, Floats]:
-    """Corners of an image (width, height) in pixel coordinates; infinite where unknown."""
-    if resolution is None:
-        return np.full(2, -np.inf), np.full(2, np.inf)
-    return np.full(2, -0.5), np.asarray(resolution, dtype=np.float64) - 0.5
 
 
 def within(y: Floats, lower: Floats, upper: Floats) -> Mask:

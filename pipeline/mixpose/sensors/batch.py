@@ -1,7 +1,6 @@
 """Several sensors of one kind, linearised together.
 
-For a handful of points NumPy spends its time on calls, not on numbers: one matrix product for all
-cameras costs hardly more than for one.
+For a handful of points NumPy spends its time on calls: one product for all costs no more.
 """
 
 from __future__ import annotations

@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import Sensor
+from mixpose.sensors.base import Rays, Sensor
+from mixpose.sensors.camera import PlacedSensor
 from mixpose.sensors.parallel import ParallelBeam
-from mixpose.sensors.rays import Rays
 
 PLANES: tuple[tuple[str, tuple[int, int]], ...] = (("xy", (0, 1)), ("yz", (1, 2)), ("zx", (2, 0)))
 """What the three images are called, and the axes of the cloud that are theirs, u first."""
@@ -36,17 +36,16 @@ class CloudPlane(ParallelBeam):
 
 
 @dataclass(frozen=True, eq=False)
-class CloudSensor:
+class CloudSensor(PlacedSensor):
     """Measures points in space."""
 
-    # (4, 4) to the axes that the points are in
-    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
 
-    dimension = 3
-    unit: Literal["px", "length"] = field(default="length", init=False, repr=False)
+    dimension: ClassVar[int] = 3
+    unit: ClassVar[Literal["px", "length"]] = "length"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_sensor_world", np.asarray(self.T_sensor_world, dtype=float))
+        self._as_floats("T_sensor_world")
 
     @property
     def lower(self) -> Floats:
@@ -86,10 +85,6 @@ class CloudSensor:
         """None: a detection is a point, not a line."""
         return
 
-    def moved(self, motion: Floats) -> Self:
-        """The cloud of points x as this one has it of ``motion @ x``."""
-        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
-
 
 @lru_cache(maxsize=64)
 def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
@@ -104,10 +99,10 @@ def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
 def as_images(
     sensors: Sequence[Sensor], deviations: Sequence[float]
 ) -> tuple[tuple[Sensor, ...], Floats, list[int]]:
-    """Sensors with clouds as their images, which tell as much at as many deviations.
+    """Sensors with clouds as their images, which tell as much at as many deviations along an axis.
 
-    Deviations are those along an axis: of a cloud's images √2 times the cloud's, as each coordinate
-    is in two of them.  The last are the places of the sensors given, or of their first images.
+    These are √2 times the cloud's, as each coordinate is in two images. The last are the places of
+    the sensors given, or of their first images.
     """
     parts = [one.planes if isinstance(one, CloudSensor) else (one,) for one in sensors]
     counts = [len(part) for part in parts]
@@ -120,6 +115,27 @@ def from_planes(planes: Floats) -> Floats:
     """Points (..., 3) in the axes of a cloud of places (3, ..., 2) in its three images."""
     first, second, _ = planes
     return np.concatenate([first, second[..., 1:]], axis=-1)
+
+
+def facing(
+    sensor: Sensor,
+    T_world_object: Floats,
+    points_world: Floats,
+    normals: Floats | None,
+    edge_on: float = 0.0,
+) -> Mask:
+    """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
+
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4). In images a feature is `edge_on`
+    from that cosine of the angle to its normal; ranges are measured from all of its front. All
+    features face a cloud, whose system sees them from several sides.
+    """
+    if normals is None or isinstance(sensor, CloudPlane | CloudSensor):
+        return np.ones(points_world.shape[:-1], dtype=np.bool_)
+    outward = normals @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
+    towards = sensor.towards(points_world)
+    cosines = np.vecdot(outward, towards) / np.linalg.norm(towards, axis=-1)
+    return np.asarray(cosines > (edge_on if sensor.dimension > 1 else 0.0))
 
 
 def _turned(axes: tuple[int, int]) -> Floats:

@@ -23,8 +23,7 @@ class LensDistortion:
     """OpenCV's distortion of a pinhole camera."""
 
     coefficients: Floats  # (14,) in OpenCV's order, or (14, L, 1) of L lenses side by side
-    # Normalised radius up to which the radial polynomial grows. Beyond it a model fitted to the
-    # image folds back and would show points that no lens images.
+    # up to which the radial polynomial grows: beyond it a model fitted to the image folds back
     radius_limit: float | Floats
 
     @classmethod

@@ -21,8 +21,7 @@ from mixpose.sensors.pinhole import PinholeCamera
 class CalibrationError:
     """Standard deviations of what a calibration says of a sensor."""
 
-    # of the focal length, as a share of it; of the pixel size, with parallel beams
-    focal: float = 0.0
+    focal: float = 0.0  # of the focal length, as a share; of the pixel size, with parallel beams
     principal_point: float = 0.0  # along each axis, px
     rotation_deg: float = 0.0  # of the orientation, about each axis
     position: float = 0.0  # along each axis, length units
@@ -31,17 +30,16 @@ class CalibrationError:
 
 def doubted(sensor: Sensor, error: CalibrationError) -> tuple[Sensor, ...]:
     """A sensor, and the same one off by a standard deviation in one thing each."""
+    others: list[Sensor] = []
+    turn = np.radians(error.rotation_deg)
     if isinstance(sensor, RangeSensor):
-        moves = [_moved(np.eye(4), k, error.position) for k in range(3)]
         biased = replace(sensor, range_bias=sensor.range_bias + error.range_bias)
-        others: list[Sensor] = [biased] if error.range_bias else []
-        return (sensor, *others, *(sensor.moved(one) for one in moves if error.position))
-    others = []
+        others, turn = [biased] if error.range_bias else [], 0.0
     if isinstance(sensor, PinholeCamera | FisheyeCamera):
-        for u, v, by in ((0, 2, error.principal_point), (1, 2, error.principal_point)):
+        for row in (0, 1) if error.principal_point else ():
             K = sensor.camera_matrix.copy()
-            K[u, v] += by
-            others += [replace(sensor, camera_matrix=K)] if by else []
+            K[row, 2] += error.principal_point
+            others.append(replace(sensor, camera_matrix=K))
         K = sensor.camera_matrix.copy()
         K[:2, :2] *= 1 + error.focal
         others += [replace(sensor, camera_matrix=K)] if error.focal else []
@@ -52,10 +50,8 @@ def doubted(sensor: Sensor, error: CalibrationError) -> tuple[Sensor, ...]:
         size = sensor.pixel_size / (1 + error.focal)
         others += [replace(sensor, pixel_size=size)] if error.focal else []
     T = np.asarray(getattr(sensor, "T_sensor_world", np.eye(4)))
-    turns = [_moved(T, k, np.radians(error.rotation_deg)) for k in (3, 4, 5)]
-    moves = [_moved(T, k, error.position) for k in range(3)]
-    others += [sensor.moved(one) for one in turns if error.rotation_deg]
-    return (sensor, *others, *(sensor.moved(one) for one in moves if error.position))
+    steps = [(k, turn) for k in (3, 4, 5)] + [(k, error.position) for k in range(3)]
+    return (sensor, *others, *(sensor.moved(_moved(T, k, by)) for k, by in steps if by))
 
 
 def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
@@ -78,8 +74,7 @@ def _with_other_lenses(sensors: tuple[Sensor, ...], k1: float) -> SensorBatch:
     for k, sensor in enumerate(sensors):
         if isinstance(sensor, PinholeCamera | FisheyeCamera):
             given = np.ravel(sensor.distortion)
-            distortion = np.zeros(max(len(given), 4))
-            distortion[: len(given)] = given
+            distortion = np.pad(given, (0, max(4 - len(given), 0)))
             distortion[0] += k1
             others[k] = replace(sensor, distortion=distortion)
     return side_by_side((*sensors, *others))

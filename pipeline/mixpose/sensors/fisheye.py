@@ -2,39 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import hide, image_bounds, within
-from mixpose.sensors.rays import Rays, central_rays
+from mixpose.sensors.base import Rays, hide, within
+from mixpose.sensors.camera import CentralCamera
 
 _WIDEST = np.radians(140.0)  # from the axis: no lens shows more, whatever its image has room for
 _NEWTON = 4  # steps from a table of angles, which is right to 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class FisheyeCamera:
+class FisheyeCamera(CentralCamera):
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
 
-    It sees as far from its axis as the radius grows and the image goes, beyond 90° too; without a
-    resolution up to 90°.
-
-    Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
+    It sees as far as the radius grows and the image goes, without a resolution up to 90° from its
+    axis. Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
     """
 
     camera_matrix: Floats  # (3, 3) px
     distortion: Floats = field(default_factory=lambda: np.zeros(4))  # (4,) k1 to k4, or none
     resolution: tuple[int, int] | None = None  # width and height, px; None: unbounded
     T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
-    lower: Floats = field(init=False, repr=False)
-    upper: Floats = field(init=False, repr=False)
     theta_limit: float = field(init=False, repr=False)
-
-    dimension = 2
-    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
 
     def __post_init__(self) -> None:
         distortion = np.asarray(self.distortion, dtype=np.float64).ravel()
@@ -42,11 +34,7 @@ class FisheyeCamera:
             raise ValueError(f"{distortion.size} distortion coefficients, a fisheye camera has 4")
         distortion = np.zeros(4) if distortion.size == 0 else distortion
         object.__setattr__(self, "distortion", distortion)
-        for name in ("camera_matrix", "T_sensor_world"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        lower, upper = image_bounds(self.resolution)
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+        self._as_floats("camera_matrix", "T_sensor_world")
         widest = np.pi / 2 if self.resolution is None else _WIDEST
         theta = np.linspace(0, widest, 2001)
         bad = ~(np.diff(self._radius(theta)[0]) > 0)
@@ -63,11 +51,6 @@ class FisheyeCamera:
         assert J is not None
         return y, J, visible
 
-    def towards(self, points_world: Floats) -> Floats:
-        """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
-        centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
-        return np.asarray(centre - points_world)
-
     def rays(self, y: Floats) -> Rays:
         """Lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
@@ -79,11 +62,7 @@ class FisheyeCamera:
             there, slope = self._radius(theta)
             theta = np.clip(theta - (there - radius) / np.maximum(slope, 1e-9), 0, self.theta_limit)
         across = np.sin(theta) / np.where(radius > 0, radius, 1.0)
-        return central_rays(self, y, np.column_stack([xy * across[:, None], np.cos(theta)]))
-
-    def moved(self, motion: Floats) -> Self:
-        """The camera that sees points x where this one sees ``motion @ x``."""
-        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
+        return self._rays_along(np.column_stack([xy * across[:, None], np.cos(theta)]), y)
 
     def _radius(self, theta: Floats) -> tuple[Floats, Floats]:
         k1, k2, k3, k4 = self.distortion

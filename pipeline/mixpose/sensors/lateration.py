@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -13,26 +13,16 @@ from mixpose.sensors.base import hide, within
 
 @dataclass(frozen=True, eq=False)
 class RangeSensor:
-    """Measures distances: range = ‖x_world − position‖ + range_bias.
+    """Measures distances: range = ‖x_world − position‖ + range_bias."""
 
-    Parameters
-    ----------
-    position : (3,) array
-        The lateration source γ_l in the world.
-    range_bias : float
-        Constant part of every reading, in length units.
-    range_limits : (float, float) or None
-        Smallest and largest reading; None for no limits.
-    """
-
-    position: Floats
-    range_bias: float = 0.0
-    range_limits: tuple[float, float] | None = None
+    position: Floats  # (3,) the lateration source γ_l in the world
+    range_bias: float = 0.0  # constant part of every reading, length units
+    range_limits: tuple[float, float] | None = None  # smallest and largest reading; None: no limits
     lower: Floats = field(init=False, repr=False)
     upper: Floats = field(init=False, repr=False)
 
-    dimension = 1
-    unit: Literal["px", "length"] = field(default="length", init=False, repr=False)
+    dimension: ClassVar[int] = 1
+    unit: ClassVar[Literal["px", "length"]] = "length"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))

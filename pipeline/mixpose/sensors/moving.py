@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.rigid import cross, inverse, perturb
 from mixpose.sensors import batch
-from mixpose.sensors.base import Sensor
-from mixpose.sensors.rays import Rays
+from mixpose.sensors.base import Rays, Sensor
 
 
 @dataclass(frozen=True)
@@ -61,24 +60,17 @@ class RollingSensor:
     delay: float
     readout: float
 
-    @property
-    def dimension(self) -> int:
-        """m, the number of sensor coordinates."""
-        return self.sensor.dimension
-
-    @property
-    def unit(self) -> Literal["px", "length"]:
-        """What the sensor coordinates count."""
-        return self.sensor.unit
+    dimension: ClassVar[int] = 2
+    unit: ClassVar[Literal["px", "length"]] = "px"
 
     @property
     def lower(self) -> Floats:
-        """Smallest measurable coordinates (m,)."""
+        """The image's upper left corner (2,)."""
         return self.sensor.lower
 
     @property
     def upper(self) -> Floats:
-        """Largest measurable coordinates (m,)."""
+        """The image's lower right corner (2,)."""
         return self.sensor.upper
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
@@ -151,10 +143,10 @@ class RollingBatch:
         return np.asarray(self._still.towards(at.swapaxes(1, 2)) @ turns)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `SensorBatch.linearise`.
+        """As `SensorBatch.linearise`, where t solves t = moment of the row that is seen at t.
 
-        The moment t solves t = moment of the row that is seen at t.  One Newton step from the
-        middle row leaves the square of the share of the readout in which the image moves a row.
+        One Newton step from the middle row leaves the square of the share of the readout in which
+        the image moves a row.
         """
         per_row = self._per_row
         each = points_world if points_world.ndim > 2 else points_world[None]
@@ -176,11 +168,7 @@ class RollingBatch:
         return y, by_point.transpose(2, 3, 1, 0), visible
 
     def _moved(self, arms: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
-        """Points (3, L, n) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
-
-        Of arms (3, L, n) from the body's origin.  Velocities are those of points of the body, but
-        for how far its origin moved; turns are rotation vectors (3, L, n) or (3, L, 1).
-        """
+        """Where arms (3, L, n) are after seconds (L, n) or (L, 1), their velocities, and turns."""
         more = seconds * self._acceleration
         twists = (self._velocity + 0.5 * more) * seconds
         rates, turned = self._velocity + more, twists[3:]

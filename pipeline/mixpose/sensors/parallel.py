@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
-from mixpose.sensors.base import hide, image_bounds, within
-from mixpose.sensors.rays import Rays
+from mixpose.sensors.base import Rays, hide, within
+from mixpose.sensors.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
-class ParallelBeam:
+class ParallelBeam(Camera):
     """A camera without perspective: pixel = (x_s, y_s) / pixel_size + principal_point.
 
     The paper's rotated projections are ``x_s = cos γ x + sin γ y, y_s = z``.
@@ -24,18 +23,9 @@ class ParallelBeam:
     principal_point: Floats  # (2,) where the sensor's origin projects, px
     resolution: tuple[int, int] | None = None  # width and height, px; None: unbounded
     T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
-    lower: Floats = field(init=False, repr=False)
-    upper: Floats = field(init=False, repr=False)
-
-    dimension = 2
-    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("principal_point", "T_sensor_world"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        lower, upper = image_bounds(self.resolution)
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+        self._as_floats("principal_point", "T_sensor_world")
 
     @property
     def affine(self) -> Floats:
@@ -71,7 +61,3 @@ class ParallelBeam:
         origins = across @ T_world_sensor[:3, :2].T + T_world_sensor[:3, 3]
         directions = np.tile(T_world_sensor[:3, 2], (len(y), 1))
         return Rays(origins, directions, y, False, self.pixel_size, 0.0)
-
-    def moved(self, motion: Floats) -> Self:
-        """The camera that sees points x where this one sees ``motion @ x``."""
-        return replace(self, T_sensor_world=self.T_sensor_world @ motion)

@@ -2,60 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from mixpose.records import Floats, Mask
-from mixpose.sensors.base import hide, image_bounds, within
+from mixpose.sensors.base import Rays, hide, within
+from mixpose.sensors.camera import CentralCamera
 from mixpose.sensors.distortion import LensDistortion
-from mixpose.sensors.rays import Rays, central_rays
 
 # Of a strong lens OpenCV's five rounds leave a pixel.
 _UNDONE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-
 NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
 
 
 @dataclass(frozen=True, eq=False)
-class PinholeCamera:
+class PinholeCamera(CentralCamera):
     """A perspective camera.
 
-    Parameters
-    ----------
-    camera_matrix : (3, 3) array
-        ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in px.
-    distortion : (k,) array
-        0, 4, 5, 8, 12 or 14 OpenCV coefficients.
-    resolution : (int, int) or None
-        Width and height in px; None leaves the image unbounded.
-    T_sensor_world : (4, 4) array
-
-    Raises
-    ------
-    ValueError
-        If the number of distortion coefficients is not one of OpenCV's.
+    Raises `ValueError` if `distortion` has not 0, 4, 5, 8, 12 or 14 coefficients.
     """
 
-    camera_matrix: Floats
-    distortion: Floats = field(default_factory=lambda: np.zeros(0))
-    resolution: tuple[int, int] | None = None
-    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
-    lower: Floats = field(init=False, repr=False)
-    upper: Floats = field(init=False, repr=False)
+    camera_matrix: Floats  # (3, 3) ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]``, px
+    distortion: Floats = field(default_factory=lambda: np.zeros(0))  # (k,) in OpenCV's order
+    resolution: tuple[int, int] | None = None  # width and height, px; None: unbounded
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4)
     lens: LensDistortion | None = field(init=False, repr=False)
 
-    dimension = 2
-    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
-
     def __post_init__(self) -> None:
-        for name in ("camera_matrix", "distortion", "T_sensor_world"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        lower, upper = image_bounds(self.resolution)
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+        self._as_floats("camera_matrix", "distortion", "T_sensor_world")
         object.__setattr__(self, "lens", LensDistortion.from_coefficients(self.distortion))
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
@@ -84,11 +60,6 @@ class PinholeCamera:
         hide(y, visible, J)
         return y, J, visible
 
-    def towards(self, points_world: Floats) -> Floats:
-        """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
-        centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
-        return np.asarray(centre - points_world)
-
     def rays(self, y: Floats) -> Rays:
         """Lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
@@ -98,11 +69,7 @@ class PinholeCamera:
         if self.lens is not None and len(y):  # OpenCV has no empty arrays
             given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
             xy = np.asarray(cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2), float)
-        return central_rays(self, y, np.column_stack([xy, np.ones(len(xy))]))
-
-    def moved(self, motion: Floats) -> Self:
-        """The camera that sees points x where this one sees ``motion @ x``."""
-        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
+        return self._rays_along(np.column_stack([xy, np.ones(len(xy))]), y)
 
     def _normalised(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         points = points_world @ self.T_sensor_world[:3, :3].T + self.T_sensor_world[:3, 3]

@@ -18,18 +18,17 @@ from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, is_number, num
 from mixpose.units import Unit
 
 FEWEST_FEATURES = 3
-
 _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 
 
 def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
-    The marker file's path is relative to `folder`; lengths of other programs' files are converted
-    into `unit`. There must be three features or more, none repeated, that spread and normals fit.
+    The marker file is below `folder`; lengths of other programs' files are converted into `unit`.
+    Raises BadKeyError unless there are three features or more, none repeated, that the rest fits.
     """
     markers = _markers(table, folder, unit)
-    points = np.zeros((0, 3)) if markers is None else markers.points
+    points = markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
     nodes = len(points) + SEGMENT_NODES * len(segments)
@@ -66,8 +65,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     normals = _normals(table, markers, count)
     _refuse_repeated(points, spreads, normals, given)
     radii = _radii(table, normals, len(points), count)
-    gravity = _gravity(table)
-    names = _names(table, markers)
+    gravity, names = _gravity(table), _names(table, markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
 
 
@@ -77,21 +75,21 @@ def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, ke
     parts += [] if normals is None else [normals[: len(points)]]
     rows = np.concatenate(parts, axis=1)
     _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    again = np.flatnonzero(first[back.ravel()] != np.arange(len(rows)))
+    before = first[back.ravel()]
+    again = np.flatnonzero(before != np.arange(len(rows)))
     if len(again):
         k = int(again[0])
-        before = int(first[back.ravel()][k])
         raise BadKeyError(
-            f"point {k + 1} is where point {before + 1} is, alike in all; allowed: each point once",
+            f"point {k + 1} is where point {before[k] + 1} is, alike in all; allowed: each point "
+            "once",
             key,
         )
 
 
-def _names(table: ObjectTable, markers: Markers | None) -> tuple[str, ...]:
+def _names(table: ObjectTable, markers: Markers) -> tuple[str, ...]:
     """What people call the points; nothing where a file gives some no name, or two the same."""
-    given = markers.names if markers is not None and table.names is None else table.names or ()
-    names = tuple(" ".join(name.split()) for name in given)
-    count = 0 if markers is None else len(markers.points)
+    given = markers.names if table.names is None else table.names
+    names, count = tuple(" ".join(name.split()) for name in given), len(markers.points)
     if table.names is None:
         return names if all(names) and len({*names}) == len(names) == count else ()
     if table.file is not None:
@@ -136,22 +134,20 @@ def _gravity(table: ObjectTable) -> Gravity | None:
     return Gravity(table.gravity.direction, table.gravity.sigma)
 
 
-def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers | None:
+def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers:
     if table.file is not None:
         if table.points is not None:
             raise BadKeyError("stands beside points; allowed: one of the two", "file")
         with under("file"):
             return read_marker_file(folder / table.file, unit)
-    if table.points is not None:
-        return Markers(table.points, None)
-    if table.segments is None:
+    if table.points is None and table.segments is None:
         raise BadKeyError('missing; allowed: points, file = "markers.csv" or segments', "points")
-    return None
+    return Markers(np.zeros((0, 3)) if table.points is None else table.points, None)
 
 
-def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
+def _spreads(table: ObjectTable, markers: Markers, count: int) -> Floats:
     """Covariances (N, 3, 3) of all features."""
-    if markers is None or markers.sigma is None:
+    if markers.sigma is None:
         with under("sigma"):
             return covariances(0.0 if table.sigma is None else table.sigma, count)
     if table.sigma is not None:
@@ -163,11 +159,10 @@ def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
 
 
 def covariances(sigma: Any, count: int) -> Floats:
-    """Read the key ``sigma`` as one covariance per feature, (N, 3, 3).
+    """Read the key ``sigma``, which is `SIGMA_ALLOWED`, as one covariance per feature, (N, 3, 3).
 
-    It is a number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature. Where
-    three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and three
-    lists of three numbers are a covariance for all of them.
+    Where three features leave it open, a list of three numbers is [sx, sy, sz] for all of them, and
+    three lists of three numbers are a covariance for all of them.
     """
     if _is_single(sigma):
         _check_ambiguous(sigma, count)
@@ -188,9 +183,8 @@ def _is_single(sigma: Any) -> bool:
     if not isinstance(sigma, list):
         return True
     lists = [item for item in sigma if isinstance(item, list)]
-    if len(sigma) != 3 or not lists:
-        return len(sigma) == 3
-    return len(lists) == 3 and not any(isinstance(x, list) for item in lists for x in item)
+    of_numbers = not any(isinstance(x, list) for item in lists for x in item)
+    return len(sigma) == 3 and (not lists or (len(lists) == 3 and of_numbers))
 
 
 def _check_ambiguous(sigma: Any, count: int) -> None:
@@ -244,13 +238,13 @@ def _positive(covariance: Floats) -> Floats:
     return covariance
 
 
-def _normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+def _normals(table: ObjectTable, markers: Markers, count: int) -> Floats | None:
     """Unit normals (N, 3), else those of the marker file where it has all features."""
     normals = table.normals
-    if normals is None and markers is not None and markers.normals is not None:
-        normals = markers.normals if len(markers.normals) == count else None
     if normals is None:
-        return None
+        normals = markers.normals
+        if normals is None or len(normals) != count:
+            return None
     allowed = "one per feature, points first and then segments"
     _require_count(len(normals), "normals", count, "features", allowed, "normals")
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)

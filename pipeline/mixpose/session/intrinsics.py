@@ -1,20 +1,32 @@
-"""Camera matrix and distortion: what is allowed, wherever they were read."""
+"""What calibrations have in them, wherever it was read: matrix, distortion, size and motion."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.messages import BadKeyError, found
-from mixpose.session.values import numbers
+from mixpose.rigid import from_parts
+from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.motion import rigid, rotation_of_vector
+from mixpose.session.values import MATRIX_FORM, numbers, resolution
 
 CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 
-MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 DISTORTION_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
+
+# Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
+MODELS: dict[str, CameraModel] = {
+    "radtan": "pinhole",
+    "plumb_bob": "pinhole",
+    "rational_polynomial": "pinhole",
+    "none": "pinhole",
+    "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}
 
 # No camera is near these; beyond them the squares of directions are no numbers.
 SHORTEST_FOCAL_PX, LONGEST_FOCAL_PX = 1e-3, 1e9
@@ -26,8 +38,7 @@ class Intrinsics:
 
     camera_matrix: Floats  # (3, 3)
     distortion: Floats  # (k,), OpenCV's order; empty for none
-    # width and height in px; None where the calibration does not say
-    resolution: tuple[int, int] | None = None
+    resolution: tuple[int, int] | None = None  # width and height, px; None where it is not said
     model: CameraModel | None = None  # the kind of camera; None where the calibration does not say
 
 
@@ -53,10 +64,7 @@ def camera_matrix(value: Any) -> Floats:
 
 
 def distortion(value: Any, model: str) -> Floats:
-    """Read distortion coefficients, as a list or as a matrix of one row or column.
-
-    Raises BadKeyError if a camera of this model cannot have that many.
-    """
+    """Read as many coefficients as the model may have: a list, or a matrix of one row or column."""
     is_row = isinstance(value, list) and len(value) == 1 and isinstance(value[0], list)
     flat = value[0] if is_row else column_as_list(value)
     if flat is None or flat == []:
@@ -74,3 +82,49 @@ def column_as_list(value: Any) -> Any:
     if isinstance(value, list) and all(isinstance(row, list) and len(row) == 1 for row in value):
         return [row[0] for row in value]
     return value
+
+
+def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floats:
+    """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists."""
+    with under("translation"):
+        t = numbers(column_as_list(translation), (3,), "[x, y, z]")
+    rotation = column_as_list(rotation)
+    allowed = "a rotation, three rows of three numbers or [x, y, z], axis times angle in radians"
+    if isinstance(rotation, list) and len(rotation) == 9:
+        rotation = [rotation[k : k + 3] for k in (0, 3, 6)]
+    is_matrix = isinstance(rotation, list) and bool(rotation) and isinstance(rotation[0], list)
+    with under(key):
+        values = numbers(rotation, (3, 3) if is_matrix else (3,), allowed)
+    if is_matrix:
+        return rigid(from_parts(values, t), key)
+    return from_parts(rotation_of_vector(values, key).as_matrix(), t)
+
+
+def model_of_distortion(name: object) -> CameraModel | None:
+    """The camera model that a distortion model of Kalibr or ROS belongs to."""
+    if name is None or name == "":  # as ROS writes for a camera without distortion
+        return None
+    if isinstance(name, str) and name in MODELS:
+        return MODELS[name]
+    raise BadKeyError(found(name, one_of(MODELS)))
+
+
+def present(content: dict[str, Any], key: str) -> Any:
+    """A key without which a camera would silently count as free of distortion."""
+    if key not in content:
+        raise BadKeyError(f"missing; keys in the file: {', '.join(map(str, content))[:80]}")
+    return content[key]
+
+
+def plain(value: Any) -> Any:
+    """Turn text such as 1e-05, which YAML does not take for a number, into numbers."""
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    with suppress(ValueError):
+        return float(value) if isinstance(value, str) else value
+    return value
+
+
+def size_of(value: Any) -> tuple[int, int] | None:
+    """Width and height; None where they are missing or, as some drivers write, zero."""
+    return None if value in (None, [0, 0]) else resolution(value)

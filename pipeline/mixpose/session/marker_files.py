@@ -3,13 +3,9 @@
 NDI's .rom (SROM): a binary file of 752 bytes with up to 20 markers, in mm. Little-endian: "NDI", a
 checksum at byte 4 (the sum of all bytes after it), the number of markers at byte 28, positions as
 three float32 each from byte 72.
-
-Vicon's .vsk: XML in which positions of markers name parameters, in mm. A file may describe a
-skeleton of several segments; a rigid body has one.
-
-AsterTrack's .obj: a mesh in metres, in which each face of a marker group is a flat marker. A marker
-is at the middle of its face and looks along the face's normal. Groups are those whose name has
-"marker" in it; a file without groups has nothing but markers.
+Vicon's .vsk: XML in which positions of markers name parameters, in mm; a rigid body is one segment.
+AsterTrack's .obj: a mesh in metres. Each face of a group whose name has "marker" in it, or of a
+file without groups, is a flat marker: at the middle of the face, looking along its normal.
 """
 
 from __future__ import annotations
@@ -36,14 +32,11 @@ _ALLOWED = "a CSV file name,x,y,z[,sigma...], NDI's .rom, Vicon's .vsk or AsterT
 NDI_MARK = b"NDI\0"
 _CHECKSUM, _SUMMED_FROM, _COUNT, _POSITIONS = 4, 6, 28, 72
 _MOST_NDI = 20
-
 _VICON_TARGET = "TargetLocalPointToWorldPoint"
-
 _HEADER = ["name", "x", "y", "z"]
 _SIGMA_COLUMNS = (0, 1, 3, 9)
-
+# of a table that `mixpose learn` wrote: how well markers are known, for people
 LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
-"""Columns of a table that `mixpose learn` wrote: how well markers are known, for people."""
 
 
 def read_marker_file(path: Path, unit: Unit) -> Markers:
@@ -67,10 +60,7 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
 
 
 def read_rom(content: bytes) -> Markers:
-    """Read the markers of an NDI tool.
-
-    Raises BadKeyError if the file is none, is cut short, or has changed since it was written.
-    """
+    """Read the markers of an NDI tool; BadKeyError if the file is none or damaged."""
     if not content.startswith(NDI_MARK):
         raise BadKeyError('not an NDI .rom file, which begins with "NDI"')
     if len(content) < _POSITIONS + 12 * _MOST_NDI:
@@ -86,10 +76,7 @@ def read_rom(content: bytes) -> Markers:
 
 
 def read_vsk(content: bytes) -> Markers:
-    """Read the markers of a Vicon subject that is one rigid body.
-
-    Raises BadKeyError if the file is no such XML, is a skeleton, or lacks a parameter.
-    """
+    """Read the markers of a Vicon subject; BadKeyError if the file is not that of a rigid body."""
     text = as_text(content)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise BadKeyError("found a DOCTYPE or ENTITY, which a .vsk file does not have")
@@ -140,14 +127,16 @@ def read_astertrack(content: bytes) -> Markers:
     for number, line in enumerate(as_text(content).splitlines(), start=1):
         word, *cells = line.split() or [""]
         if word == "v":
-            vertices.append(_coordinates(cells, number))
+            vertices.append([as_number(cell) for cell in cells[:3]])
+            if len(vertices[-1]) != 3 or not all(map(is_number, vertices[-1])):
+                raise BadKeyError(f"line {number}: {found(' '.join(cells), 'v x y z')}")
         elif word in ("g", "o"):
             group = " ".join(cells)
         elif word == "f":
             faces.append((group, number, _corners(cells, number)))
     if not vertices or not faces:
         raise BadKeyError("found no vertices (v) and faces (f), as a Wavefront .obj has them")
-    groups = list(dict.fromkeys(group for group, _, _ in faces))
+    groups = list(dict.fromkeys(group for group, *_ in faces))
     of_markers = [name for name in groups if "marker" in name.lower()]
     if not of_markers and groups != [""]:
         raise BadKeyError(
@@ -159,13 +148,6 @@ def read_astertrack(content: bytes) -> Markers:
     points, normals = (np.array(part) for part in zip(*placed, strict=True))
     names = tuple(str(k + 1) for k in range(len(points)))
     return Markers(points, None, names, normals)
-
-
-def _coordinates(cells: list[str], line: int) -> list[float]:
-    values = [as_number(cell) for cell in cells[:3]]
-    if len(values) != 3 or not all(map(is_number, values)):
-        raise BadKeyError(f"line {line}: {found(' '.join(cells), 'v x y z')}")
-    return values
 
 
 def _corners(cells: list[str], line: int) -> list[int]:
@@ -205,20 +187,16 @@ class Markers:
     """What a marker table holds."""
 
     points: Floats  # (N, 3)
-    # per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them; None
-    # where the table has no such columns
-    sigma: list[Any] | None
+    sigma: list[Any] | None  # of each, as the key ``sigma`` has it; None without such columns
     names: tuple[str, ...] = ()  # of the markers, where the file has names
-    # (N, 3), outward directions of flat markers, where the file has them
-    normals: Floats | None = None
+    normals: Floats | None = None  # (N, 3), outward, of flat markers, where the file has them
 
 
 def read_markers(path: Path) -> Markers:
-    """Read a marker table; problems name line and column.
+    """Read a marker table, a CSV file; problems name line and column.
 
-    It is a CSV file with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along
-    x, y and z) or nine (the covariance, row by row). The columns in which ``mixpose learn`` says
-    how well markers are known may stand there, too.
+    The header ``name,x,y,z`` is followed by no column, one (σ), three (σ along x, y and z) or nine
+    (the covariance, row by row), and perhaps by `LEARNT_COLUMNS`.
     """
     content = read_bytes(path)
     with in_file(path.name):
@@ -230,24 +208,20 @@ def read_markers(path: Path) -> Markers:
         if not rows:
             raise BadKeyError("the file is empty; allowed: a header name,x,y,z and a row per point")
         header = [cell.strip() for cell in rows[0][1]]
-        _check_header(header)
-        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
-        values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
-        if not len(values):
+        words = [name.lower() for name in header]
+        if words[:4] != _HEADER or len(words) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
+            raise BadKeyError(
+                f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
+                "columns of sigma"
+            )
+        if len(rows) == 1:
             raise BadKeyError("found no markers below the header")
+        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
+        values = values[:, : len(header) - 1 - _learnt(header)]
         names = _names_of([(line, row[0]) for line, row in rows[1:]])
     spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
     sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
     return Markers(values[:, :3], sigma, names)
-
-
-def _check_header(header: list[str]) -> None:
-    names = [name.lower() for name in header]
-    if names[:4] != _HEADER or len(names) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
-        raise BadKeyError(
-            f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
-            "columns of sigma"
-        )
 
 
 def _learnt(header: list[str]) -> int:

@@ -15,12 +15,10 @@ Key = tuple[str | int, ...]
 
 
 class BadKeyError(ValueError):
-    """What is wrong with one key, before the file it stands in is known: all that readers raise
-    here.
+    """What is wrong with one key: all that readers raise here, before the file's name is known.
 
-    A ValueError, so that pydantic collects it with its own findings. `text` says what was found and
-    what is allowed; `key` leads to the value from where the problem was noticed, list items by
-    number, from 0.
+    A ValueError, which pydantic collects. `text` says what was found and what is allowed; `key`
+    leads to the value from where the problem was noticed, list items by number, from 0.
     """
 
     def __init__(self, text: str, *key: str | int) -> None:
@@ -79,21 +77,20 @@ def _toml(value: object) -> str:
 def dotted(key: Key, named: Iterable[object] = ()) -> str:
     """Write a key as ``sensor["left"].T_sensor_world[2]``.
 
-    `named` are the names that the session gives its sensors, or its bodies, whichever the key is
-    of; one that is unique text stands in place of the number.
+    `named` are the names of the session's sensors, or bodies, whichever the key is of; one that is
+    unique text stands in place of the number.
     """
     names = list(named)
-    parts: list[str] = []
+    text = ""
     for i, part in enumerate(key):
+        name = names[part] if i == 1 and isinstance(part, int) and part < len(names) else None
         if isinstance(part, str):
-            parts.append(f".{part}" if parts else part)
-            continue
-        name = names[part] if i == 1 and part < len(names) else None
-        if isinstance(name, str) and name and names.count(name) == 1:
-            parts.append(f"[{json.dumps(name, ensure_ascii=False)}]")
+            text += f".{part}" if text else part
+        elif isinstance(name, str) and name and names.count(name) == 1:
+            text += f"[{json.dumps(name, ensure_ascii=False)}]"
         else:
-            parts.append(f"[{part}]")
-    return "".join(parts)
+            text += f"[{part}]"
+    return text
 
 
 def nearest(word: str, known: Iterable[str], *, cutoff: float = CLOSE) -> str | None:

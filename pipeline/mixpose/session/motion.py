@@ -8,19 +8,15 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, is_rigid, nearest_rigid
 from mixpose.session.messages import BadKeyError, one_of
-from mixpose.session.schema_common import Placement
+from mixpose.session.schema_sensors import Placement
 
-# A rotation written with four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4.
-ROUNDING = 2e-4
-# Scaling a quaternion to length 1 leaves its rotation as it is, so three decimals will do.
-_QUATERNION_LENGTH = 2e-3
-
+ROUNDING = 2e-4  # a rotation of four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4
+_QUATERNION_LENGTH = 2e-3  # scaling one leaves its rotation as it is: three decimals will do
 _ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
 
 
 def read_motion(table: Placement, matrix_key: str) -> Floats | None:
-    """Read the one form of a rigid motion that a table holds, made exactly rigid; None if it holds
-    none.
+    """Read the one form of a rigid motion (4, 4) that a table holds, made exactly rigid, or None.
 
     `matrix_key` is that of the 4x4 form: "T_world_object" or "T_sensor_world". Two forms, half a
     form, and a matrix that is no rigid motion are refused.

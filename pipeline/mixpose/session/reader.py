@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.fit import EstimatorOptions
 from mixpose.limits import MOST_SAMPLES
@@ -29,8 +28,8 @@ _STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
 def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read what a session file says of sensors and recordings, whatever it says of bodies.
 
-    Its body is a stand-in: `[object]` may be missing, or name a file that is still to be made. The
-    rest is as for `load_session`, but that `[start]` and `[estimator]` do not count.
+    As `load_session`, but that `[start]` and `[estimator]` do not count, and the body is a
+    stand-in: `[object]` may be missing, or name a file that is still to be made.
     """
     return _loaded(Path(path), allow_code=allow_code, bodies=False)
 
@@ -79,7 +78,14 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
     objects = _objects(table, path.parent)
     with under("estimator"):
         estimator = _estimator(table.estimator, objects)
-    _check_samples(estimator.samples, [one.body for one in objects])
+    for one in objects:  # all samples are to fit into memory
+        if not one.body.is_exact and len(one.body) * estimator.samples > MOST_SAMPLES:
+            raise BadKeyError(
+                f"found {estimator.samples} for {len(one.body)} features of {one.body.name}; "
+                f"allowed: {MOST_SAMPLES} together",
+                "estimator",
+                "samples",
+            )
     return Session(
         path=path,
         sha256=sha256,
@@ -136,18 +142,6 @@ def _start(table: StartTable | None) -> Start | None:
             "T_world_object",
         )
     return Start(T_world_object, table.rotation_deg, table.distance)
-
-
-def _check_samples(samples: int, bodies: Sequence[Body]) -> None:
-    """See that the samples of all features fit into memory."""
-    for body in bodies:
-        if not body.is_exact and len(body) * samples > MOST_SAMPLES:
-            raise BadKeyError(
-                f"found {samples} for {len(body)} features of {body.name}; allowed: "
-                f"{MOST_SAMPLES} together",
-                "estimator",
-                "samples",
-            )
 
 
 def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> EstimatorOptions:

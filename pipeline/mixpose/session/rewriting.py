@@ -49,10 +49,7 @@ def _has_module(folder: Path, name: str) -> bool:
 
 
 def text_of(document: Any, session: Session, head: str = "") -> str:
-    """The text of a TOML document below a head, its bytes as those of the session file.
-
-    So a byte order mark is kept, and where all lines end in CR LF, new ones do too.
-    """
+    """The text of a TOML document below a head; byte order mark and ends of lines stay."""
     written, text = _written(session), head + str(tomlkit.dumps(document))
     if "\r\n" in written and not _BARE_END.search(written):
         text = _BARE_END.sub("\r\n", text)
@@ -133,7 +130,6 @@ def _lead_back(document: Any, old: Path, new: Path) -> None:
     """Let relative paths lead from a new folder to where they led from the old one."""
     if old.resolve() == new.resolve():
         return
-
     for table, key, *_ in places_of(document):
         value = str(table[key])
         if not (Path(value).is_absolute() or "://" in value or value.startswith("camera:")):
@@ -148,14 +144,14 @@ def places_of(document: Any) -> Iterator[tuple[Any, str | int, Role, str]]:
         if "file" in one:
             yield one, "file", "file", "object" if len(objects) == 1 else one["name"]
     for sensor in document["sensor"]:
-        name = sensor["name"]
-        if isinstance(sensor.get("source"), list):
-            yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
-        elif isinstance(sensor.get("source"), str):
+        name, source, calibration = sensor["name"], sensor.get("source"), sensor.get("calibration")
+        if isinstance(source, list):
+            yield from ((source, i, "source", name) for i in range(len(source)))
+        elif isinstance(source, str):
             yield sensor, "source", "source", name
         if "times" in sensor:
             yield sensor, "times", "times", name
-        if isinstance(sensor.get("calibration"), dict):
-            yield sensor["calibration"], "file", "file", name
-        elif "calibration" in sensor:
+        if isinstance(calibration, dict):
+            yield calibration, "file", "file", name
+        elif calibration is not None:
             yield sensor, "calibration", "file", name

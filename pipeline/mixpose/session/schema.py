@@ -16,13 +16,12 @@ from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
-from mixpose.session.schema_common import ExtractTable, Motion, Placement, Positive, Table, Text
-from mixpose.session.schema_sensors import AnySensorTable
-from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, Free
+from mixpose.session import schema_sensors as sensors
+from mixpose.session.schema_sensors import ExtractTable, Motion, Placement, Positive, Table, Text
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, Free, array_of
 from mixpose.units import Unit
 
-MOST_ALIKE = 1000
-"""Identical bodies that a session may have."""
+MOST_ALIKE = 1000  # identical bodies that a session may have
 
 
 class GravityTable(Table):
@@ -31,7 +30,7 @@ class GravityTable(Table):
     sampled objectives (`"paper"`, `"independent"`) integrate over it.
     """
 
-    direction: Annotated[Floats, ArrayOf((3,), "a direction [x, y, z] in the world")]
+    direction: Annotated[Floats, array_of((3,), "a direction [x, y, z] in the world")]
     """Where gravity points in the world; its length does not matter.
     Example: `direction = [0, 0, -1]`"""
     sigma: Positive = Field(description="a length greater than 0")
@@ -48,7 +47,7 @@ class StartTable(Placement):
     """The pose: maps coordinates of the body to coordinates of the world.
     Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`"""
     euler_xyz_deg: Annotated[
-        Floats | None, ArrayOf((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
+        Floats | None, array_of((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
     ] = None
     """The rotation as turns about the fixed axes, x first.
     Example: `euler_xyz_deg = [0, 0, 45]`"""
@@ -72,7 +71,7 @@ class ObjectTable(Table):
     name: Text
     """Name of the body, written into every pose.
     Example: `name = "tracker"`"""
-    points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
+    points: Annotated[Floats | None, array_of((None, 3), "a list of points [x, y, z]")] = None
     """Features in the body's own coordinates, in `unit`, in any order.
     Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`"""
     names: list[Text] | None = Field(None, description="a list of names, one per point")
@@ -91,12 +90,12 @@ class ObjectTable(Table):
     deviation in `unit`, or covariance in `unit`². Left out, or 0: exact.
     Example: `sigma = 0.5`"""
     segments: Annotated[
-        Floats | None, ArrayOf((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
+        Floats | None, array_of((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
     ] = None
     """Straight lines as features, from end to end in `unit`; they may stand beside points.
     Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`"""
     normals: Annotated[
-        Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
+        Floats | None, array_of((None, 3), "a list of normals [x, y, z], one per point")
     ] = None
     """Outward directions, one per feature (points first, then segments): a feature is seen only
     by sensors that it faces, by cameras at up to 80° from its normal, where it is a sixth as high
@@ -112,7 +111,7 @@ class ObjectTable(Table):
     spread: Spread = "gaussian"
     """Density of the displacements that `sigma` states.
     Example: `spread = "uniform"`"""
-    tip: Annotated[Floats | None, ArrayOf((3,), "a point [x, y, z] of the body")] = None
+    tip: Annotated[Floats | None, array_of((3,), "a point [x, y, z] of the body")] = None
     """A point of the body that each pose line tells in the world, as `tip`, with its covariance:
     the tip of a tool. It need not be a feature; `mixpose pivot` finds it.
     Example: `tip = [0.2, -1.4, -148.6]`"""
@@ -187,7 +186,7 @@ class SessionTable(Table):
     """See `[estimator]`."""
     extract: ExtractTable = Field(ExtractTable.model_validate({}), description="a table [extract]")
     """See `[extract]`."""
-    sensor: list[AnySensorTable] = Field(
+    sensor: list[sensors.AnySensorTable] = Field(
         min_length=1, description="at least one table [[sensor]], in double brackets"
     )
     """See `[[sensor]]`; one for each sensor."""

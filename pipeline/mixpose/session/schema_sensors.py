@@ -1,4 +1,4 @@
-"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor.
+"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor, and ``[extract]``.
 
 How keys are described is said in `schema`.
 """
@@ -7,25 +7,91 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BeforeValidator, Field, PlainValidator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from mixpose.records import Floats
 from mixpose.session import values
-from mixpose.session.intrinsics import MATRIX_FORM
-from mixpose.session.schema_common import (
-    ExtractTable,
-    Motion,
-    NotNegative,
-    Number,
-    Placement,
-    Positive,
-    Table,
-    Text,
-)
-from mixpose.session.values import ArrayOf, Delay, SensorName, Source, read_calibration_key
+from mixpose.session.values import array_of
 from mixpose.units import Unit
 
 SPAN_ALLOWED = "seconds, from 0 to 1"
+
+Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
+Number: TypeAlias = Annotated[float, Field(ge=-values.LARGEST, le=values.LARGEST)]
+NotNegative: TypeAlias = Annotated[float, Field(ge=0, le=values.LARGEST)]
+Positive: TypeAlias = Annotated[float, Field(ge=values.SMALLEST, le=values.LARGEST)]
+
+Motion: TypeAlias = Annotated[
+    Floats | None, array_of((4, 4), "a 4x4 matrix, four rows of four numbers")
+]
+
+
+class Table(BaseModel):
+    """A TOML table: no keys but these, no text for numbers, no NaN and no infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Placement(Table):
+    """The forms of a rigid motion beside the 4x4 matrix."""
+
+    rotation_vector: Annotated[
+        Floats | None, array_of((3,), "three numbers: axis times angle in radians")
+    ] = None
+    """The rotation, in place of the matrix and together with `translation`.
+    Example: `rotation_vector = [0.1, -0.2, 1.0]`"""
+    quaternion_xyzw: Annotated[Floats | None, array_of((4,), "four numbers: x, y, z, w")] = None
+    """The same rotation as a quaternion of length 1, the real part last.
+    Example: `quaternion_xyzw = [0.0, 0.0, 0.7071068, 0.7071068]`"""
+    translation: Annotated[Floats | None, array_of((3,), "three numbers: x, y, z")] = None
+    """The last column of the matrix, in `unit`; beside a rotation.
+    Example: `translation = [20, 10, 900]`"""
+
+
+class ExtractTable(Table):
+    """How features are found in images. `[extract]` holds for all sensors; `[sensor.extract]`
+    below a `[[sensor]]` changes single keys for that sensor. In a table of detections features
+    are found already, and of these keys only `sigma` counts.
+    """
+
+    method: values.Method = None
+    """Centres of spots and disks (`"blobs"`), corners of a chessboard, the grey values themselves,
+    centres of unsharp or faint spots by the Laplacian of Gaussian (`"log"`, which needs
+    `spot_sigma`: about how wide they are), or a function of your own in a module beside the session
+    file.
+    Example: `method = "corners"`"""
+    polarity: Literal["bright", "dark"] | None = None
+    """Whether features are brighter or darker than what surrounds them.
+    Example: `polarity = "dark"`"""
+    threshold: values.Threshold = None
+    """Grey level that parts features from the background. `"auto"` goes by the noise of the image
+    and the brightest feature. `"triangle"` and `"li"` go by the histogram: they keep what is dim
+    beside something much brighter, and more of what is no feature. `"otsu"` parts two classes of
+    about the same size, whatever they are. `"local"` and `"sauvola"` compare each pixel with its
+    surroundings, `"sauvola"` also with how much these vary. A number is a level in grey values of
+    the image: all that is above it counts. `"corners"` and `"log"` take `"auto"` or a number: the
+    least step between fields, or height of a spot.
+    Example: `threshold = 120`"""
+    min_area: Number | None = Field(None, ge=0, description="an area in px, at least 0")
+    """Blobs smaller than this, in px, are no features.
+    Example: `min_area = 20`"""
+    max_area: Positive | None = Field(None, description="an area in px, greater than min_area")
+    """Blobs larger than this, in px, are no features; left out: there is no limit.
+    Example: `max_area = 500`"""
+    sigma: Positive | None = Field(
+        None, description="greater than 0: px for cameras, a length for lateration and clouds"
+    )
+    """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
+    a predicted and a found feature draw each other in the final fit. For ranges set it to what they
+    err by.
+    Example: `sigma = 2.0`"""
+    spot_sigma: Number | None = Field(
+        None, ge=0, description="at least 0: px for cameras, a length for lateration and clouds"
+    )
+    """Width (standard deviation) that features have already in grey values
+    (`method = "intensity"`) and in range profiles, in px or in `unit`; with `method = "log"` that
+    of the spots to look for, from 0.7 to 1.5 times the true one, 3 px if it is left out.
+    Example: `spot_sigma = 5.0`"""
 
 
 class CalibrationTable(Table):
@@ -83,10 +149,10 @@ class CalibrationErrorTable(Table):
 class SensorTable(Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
-    name: SensorName
+    name: values.SensorName
     """Name of the sensor, a different one for each.
     Example: `name = "left"`"""
-    source: Source = ()
+    source: values.Source = ()
     """The recording, relative to the session file: images, a video, a table of detections
     (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
     profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
@@ -99,7 +165,7 @@ class SensorTable(Table):
     fps: Positive | None = Field(None, description="frames per second, greater than 0")
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
     Example: `fps = 25`"""
-    delay: Delay = 0.0
+    delay: values.Delay = 0.0
     """Seconds by which this sensor's frames are taken later than their times say; negative where
     they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
     delay is known (`docs/sensors-in-time.md`).
@@ -123,9 +189,7 @@ class PlacedTable(SensorTable, Placement):
     right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
     the origin of the world.
     Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`"""
-    resolution: Annotated[tuple[int, int] | None, PlainValidator(values.resolution)] = Field(
-        None, description=values.RESOLUTION_FORM
-    )
+    resolution: values.Resolution = None
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
     Example: `resolution = [640, 512]`"""
     readout: float = Field(0.0, ge=0, le=1, description=SPAN_ALLOWED)
@@ -145,15 +209,15 @@ class CameraTable(PlacedTable):
     """The lens: OpenCV's pinhole model, or its fisheye model. The latter sees beyond 90° from its
     axis, too, as far as the image goes.
     Example: `model = "pinhole"`"""
-    camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
+    camera_matrix: Annotated[Floats | None, array_of((3, 3), values.MATRIX_FORM)] = None
     """Focal lengths and principal point in px; pixel centres have integer coordinates.
     Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`"""
     distortion: Any = Field(None, description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
     """OpenCV's distortion coefficients, in OpenCV's order. Left out: none.
     Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`"""
-    calibration: Annotated[CalibrationTable | None, BeforeValidator(read_calibration_key)] = Field(
-        None, description='a file, or a table { file = "...", ... }'
-    )
+    calibration: Annotated[
+        CalibrationTable | None, BeforeValidator(values.read_calibration_key)
+    ] = Field(None, description='a file, or a table { file = "...", ... }')
     """A calibration file in place of `camera_matrix` and `distortion`.
     Example: `calibration = "left.yml"`"""
 
@@ -168,7 +232,7 @@ class ParallelTable(PlacedTable):
     """Length in the world, in `unit`, that one px shows.
     Example: `pixel_size = 0.5`"""
     principal_point: Annotated[
-        Floats, ArrayOf((2,), "[u, v], the px where the sensor's origin projects")
+        Floats, array_of((2,), "[u, v], the px where the sensor's origin projects")
     ]
     """Where the sensor's origin is in the image, in px.
     Example: `principal_point = [150, 160]`"""
@@ -180,7 +244,7 @@ class LaterationTable(SensorTable):
     model: Literal["lateration"]
     """Ranges, in `unit`.
     Example: `model = "lateration"`"""
-    position: Annotated[Floats, ArrayOf((3,), "[x, y, z], the sensor's place in the world")]
+    position: Annotated[Floats, array_of((3,), "[x, y, z], the sensor's place in the world")]
     """Where ranges are measured from, in `unit`.
     Example: `position = [0, -1000, 0]`"""
     range_bias: Number = Field(0.0, description="a length")

@@ -16,12 +16,18 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
-from mixpose.session.schema_common import ExtractTable
-from mixpose.session.schema_sensors import AnySensorTable, CameraTable, CloudTable, LaterationTable
+from mixpose.session.schema_sensors import (
+    AnySensorTable,
+    CameraTable,
+    CloudTable,
+    ExtractTable,
+    LaterationTable,
+)
 from mixpose.session.setup import SensorSetup
+from mixpose.session.values import MATRIX_FORM
 from mixpose.units import Unit, length_ratio
 
 _WIDEST_PX = 1000
@@ -62,10 +68,7 @@ def build_sensors(
 
 
 def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOptions:
-    """Put a sensor's own extraction keys over the defaults of all sensors.
-
-    Raises BadKeyError if the largest area is not above the smallest.
-    """
+    """Put a sensor's own extraction keys over the defaults of all sensors."""
     tables = [defaults] if own is None else [defaults, own]
     given = {k: v for each in tables for k, v in each.model_dump(exclude_unset=True).items()}
     options = ExtractOptions(**given)
@@ -78,30 +81,18 @@ def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOp
     return options
 
 
-def _check_extraction(options: ExtractOptions) -> None:
-    """Say now, with the key, what would fail on the first image."""
-    try:
-        check_options(options)  # without a folder: reading a session runs nobody's code
-    except SessionError as error:
-        key, _, text = str(error).partition(": ")
-        raise BadKeyError(text, key.removeprefix("extract.")) from error
-
-
 def _build_sensor(
     table: AnySensorTable, defaults: ExtractTable, folder: Path, unit: Unit
 ) -> SensorSetup:
     if table.times is not None and table.fps is not None:
         raise BadKeyError("stands beside times; allowed: one of the two", "fps")
-    resolution: tuple[int, int] | None = None
     sensor: Sensor
     match table:
         case CameraTable():
             sensor = _camera(table, folder, unit)
-            resolution = sensor.resolution
         case schema_sensors.ParallelTable():
-            resolution = table.resolution
             sensor = sensors.ParallelBeam(
-                table.pixel_size, table.principal_point, resolution, _T_sensor_world(table)
+                table.pixel_size, table.principal_point, table.resolution, _T_sensor_world(table)
             )
         case LaterationTable():
             if (table.range_min is None) != (table.bin_size is None):
@@ -115,13 +106,18 @@ def _build_sensor(
                     'found "estimate" with model = "cloud"; allowed: seconds', "delay"
                 )
             sensor = sensors.CloudSensor(_T_sensor_world(table))
+    resolution = getattr(sensor, "resolution", None)
     if getattr(table, "readout", 0.0) and resolution is None:
         raise BadKeyError("stands without resolution; allowed: with [width, height]", "readout")
     with under("extract"):
         extract = merge_extract(defaults, table.extract)
         _check_widths(extract, table)
         if not isinstance(table, LaterationTable | CloudTable):
-            _check_extraction(extract)
+            try:  # say now what would fail on the first image
+                check_options(extract)  # without a folder: reading a session runs nobody's code
+            except SessionError as error:
+                key, _, text = str(error).partition(": ")
+                raise BadKeyError(text, key.removeprefix("extract.")) from error
     given = type(table).model_fields.keys() & _TAKEN
     return SensorSetup(
         **{key: getattr(table, key) for key in given},

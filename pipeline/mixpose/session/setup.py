@@ -19,8 +19,7 @@ class Start:
     """Where the object is at first, ``[start]``."""
 
     T_world_object: Floats  # (4, 4)
-    # half-width of the search around it in degrees; None where the file gives none
-    rotation_deg: float | None = None
+    rotation_deg: float | None = None  # half-width in degrees; None where not given
     distance: float | None = None  # half-width in length units; None where the file gives none
 
 
@@ -50,23 +49,17 @@ class SensorSetup:
     name: str  # unique in the session
     model: str
     sensor: Sensor  # the calibrated geometry
-    # As written in the file: relative to `Session.folder`.  A tuple where the file has a list; the
-    # empty tuple where it names no source, as for a system that is only planned.
-    source: str | tuple[str, ...]
+    source: str | tuple[str, ...]  # as written, relative to `Session.folder`; empty: none is named
     times: Path | None  # table of frame times, relative paths resolved
     fps: float | None  # frames per second
     extract: ExtractOptions  # ``[extract]`` with what ``[sensor.extract]`` overrides
-    # range of a profile's first bin and from bin to bin, in length units; both or neither
-    range_min: float | None = None
-    bin_size: float | None = None
+    range_min: float | None = None  # range of a profile's first bin, length units
+    bin_size: float | None = None  # from bin to bin; both or neither
     resolution: tuple[int, int] | None = None  # width and height of a camera's images in px
-    # seconds by which frames are taken later than their times say; to be estimated
-    delay: float | Literal["estimate"] = 0.0
-    # seconds from a camera's first row to its last, and for which a row collects light
-    readout: float = 0.0
-    exposure: float = 0.0
-    # how far off the geometry may be; None: exact
-    calibration_error: CalibrationError | None = None
+    delay: float | Literal["estimate"] = 0.0  # s by which frames are later than their times
+    readout: float = 0.0  # s from a camera's first row to its last
+    exposure: float = 0.0  # s for which a row collects light
+    calibration_error: CalibrationError | None = None  # of the geometry; None: exact
     own: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets, whatever ``[extract]``
 
     @property

@@ -1,8 +1,4 @@
-"""Reading the text files that a session consists of, TOML and YAML among them.
-
-TOML with a hint where a common slip is what it fails at; YAML also with the first line that OpenCV
-writes and YAML does not know.
-"""
+"""Reading the text files that a session consists of, TOML and YAML among them."""
 
 from __future__ import annotations
 
@@ -27,20 +23,20 @@ _NO_TEXT = tuple(
 
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")
 _TABLE = re.compile(r"\[\[?\s*(sensor|object)\s*\]")
-_BARE_WORD = re.compile(r"\s*([\w.-]+)\s*=\s*([^\W\d][^\s\"'\[\]{},#]*)\s*(?:#.*)?")
-_COMMA = re.compile(r"\s*([\w.-]+)\s*=\s*([-+]?\d+),(\d+)\s*(?:#.*)?")
-_COLON = re.compile(r"\s*([\w.-]+)\s*:\s*(.+)")
 _OTHER_QUOTES = re.compile("[“”„‘’«»]")
+_WORD = r"(?!(?:true|false)\s*(?:#.*)?$)[^\W\d][^\s\"'\[\]{},#]*"
+_SLIPS = (
+    (rf"\s*([\w.-]+)\s*=\s*({_WORD})\s*(?:#.*)?", r'text in quotes, \1 = "\2"'),
+    (r"\s*([\w.-]+)\s*=\s*([-+]?\d+),(\d+)\s*(?:#.*)?", r"a decimal point, \1 = \2.\3"),
+    (r"\s*([\w.-]+)\s*:(?=.)\s*(.*?)\s*", r"an equals sign, \1 = \2"),
+)
+"""Lines that are no TOML, and as what they would be."""
 
 _OPENCV_HEAD = re.compile(r"\A\s*%YAML:?[ \d.]*[^\n]*\n(---[^\n]*\n)?")
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file.
-
-    Raises BadKeyError if there is no such file, it is larger than any session needs, or it cannot
-    be read.
-    """
+    """Read a file; BadKeyError if that cannot be done, or it is larger than any session needs."""
     try:
         is_other = path.exists() and not path.is_file()
         size = path.stat().st_size
@@ -59,10 +55,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def as_text(content: bytes) -> str:
-    """Decode UTF-8, with or without the mark that some editors put in front.
-
-    Raises BadKeyError naming what it is in place of text, or the line that is not UTF-8.
-    """
+    """Decode UTF-8, with or without the mark that some editors put in front, or a BadKeyError."""
     kind = next((name for start, name in _NO_TEXT if start.match(content)), None)
     if kind is not None:
         raise BadKeyError(f"found {kind}; allowed: a text file in UTF-8")
@@ -93,21 +86,8 @@ def _hint(text: str, reason: str) -> str:
         return '; allowed: straight quotes, "..."'
     if "\\" in line and ("in a string" in reason or "hex value" in reason):
         return "; allowed: paths with / , or in single quotes, '...'"
-    return _meant(line)
-
-
-def _meant(line: str) -> str:
-    """A line as it would be TOML."""
-    word = _BARE_WORD.fullmatch(line)
-    if word is not None and word[2] not in ("true", "false"):
-        return f'; allowed: text in quotes, {word[1]} = "{word[2]}"'
-    comma = _COMMA.fullmatch(line)
-    if comma is not None:
-        return f"; allowed: a decimal point, {comma[1]} = {comma[2]}.{comma[3]}"
-    colon = _COLON.fullmatch(line)
-    if colon is not None:
-        return f"; allowed: an equals sign, {colon[1]} = {colon[2].strip()}"
-    return ""
+    found = ((re.fullmatch(pattern, line), meant) for pattern, meant in _SLIPS)
+    return next((f"; allowed: {slip.expand(meant)}" for slip, meant in found if slip), "")
 
 
 def parse_yaml(text: str) -> Any:

@@ -78,8 +78,6 @@ def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
             key.append(step)
             field = table.model_fields.get(step)
             choices = _tables(field.annotation) if field else []
-    if field is None and len(choices) > 1:
-        table = choices[0]
     return _Place(tuple(key), table, field)
 
 
@@ -114,11 +112,9 @@ def allowed_for(field: FieldInfo | None) -> str:
 
 def _tag_problem(place: _Place, value: Any) -> BadKeyError:
     """A sensor whose model is unknown or missing: nothing else in it could be checked."""
-    models: list[str] = []
-    keys: set[str] = set()
-    for table in _tables(place.field.annotation if place.field else None):
-        models += _literals(table.model_fields[_TAG])
-        keys |= set(table.model_fields)
+    tables = _tables(place.field and place.field.annotation)
+    models = [word for table in tables for word in _literals(table.model_fields[_TAG])]
+    keys = {key for table in tables for key in table.model_fields}
     if _TAG in value:
         text = found(value[_TAG], one_of(models)) + did_you_mean(value[_TAG], models)
         return BadKeyError(text, *place.key, _TAG)

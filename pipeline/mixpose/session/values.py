@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal, TypeAlias, TypeGuard
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetCoreSchemaHandler, PlainValidator
+from pydantic import AfterValidator, Field, GetCoreSchemaHandler
 from pydantic_core import core_schema
 
 from mixpose.limits import MOST_PIXELS
@@ -30,7 +32,7 @@ _SOURCE_ALLOWED = (
 )
 LONGEST_DELAY_S = 1.0
 _THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
-
+MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 RESOLUTION_FORM = "[width, height], two positive integers"
 
 LARGEST = 1e12  # powers of larger numbers would overflow to infinity unseen
@@ -39,10 +41,10 @@ _WIDEST = 1_000_000  # px; more than any image library reads
 
 
 @dataclass(frozen=True)
-class ArrayOf:
-    """Annotation of a key that holds nested lists of numbers, see `arrays.numbers`."""
+class ReadBy:
+    """Annotation of a key: what reads the value in the file, and what it may be."""
 
-    shape: tuple[int | None, ...]
+    read: Callable[[Any], Any]
     description: str
 
     def __get_pydantic_core_schema__(
@@ -50,13 +52,13 @@ class ArrayOf:
     ) -> core_schema.CoreSchema:
         return core_schema.no_info_plain_validator_function(self.read)
 
-    def read(self, value: Any) -> Floats:
-        """Read what the file holds."""
-        return numbers(value, self.shape, self.description)
+
+def array_of(shape: tuple[int | None, ...], description: str) -> ReadBy:
+    """Annotation of a key that holds nested lists of numbers, see `numbers`."""
+    return ReadBy(partial(numbers, shape=shape, allowed=description), description)
 
 
 def _read_sensor_name(name: str) -> str:
-    """A sensor's name: text that can stand in NAME=PATH."""
     if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
         raise BadKeyError(
             found(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
@@ -65,14 +67,12 @@ def _read_sensor_name(name: str) -> str:
 
 
 def _read_method(value: Any) -> str:
-    """A method's name, or a function of one's own."""
     if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
         return value
     raise BadKeyError(found(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
 
 
 def _read_threshold(value: Any) -> str | float:
-    """A rule's name, or a grey level."""
     if isinstance(value, str) and value in THRESHOLDS:
         return value
     if is_number(value):
@@ -91,7 +91,6 @@ def _read_source(value: Any) -> str | tuple[str, ...]:
 
 
 def _read_delay(value: Any) -> float | Literal["estimate"]:
-    """Seconds, or the word that asks for them."""
     if value == "estimate":
         return "estimate"
     if not is_number(value) or not -LONGEST_DELAY_S <= value <= LONGEST_DELAY_S:
@@ -114,21 +113,28 @@ def _read_free(value: Any) -> tuple[str, ...]:
 SensorName: TypeAlias = Annotated[
     str, AfterValidator(_read_sensor_name), Field(description="a name for the sensor, as text")
 ]
-Method: TypeAlias = Annotated[
-    str | None, PlainValidator(_read_method), Field(description=_METHOD_ALLOWED)
-]
-Threshold: TypeAlias = Annotated[
-    str | float | None, PlainValidator(_read_threshold), Field(description=_THRESHOLD_ALLOWED)
-]
-Source: TypeAlias = Annotated[
-    str | tuple[str, ...], PlainValidator(_read_source), Field(description=_SOURCE_ALLOWED)
-]
-Delay: TypeAlias = Annotated[
-    float | Literal["estimate"], PlainValidator(_read_delay), Field(description=_DELAY_ALLOWED)
-]
-Free: TypeAlias = Annotated[
-    tuple[str, ...], PlainValidator(_read_free), Field(description=_FREE_ALLOWED)
-]
+"""It can stand in NAME=PATH."""
+Method: TypeAlias = Annotated[str | None, ReadBy(_read_method, _METHOD_ALLOWED)]
+Threshold: TypeAlias = Annotated[str | float | None, ReadBy(_read_threshold, _THRESHOLD_ALLOWED)]
+Source: TypeAlias = Annotated[str | tuple[str, ...], ReadBy(_read_source, _SOURCE_ALLOWED)]
+Delay: TypeAlias = Annotated[float | Literal["estimate"], ReadBy(_read_delay, _DELAY_ALLOWED)]
+Free: TypeAlias = Annotated[tuple[str, ...], ReadBy(_read_free, _FREE_ALLOWED)]
+
+
+def resolution(value: Any) -> tuple[int, int]:
+    """Read the width and height of an image in px."""
+    match value:
+        case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
+            if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
+                if width * height <= MOST_PIXELS:
+                    return width, height
+                raise BadKeyError(
+                    f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
+                )
+    raise BadKeyError(found(value, RESOLUTION_FORM))
+
+
+Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(resolution, RESOLUTION_FORM)]
 
 
 def read_calibration_key(value: Any) -> Any:
@@ -162,8 +168,7 @@ def limits(value: object) -> str:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
-    """Read nested lists of numbers as a float64 array; a problem points at the first that does not
-    fit.
+    """Read nested lists of numbers as a float64 array; a problem points at the first misfit.
 
     `shape` has the length of the list at each depth, None for any length but zero; `allowed` is
     what to tell the user.
@@ -182,16 +187,3 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
         with under(i):
             rows.append(numbers(item, inner, allowed))
     return np.array(rows, dtype=np.float64)
-
-
-def resolution(value: Any) -> tuple[int, int]:
-    """Read the width and height of an image in px."""
-    match value:
-        case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
-            if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
-                if width * height <= MOST_PIXELS:
-                    return width, height
-                raise BadKeyError(
-                    f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
-                )
-    raise BadKeyError(found(value, RESOLUTION_FORM))

@@ -46,7 +46,7 @@ def choices(
 ) -> list[Choice]:
     """Choose among the alternatives (N) of each time of a track.
 
-    The poses of the track itself count for nothing; its covariances are those of all alternatives.
+    The track's poses count for nothing; its covariances are those of all alternatives.
     """
     paths, logs = _followed(track, alternatives, model, rules)
     shares = np.exp(logs - logs.max())
@@ -67,10 +67,7 @@ def choices(
 def _followed(
     track: Track, alternatives: Sequence[Alternatives], model: MotionModel, rules: SmoothingRules
 ) -> tuple[list[tuple[int, ...]], Floats]:
-    """The likeliest paths, each a choice per time, and their log likelihoods.
-
-    A path begins at the first time, or later, where all before show something else.
-    """
+    """The likeliest paths, each a choice per time, _NONE before it begins, and log likelihoods."""
     white = white_parts(track, np.array([model.white]))
     noise = noise_of(track, model.intensities[None])
 

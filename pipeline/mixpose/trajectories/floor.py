@@ -26,29 +26,26 @@ class Floor:
 
     T_old_new: Floats  # (4, 4): maps coordinates of the new world to those of the old one
     by: str  # what it was found by
-    # root mean square distance of the points from the floor; None where any would fit
-    off: float | None = None
-    # standard deviation of its tilt about the axis that is known least; 0 of true poses
-    tilt_deg: float = 0.0
+    off: float | None = None  # RMS distance of the points from it; None where any would fit
+    tilt_deg: float = 0.0  # standard deviation about the axis known least; 0 of true poses
 
 
 def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
-    """The frame that bodies on the floor tell.
+    """The frame that bodies on the floor tell, whose axis `up` points up; of a body, its own.
 
-    One body that rests is the frame of the world.  Three that rest, or three poses apart, are
-    three points: the origin, where the first axis leads to, and any other of the floor.  More are a
-    plane, in which the origin and the first axis are as near to where they were as can be.  Of a
-    body with a tip the tip is the point, of others the origin.
-
-    `up` is the axis of the world that points up; of a body, its own. Up is where the sensors
-    (n, 3), in the old world, are. Raises RecordingError if the poses tell no floor.
+    One body that rests is the frame of the world. Three that rest, or three poses apart, are three
+    points: the origin, where the first axis leads to, and any other of the floor. More are a plane,
+    in which the origin and the first axis are as near to where they were as can be. Of a body with
+    a tip the tip is the point, of others the origin. Up is where the sensors (n, 3), in the old
+    world, are. Raises RecordingError if the poses tell no floor.
     """
     bodies: dict[str, list[Estimate]] = {}
     for each in estimates:
         bodies.setdefault(each.label, []).append(each)
     rests = [_rests(own) for own in bodies.values()]
     if len(bodies) == 1 and rests[0]:
-        T = _mean_pose(estimates)
+        poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
+        T = poses[0] if len(poses) == 1 else rigid.mean_motion(poses)
         _require_still(estimates, T)
         return Floor(T, f"the body {estimates[0].label!r}", None, _tilt_of_body(estimates, T, up))
     if all(rests):
@@ -68,8 +65,7 @@ def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
     # where points are farther off the plane than they err by, it is not flat, or they lie not on it
     errs = max(errs, off * np.sqrt(count / (count - 3)))
     T = _plane(points.mean(axis=0), normal, up)
-    tilt_deg = float(np.degrees(errs / across))
-    return Floor(T, f"a plane through {count} points", off, tilt_deg)
+    return Floor(T, f"a plane through {count} points", off, float(np.degrees(errs / across)))
 
 
 def _tilt_of_body(estimates: Sequence[Estimate], T_mean: Floats, up: Axis) -> float:
@@ -79,9 +75,8 @@ def _tilt_of_body(estimates: Sequence[Estimate], T_mean: Floats, up: Axis) -> fl
         return 0.0
     normal = T_mean[:3, "xyz".index(up)]
     level = np.eye(3) - np.outer(normal, normal)
-    return float(
-        np.degrees(np.sqrt(np.linalg.eigvalsh(level @ np.mean(turns, axis=0) @ level)[-1]))
-    )
+    variances = np.linalg.eigvalsh(level @ np.mean(turns, axis=0) @ level)
+    return float(np.degrees(np.sqrt(variances[-1])))
 
 
 def _point(one: Estimate) -> Floats:
@@ -115,19 +110,8 @@ def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
         )
 
 
-def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
-    poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
-    return np.asarray(poses[0]) if len(poses) == 1 else rigid.mean_motion(poses)
-
-
 def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats, float, float]:
-    """Upward normal of the plane of least squared distances of points (n, 3).
-
-    Also the root mean square of these, and the root of the summed squares of how far points are
-    from their middle where they spread least within the plane.
-
-    Raises a RecordingError where the points, with a covariance (3, 3) each, span none.
-    """
+    """Upward normal of the plane nearest to points (n, 3), their RMS off it, spread in it."""
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle)
     errors = np.sqrt(len(points) * (directions[1] @ covariance @ directions[1]))

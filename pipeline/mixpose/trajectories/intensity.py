@@ -106,10 +106,7 @@ def fitted_model(
 
 
 def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -> float:
-    """The share of covariances that is white, of which poses are likeliest; 1 unless surely not.
-
-    Among sudden motion: what is steady takes the jumps of a body that rests in between for noise.
-    """
+    """The white share of covariances of which poses are likeliest; 1 unless surely not."""
     most = max(rules.block // len(blocks), rules.fewest)
     blocks = [one.part(slice(most)) for one in blocks]
     logs = [np.zeros((len(one) - 1, 2)) for one in blocks]
@@ -118,6 +115,7 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
         total = 0.5 * (x / rules.believed) ** 2
         for k, one in enumerate(blocks):
             at = replace(model, white=float(np.exp(x)))
+            # steady motion would take the jumps of a body that rests in between for noise
             _, each, logs[k] = smooth_with_sudden_motion(one, at, rules, logs[k])
             total -= float(each.sum())
         return total
@@ -235,10 +233,7 @@ def _along(
 
 
 def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules) -> Floats:
-    """Of the poses of a track after the first few, which tell the rates of all orders; (G,).
-
-    Now and then a pose that is ok is a wrong one: it may be anywhere where the body gets in a step.
-    """
+    """(G,), of poses of a track after the first few, which tell the rates of all orders."""
     own = white_parts(track, np.exp(x[:, 2]))
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
     logs_wrong = logs_of_wrong(track, own, rules)
@@ -260,9 +255,6 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
 
 
 def logs_of_wrong(track: Track, own: Floats, rules: SmoothingRules) -> Floats:
-    """Log-likelihoods (N, G), without −3 log 2π, of poses that are ok, and wrong.
-
-    By their `white_parts` (N, G, 6, 6).
-    """
+    """Log-likelihoods (N, G), without −3 log 2π, of wrong poses, by `white_parts` (N, G, 6, 6)."""
     anywhere = np.diagonal(own, axis1=2, axis2=3) + (rules.reach * track.moved) ** 2
     return np.asarray(np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=2))

@@ -27,9 +27,8 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from mixpose import rigid
 from mixpose.records import Floats, Indices, Mask
 
+# what takes white noise, and the order of that derivative
 ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
-"""What takes white noise, and the order of that derivative."""
-
 # [ω] of x -> ω × x is ω of these, row by row
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
@@ -43,10 +42,8 @@ class States(NamedTuple):
     """States of a body at one time, as G filters that run side by side know them."""
 
     poses: Floats  # (G, 4, 4)
-    # (G, p - 1, 6): derivatives of the pose, lengths and radians per second to the power of 1 on
-    rates: Floats
-    # (G, 6 p, 6 p): of the pose and of its derivatives, in this order, six numbers of each
-    covariances: Floats
+    rates: Floats  # (G, p - 1, 6): derivatives of the pose, lengths and radians per s, s² ...
+    covariances: Floats  # (G, 6 p, 6 p): of the pose and of its derivatives, in this order
 
     @property
     def order(self) -> int:

@@ -51,9 +51,7 @@ class Pivoting(NamedTuple):
 
     poses: Floats  # (N, 4, 4): of the body
     covariances: Floats  # (N, 6, 6)
-    # (N, 4, 4): of the body that the point is fixed in; of the world these are the identity, and
-    # their covariances zero
-    references: Floats
+    references: Floats  # (N, 4, 4): of the body that the point is fixed in; identities: the world
     reference_covariances: Floats  # (N, 6, 6)
 
     def part(self, some: Mask) -> Pivoting:
@@ -71,11 +69,8 @@ class Tip:
     residual: float  # root mean square distance of tip and point
     expected: float  # the same by the covariances of the poses
     held_out: float  # and of poses that were held out
-    # squared residuals by their covariances; what is above 1 is in the covariance of the tip
-    scale: float
-    # variance of the tip by parts of the recording that are held out, against that by residuals;
-    # above 1 where errors last, and then in the covariance, with what so few parts tell it to
-    lasting: float
+    scale: float  # squared residuals by covariances; above 1 it is in the covariance of the tip
+    lasting: float  # variance by parts held out, against that by residuals; above 1: errors last
     frames: int  # poses that count
     left_out: int  # those that lie too far off
     turns_deg: Floats  # (3,): root mean square turns across the three directions, least first
@@ -130,10 +125,7 @@ def find_tip(pivoting: Pivoting) -> Tip:
 
 
 def _require_turns(pivoting: Pivoting, scale: float, rules: PivotRules) -> tuple[Floats, Floats]:
-    """By how much directions of the body swing, RMS in radians (3,), least first, and these (3, 3).
-
-    A RecordingError where one swings no more than errors make it: the tip may be anywhere along it.
-    """
+    """By how much directions of the body swing, RMS in radians (3,), least first; these (3, 3)."""
     R = pivoting.references[:, :3, :3].swapaxes(1, 2) @ pivoting.poses[:, :3, :3]
     away = R - R.mean(axis=0)
     values, vectors = np.linalg.eigh(np.einsum("kij,kil->jl", away, away) / len(R))
@@ -168,10 +160,8 @@ def _linear(pivoting: Pivoting) -> tuple[Floats, Floats]:
 
 
 def _alike(pivoting: Pivoting, rules: PivotRules) -> Mask:
-    """The poses (N,) to begin with, which a tip and a point bring together about as well as most.
-
-    Those of three poses, of which the median of all is off least (Rousseeuw, J. Am. Stat. Assoc. 79
-    (1984) 871).
+    """The poses (N,) to begin with, by least median (P. Rousseeuw, J. Am. Stat. Assoc. 79 (1984)
+    871).
     """
     (A, b), rng = _linear(pivoting), np.random.default_rng(0)
     some = rng.permuted(np.tile(np.arange(len(b)), (rules.drawn, 1)), axis=1)[:, :3]
@@ -243,12 +233,7 @@ def _covariances(pivoting: Pivoting, by_poses: Floats) -> Floats:
 def _held_out(
     some: Pivoting, tip: Floats, information: Floats, scale: float, rules: PivotRules
 ) -> tuple[float, float, float]:
-    """RMS residual of parts of the recording, each by a tip that was found without it.
-
-    And the squared distance of these tips from that of all, against what it would be if errors of
-    all frames were independent, 1 unless chance is seldom as much; and by what an ellipsoid of 95 %
-    is larger where so few numbers tell its size (R. A. Fisher's F in place of χ²).
-    """
+    """RMS residual of parts of the recording by tips found without them; factors of variance."""
     rest, squared = [], 0.0
     for part in np.array_split(np.arange(len(some.poses)), rules.parts):
         others = np.ones(len(some.poses), bool)
@@ -265,6 +250,7 @@ def _held_out(
     held_out = _rms(np.concatenate(rest))
     if squared <= chdtri(freedom, rules.accident):
         return held_out, 1.0, 1.0
+    # where few numbers tell its size, an ellipsoid of 95 % is larger: R. A. Fisher's F, not χ²
     return held_out, squared / freedom, float(3 * fdtri(3, freedom, 0.95) / chdtri(3, 0.05))
 
 

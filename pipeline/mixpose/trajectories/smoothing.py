@@ -20,23 +20,13 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.trajectories import track as tracks
 from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
 from mixpose.trajectories.intensity import (
     SmoothingRules,
     fitted_model,
     logs_of_wrong,
     smooth_with_sudden_motion,
-)
-from mixpose.trajectories.lines import require_covariances, require_frames_once
-from mixpose.trajectories.track import (
-    MotionModel,
-    SmoothedTrack,
-    Track,
-    of_free,
-    smooth_track,
-    track_of,
-    white_parts,
-    without,
 )
 
 _ROUNDED_S = 1e-6  # of differences of times, which are since 1970 at worst
@@ -48,7 +38,7 @@ class SmoothedBody:
     """The poses of a body, smoothed."""
 
     estimates: tuple[Estimate, ...]  # of each line and each frame that was filled, by number
-    model: MotionModel | None  # None where there were too few poses
+    model: tracks.MotionModel | None  # None where there were too few poses
     smoothed: int  # poses
     filled: int  # frames in which no pose was
     decided: int  # ambiguous frames that are ok now
@@ -62,7 +52,7 @@ class _Segment:
 
     lines: tuple[PoseLine | None, ...]
     frames: tuple[int, ...]
-    track: Track
+    track: tracks.Track
 
 
 def smooth_body(
@@ -90,7 +80,7 @@ def smooth_body(
     at = np.array([line.frame for line in ordered], float) if times is None else times
     ordered = unfolded(ordered, symmetries)
     posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
-    require_covariances([ordered[k] for k in posed])
+    tracks.require_covariances([ordered[k] for k in posed])
     sure = [k for k in posed if ordered[k].status == "ok"]
     told = sure if len(sure) >= rules.fewest else posed
     if len(told) < rules.fewest:
@@ -118,10 +108,7 @@ def smooth_body(
 
 @contextmanager
 def _possible(label: str) -> Iterator[dict[int, Estimate]]:
-    """Estimates by frame, to be worked out within.
-
-    Raises RecordingError in one line where numbers of the recording are too large or too small.
-    """
+    """Estimates by frame, to be worked out within; a RecordingError if numbers do not allow it."""
     found: dict[int, Estimate] = {}
     try:
         with np.errstate(all="ignore"):
@@ -143,53 +130,42 @@ def _possible(label: str) -> Iterator[dict[int, Estimate]]:
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
     """Of all lines; None where one has none, or they do not ascend."""
-    require_frames_once(lines)
+    tracks.require_frames_once(lines)
     found = [line.time_s for line in lines if line.time_s is not None]
     times = np.array(found, dtype=np.float64)
     return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
 
 
-def _track(lines: Sequence[PoseLine], times: Floats) -> Track:
+def _track(lines: Sequence[PoseLine], times: Floats) -> tracks.Track:
     poses = np.stack([line.T_world_object for line in lines if line.T_world_object is not None])
     covariances = np.stack([line.covariance for line in lines if line.covariance is not None])
-    return track_of(times, poses, covariances, np.ones(len(lines), bool))
+    return tracks.track_of(times, poses, covariances, np.ones(len(lines), bool))
 
 
 def _segments(
-    lines: Sequence[PoseLine],
-    times: Floats,
-    posed: Sequence[int],
-    longest: float,
-    fill_s: float,
+    lines: Sequence[PoseLine], times: Floats, posed: Sequence[int], longest: float, fill_s: float
 ) -> list[_Segment]:
     """Lines with poses, cut at the longest gaps, with the frames between that are to be filled."""
     step = int(np.median(np.diff([lines[k].frame for k in posed])))
     cuts = np.flatnonzero(np.diff(times[posed]) > longest + _ROUNDED_S) + 1
     segments = []
     for part in np.split(np.array(posed), cuts):
-        own: list[PoseLine | None] = []
-        known: list[PoseLine] = []  # the one before in place of those that are not there
-        frames: list[int] = []
-        moments: list[float] = []
+        # line, or none where one is filled in; the last line that is there; frame and time
+        rows: list[tuple[PoseLine | None, PoseLine, int, float]] = []
         for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
             line = lines[k]
-            if frames and times[k] - moments[-1] <= fill_s + _ROUNDED_S:
-                told = slice(last, k + 1)
-                at = [each.frame for each in lines[told]]
-                between = _between(frames[-1], line.frame, step, at[1:-1])
-                own += [None] * len(between)
-                known += [known[-1]] * len(between)
+            if rows and times[k] - times[last] <= fill_s + _ROUNDED_S:
+                told, first = lines[last : k + 1], lines[last].frame
+                between = _between(first, line.frame, step, [each.frame for each in told[1:-1]])
                 # frame numbers may be beyond what numbers of NumPy hold
-                since = np.array([n - at[0] for n in at], dtype=np.float64)
-                moments += np.interp([n - at[0] for n in between], since, times[told]).tolist()
-                frames += between
-            own.append(line)
-            known.append(line)
-            frames.append(line.frame)
-            moments.append(float(times[k]))
+                since = np.array([each.frame - first for each in told], dtype=np.float64)
+                moments = np.interp([n - first for n in between], since, times[last : k + 1])
+                rows += [(None, lines[last], n, t) for n, t in zip(between, moments.tolist())]
+            rows.append((line, line, line.frame, float(times[k])))
+        own, known, frames, at = zip(*rows, strict=True)
         measured = np.array([each is not None for each in own])
-        track = replace(_track(known, np.array(moments)), measured=measured)
-        segments.append(_Segment(tuple(own), tuple(frames), track))
+        track = replace(_track(known, np.array(at)), measured=measured)
+        segments.append(_Segment(own, frames, track))
     return segments
 
 
@@ -201,7 +177,9 @@ def _between(before: int, after: int, step: int, lost: Sequence[int]) -> list[in
     return sorted([*lost, *(n for n in even if all(2 * abs(n - one) >= step for one in lost))])
 
 
-def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Estimate]:
+def _smoothed(
+    segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
+) -> dict[int, Estimate]:
     """Estimates by frame."""
     chosen = _chosen(segment, model, rules)
     poses = segment.track.poses.copy()
@@ -217,7 +195,7 @@ def _smoothed(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> d
     first, last = int(inside[0]), int(inside[-1]) + 1
     lines, frames = segment.lines[first:last], segment.frames[first:last]
     track, result = _without_foreign(track.part(slice(first, last)), model, rules)
-    spare = max(0.0, 1.0 - model.white) * of_free(track.covariances, track.free)
+    spare = max(0.0, 1.0 - model.white) * tracks.of_free(track.covariances, track.free)
     found = {}
     for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
         T, covariance = result.poses[k], result.covariances[k] + spare[k]
@@ -241,7 +219,9 @@ def _alternatives(line: PoseLine) -> Alternatives:
     return Alternatives(poses, weights / max(weights.sum(), 1.0), may_be_none=True)
 
 
-def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Choice]:
+def _chosen(
+    segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
+) -> dict[int, Choice]:
     """What each ambiguous frame of a segment shows, by its place."""
     lines = [(k, line) for k, line in enumerate(segment.lines) if line is not None]
     if all(line.status == "ok" for _, line in lines):
@@ -253,14 +233,13 @@ def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dic
 
 
 def _without_foreign(
-    track: Track, model: MotionModel, rules: SmoothingRules
-) -> tuple[Track, SmoothedTrack]:
-    """A track without poses that lie where those around them forbid, and the track smoothed.
-
-    The first is one of them if it is the last of the way back, which tells where it should be.
-    """
-    if _off(track, smooth_track(track, model), model, -1)[0] > _limit(track, rules):
-        left, back = _without_foreign_after_first(_reversed(track), model, rules)
+    track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
+) -> tuple[tracks.Track, tracks.SmoothedTrack]:
+    """A track without poses that lie where those around them forbid, and that smoothed."""
+    if _off(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
+        # is the first wrong? as the last of the way back it is told where it should be
+        reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
+        left, back = _without_foreign_after_first(reversed_track, model, rules)
         if not left.measured[-1]:
             left, rest = _without_foreign_after_first(track.part(slice(1, None)), model, rules)
             poses = np.concatenate([back.poses[-1:], rest.poses])
@@ -271,56 +250,43 @@ def _without_foreign(
     return _without_foreign_after_first(track, model, rules)
 
 
-def _reversed(track: Track) -> Track:
-    """The same, back from the last time to the first."""
-    return replace(
-        track,
-        times=-track.times[::-1],
-        poses=track.poses[::-1],
-        covariances=track.covariances[::-1],
-        measured=track.measured[::-1],
-    )
-
-
-def _limit(track: Track, rules: SmoothingRules) -> float:
+def _limit(track: tracks.Track, rules: SmoothingRules) -> float:
     """Squared distance of a pose from what all others say, beyond which it may be a wrong one."""
     return float(chdtri(int(track.free.sum()), rules.foreign))
 
 
 def _without_foreign_after_first(
-    track: Track, model: MotionModel, rules: SmoothingRules
-) -> tuple[Track, SmoothedTrack]:
+    track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
+) -> tuple[tracks.Track, tracks.SmoothedTrack]:
     """The same, where the first pose is right."""
     limit = _limit(track, rules)
-    wrong = logs_of_wrong(track, white_parts(track, np.array([model.white])), rules)[:, 0]
+    wrong = logs_of_wrong(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
         # among motion that is steady a corner of the path looks foreign, too
-        off = _off(track, smooth_track(track, model), model, -1)
+        off = _off(track, tracks.smooth_track(track, model), model, -1)
         padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
         bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
         bad[0] = False
         if not bad.any():
             break
         # but at a corner the others tell of sudden motion as well
-        among, others, _ = smooth_with_sudden_motion(without(track, bad), model, rules)
+        among, others, _ = smooth_with_sudden_motion(tracks.without(track, bad), model, rules)
         places = np.flatnonzero(bad)
         parts = np.append(0, (places[1:] + places[:-1] + 1) // 2)  # what is next to each of them
         likelier = np.add.reduceat(others - logs, parts) + wrong[places] > 0
         bad[places] = likelier & (_off(track, among, model, 1)[places] > limit)
         if not bad.any():
             break
-        track = without(track, bad)
+        track = tracks.without(track, bad)
         result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     return track, result
 
 
-def _off(track: Track, result: SmoothedTrack, model: MotionModel, sign: int) -> Floats:
-    """Squared distance (N,) of each pose from what all others say.
-
-    rᵀ(R − P)⁻¹r where the pose took part in the result, with the sign −1, and rᵀ(R + P)⁻¹r where
-    it did not.
-    """
+def _off(
+    track: tracks.Track, result: tracks.SmoothedTrack, model: tracks.MotionModel, sign: int
+) -> Floats:
+    """rᵀ(R ± P)⁻¹r (N,), of poses and what others say; the sign is -1 where they took part in P."""
     free = np.flatnonzero(track.free)
     inner = np.ix_(np.arange(len(track)), free, free)
     rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Indices, Mask
 from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
 
@@ -21,8 +25,7 @@ class Track:
     times: Floats  # (N,): s, or numbers of frames
     poses: Floats  # (N, 4, 4)
     covariances: Floats  # (N, 6, 6): as `mixpose.rigid` has them; of directions that are held, any
-    # (N,): whether there is a pose at that time; what stands in `poses` does not count where not
-    measured: Mask
+    measured: Mask  # (N,): whether there is a pose; what stands in `poses` counts there only
     free: Mask  # (6,): directions of the world in which the body is estimated
 
     def __len__(self) -> int:
@@ -55,8 +58,8 @@ def of_free(covariances: Floats, free: Mask) -> Floats:
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
     """A track whose covariances can be inverted; directions without variance are held.
 
-    A held direction gets the median variance of the others of its kind: its poses agree, so that
-    any will do.
+    Such a one gets the median variance of the others of its kind: its poses agree, so that any will
+    do.
     """
     seen = covariances[measured]
     variances = np.median(np.diagonal(seen, axis1=1, axis2=2), axis=0)
@@ -79,9 +82,7 @@ class MotionModel:
 
     order: int  # p, of the derivative that takes white noise
     intensities: Floats  # (2,): q, of lengths and of turns
-    # share of the covariances that is independent from frame to frame; above 1 where poses scatter
-    # more than their covariances say
-    white: float = 1.0
+    white: float = 1.0  # share of covariances that is independent from frame to frame
 
 
 def noise_of(track: Track, intensities: Floats) -> Floats:
@@ -154,3 +155,22 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
 def without(track: Track, bad: Mask) -> Track:
     """A track in which some poses (N,) do not count."""
     return replace(track, measured=track.measured & ~bad)
+
+
+def require_frames_once(lines: Sequence[PoseLine]) -> None:
+    """Raise a RecordingError if a frame stands twice among lines in the order of frames."""
+    for before, line in pairwise(lines):
+        if before.frame == line.frame:
+            raise RecordingError(
+                f"frame {line.frame} of {line.label!r} stands twice; allowed: a line per frame"
+            )
+
+
+def require_covariances(lines: Sequence[PoseLine]) -> None:
+    """Raise a RecordingError if a pose has no covariance."""
+    for line in lines:
+        if line.covariance is None or not line.covariance.any():
+            raise RecordingError(
+                f"line {line.line}: the pose of {line.label!r} in frame {line.frame} has no "
+                "covariance; allowed: poses as mixpose run writes them"
+            )

@@ -25,11 +25,9 @@ FORMATS = (KALIBR, OPENCV, PYCALIB, ROS, ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP)
 def read_calibration(
     wanted: CalibrationTable, folder: Path, model: CameraModel
 ) -> CalibratedCamera:
-    """Read the camera that a session names: its file, relative to `folder`, and what to read in
-    it.
+    """Read the camera that a session names: its file, relative to `folder`, and what to read in it.
 
-    The file may be in none of the formats, lack what was asked for, or hold a camera of another
-    model.
+    Raises BadKeyError if it is in none of the formats, lacks that, or is of another model.
     """
     content = read_content(folder / wanted.file, wanted.file)
     with in_file(wanted.file):
@@ -44,7 +42,7 @@ def read_calibration(
 
 
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
-    """Read all cameras of several files; files that belong together may be among them.
+    """Read all cameras of several files, among which may be some that belong together.
 
     `also` says what may be given besides, for the message about a file in no known format.
     """
@@ -60,7 +58,7 @@ def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
             groups = each.groups(contents) if each.groups else [[one] for one in contents]
         for group in groups:
             with in_file(_names_of(group)):
-                cameras = tuple(each.read(group, name, "pinhole") for name in each.names(group))
+                cameras = tuple(read("pinhole") for read in each.cameras(group).values())
             rigs.append(Rig(tuple(content.name for content in group), cameras))
     return rigs
 
@@ -88,21 +86,19 @@ def _read(content: Content, wanted: CalibrationTable, model: CameraModel) -> Cal
     _only_for("an OpenCV file", each.name, **nodes)
     if not each.holds_several:
         _only_for("a file of several cameras", each.name, camera=wanted.camera)
-    names = each.names([content])
-    name = wanted.camera
-    if name is None:
-        if len(names) > 1:
-            raise BadKeyError(
-                f"holds the cameras {', '.join(names)}; choose one as "
-                f'calibration = {{ file = "...", camera = "{names[0]}" }}'
-            )
-        name = names[0]
-    if name not in names:
+    cameras = each.cameras([content])
+    first, names = next(iter(cameras), ""), ", ".join(cameras)
+    if wanted.camera is None and len(cameras) > 1:
         raise BadKeyError(
-            f'found no camera "{name}"; cameras in the file: {", ".join(names)}; '
-            f"this is {each.name}"
+            f"holds the cameras {names}; choose one as "
+            f'calibration = {{ file = "...", camera = "{first}" }}'
         )
-    return each.read([content], name, model)
+    name = first if wanted.camera is None else wanted.camera
+    if name not in cameras:
+        raise BadKeyError(
+            f'found no camera "{name}"; cameras in the file: {names}; this is {each.name}'
+        )
+    return cameras[name](model)
 
 
 def _only_for(format_with: str, format_found: str, **keys: str | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,10 @@ from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_byt
 from mixpose.units import Unit
 
 Group: TypeAlias = "Sequence[Content]"
+"""Files that belong together."""
+
+Reader: TypeAlias = "Callable[[CameraModel], CalibratedCamera]"
+"""What reads a camera; the session's model helps where files do not state one."""
 
 # how a NumPy array, an archive of them, and a pickle of Python begin
 _NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
@@ -28,11 +32,8 @@ class CalibratedCamera:
 
     name: str
     intrinsics: Intrinsics
-    # (4, 4), maps coordinates that all cameras of the file share to those of the camera; None where
-    # the file does not say
-    T_camera_rig: Floats | None = None
-    # of the translation; None where the format leaves that to whoever wrote the file
-    unit: Unit | None = None
+    T_camera_rig: Floats | None = None  # (4, 4), from what the file's cameras share; None: not said
+    unit: Unit | None = None  # of the translation; None where the format does not fix it
     note: str = ""  # what a person should know of it; mostly empty
 
 
@@ -51,10 +52,8 @@ class Format:
     name: str  # with its article, as in "this is a Kalibr file"
     shown: str  # for the list of what is allowed
     recognises: Callable[[Content], bool]  # whether a file is in this format
-    names: Callable[[Group], list[str]]  # names of the cameras in files that belong together
-    # One of them.  The session's model helps where the files do not state one.
-    read: Callable[[Group, str, CameraModel], CalibratedCamera]
-    # files that belong together; None for formats whose files stand alone
+    cameras: Callable[[Group], Mapping[str, Reader]]  # those of a group by name
+    # groups of files; None for formats whose files stand alone
     groups: Callable[[Group], list[Group]] | None = None
     holds_several: bool = True  # whether one file can hold several cameras
 
@@ -77,10 +76,7 @@ class Content:
         return [line.strip() for line in self.text.splitlines()]
 
     def parsed(self) -> Any:
-        """What the text says as JSON or YAML.
-
-        Raises BadKeyError if it is neither; by its name's ending, why it is no TOML or JSON.
-        """
+        """What the text says as JSON or YAML, or why it is neither, by its name's ending."""
         no_json = ""
         if self.text.lstrip().startswith("{"):
             try:

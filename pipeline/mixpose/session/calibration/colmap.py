@@ -7,17 +7,17 @@ lose half a pixel.  Lengths are in no unit, as structure from motion has none.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import PurePosixPath
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
-from mixpose.session.calibration.pieces import size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, size_of
 from mixpose.session.messages import BadKeyError, found, one_of, under
 from mixpose.session.values import LARGEST, as_number
 
@@ -25,30 +25,22 @@ _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
 _CENTRE = 0.5  # px, of a pixel from its corner
 
-
-@dataclass(frozen=True)
-class _Lens:
-    """Where the parameters of a model stand: one or two focal lengths, and its distortion."""
-
-    model: CameraModel
-    focal_lengths: int
-    distortion: tuple[int | None, ...]  # places in OpenCV's order; None for a zero
-
-    @property
-    def count(self) -> int:
-        return self.focal_lengths + 2 + sum(place is not None for place in self.distortion)
+_Placed: TypeAlias = dict[str, tuple[str, Floats | None]]
+"""By name: the number of the camera, and where it stands."""
 
 
-_LENSES = {
-    "SIMPLE_PINHOLE": _Lens("pinhole", 1, ()),
-    "PINHOLE": _Lens("pinhole", 2, ()),
-    "SIMPLE_RADIAL": _Lens("pinhole", 1, (0, None, None, None)),
-    "RADIAL": _Lens("pinhole", 1, (0, 1, None, None)),
-    "OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3)),
-    "FULL_OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
-    "SIMPLE_RADIAL_FISHEYE": _Lens("fisheye", 1, (0, None, None, None)),
-    "RADIAL_FISHEYE": _Lens("fisheye", 1, (0, 1, None, None)),
-    "OPENCV_FISHEYE": _Lens("fisheye", 2, (0, 1, 2, 3)),
+# of a model: that of OpenCV; how many focal lengths and coefficients it has, and of how many these
+# are the first, the others being zero
+_LENSES: dict[str, tuple[CameraModel, int, int, int]] = {
+    "SIMPLE_PINHOLE": ("pinhole", 1, 0, 0),
+    "PINHOLE": ("pinhole", 2, 0, 0),
+    "SIMPLE_RADIAL": ("pinhole", 1, 1, 4),
+    "RADIAL": ("pinhole", 1, 2, 4),
+    "OPENCV": ("pinhole", 2, 4, 4),
+    "FULL_OPENCV": ("pinhole", 2, 8, 8),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, 1, 4),
+    "RADIAL_FISHEYE": ("fisheye", 1, 2, 4),
+    "OPENCV_FISHEYE": ("fisheye", 2, 4, 4),
 }
 
 
@@ -82,8 +74,7 @@ def _of_kind(group: Group, kind: str) -> Content | None:
     return files[0] if files else None
 
 
-def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
-    """By name: the number of the camera, and where it stands."""
+def _placed(group: Group) -> _Placed:
     cameras, images, rigs = (_of_kind(group, kind) for kind in ("cameras", "images", "rigs"))
     if cameras is None:
         raise BadKeyError("COLMAP's cameras.txt is missing; give it beside this file")
@@ -96,7 +87,7 @@ def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
     return {f"camera{number}": (number, None) for number in numbers}
 
 
-def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
+def _from_images(content: Content) -> _Placed:
     """A sensor for each image: a camera that was moved was at several places."""
     lines = [line for line in content.lines if not line.startswith("#")]
     while lines and not lines[0]:
@@ -107,7 +98,7 @@ def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
             f"found {len(poses)} images; allowed: at most {_MOST_IMAGES}, one of each camera: "
             "mixpose's cameras stand still"
         )
-    placed: dict[str, tuple[str, Floats | None]] = {}
+    placed: _Placed = {}
     for row in poses:
         if len(row) != 10:
             raise BadKeyError(
@@ -120,12 +111,12 @@ def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
     return placed
 
 
-def _from_rigs(content: Content) -> dict[str, tuple[str, Floats | None]]:
+def _from_rigs(content: Content) -> _Placed:
     """Sensors of the only rig: the reference at its origin, the others where they say."""
     rigs = [row for row in _rows(content) if len(row) > 3 and _whole(row[1]) > 1]
     if len(rigs) > 1:
         raise BadKeyError(f"found {len(rigs)} rigs of several sensors; allowed: one")
-    placed: dict[str, tuple[str, Floats | None]] = {}
+    placed: _Placed = {}
     for row in rigs:
         kind, number, *rest = row[2:]
         if kind == "CAMERA":
@@ -164,8 +155,12 @@ def _floats(cells: Sequence[str]) -> list[float]:
     return values
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+def _cameras(group: Group) -> dict[str, Reader]:
     placed = _placed(group)
+    return {name: partial(_read, group, placed, name) for name in placed}
+
+
+def _read(group: Group, placed: _Placed, name: str, _: CameraModel) -> CalibratedCamera:
     number, pose = placed[name]
     cameras = _of_kind(group, "cameras")
     assert cameras is not None, "without it there are no names"
@@ -186,24 +181,21 @@ def _intrinsics(row: list[str]) -> Intrinsics:
         raise BadKeyError(found(" ".join(row), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"))
     if row[1] not in _LENSES:
         raise BadKeyError(found(row[1], one_of(_LENSES)))
-    lens = _LENSES[row[1]]
-    values = _floats(row[4:])
-    if len(values) != lens.count:
-        raise BadKeyError(
-            f"found {len(values)} parameters of {row[1]}; allowed: {lens.count} of them"
-        )
-    fx, fy = values[0], values[lens.focal_lengths - 1]
-    cx, cy, *rest = values[lens.focal_lengths :]
+    model, focal_lengths, given, of = _LENSES[row[1]]
+    values, count = _floats(row[4:]), focal_lengths + 2 + given
+    if len(values) != count:
+        raise BadKeyError(f"found {len(values)} parameters of {row[1]}; allowed: {count} of them")
+    fx, fy = values[0], values[focal_lengths - 1]
+    cx, cy, *rest = values[focal_lengths:]
     K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
-    D = np.array([0.0 if place is None else rest[place] for place in lens.distortion])
-    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), lens.model)
+    D = np.array([*rest, *[0.0] * (of - given)])
+    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), model)
 
 
 COLMAP = Format(
     "a COLMAP file",
     "COLMAP's text (cameras.txt ...)",
     recognises=lambda content: bool(_kind(content)),
-    names=lambda group: list(_placed(group)),
-    read=_read,
+    cameras=_cameras,
     groups=lambda contents: [contents],
 )

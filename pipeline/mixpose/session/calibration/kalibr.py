@@ -7,15 +7,17 @@ programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` in its place
 from __future__ import annotations
 
 import re
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
-from mixpose.session.calibration.pieces import model_of_distortion, plain, present, size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session import intrinsics as pieces
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, found, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
@@ -23,53 +25,50 @@ from mixpose.session.values import numbers
 _MATRIX = "a 4x4 matrix, four rows of four numbers"
 
 
-def _cameras(content: Content) -> list[str]:
+def _cameras(group: Group) -> dict[str, Reader]:
+    chain = group[0].mapping
     named = [
         name
-        for name, camera in content.mapping.items()
+        for name, camera in chain.items()
         if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
     ]
     # YAML's writers put cam10 before cam2, and the one before it is cam9
-    return sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
+    names = sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
+    return {name: partial(_read, chain, names, name) for name in names}
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
-    camera = group[0].mapping[name]
+def _read(
+    chain: dict[str, Any], names: list[str], name: str, model: CameraModel
+) -> CalibratedCamera:
+    camera = chain[name]
     with under(name):
         if camera.get("camera_model", "pinhole") != "pinhole":
             raise BadKeyError(found(camera["camera_model"], '"pinhole"'), "camera_model")
         with under("distortion_model"):
-            stated = present(camera, "distortion_model")
-            model = model_of_distortion(stated) or "pinhole"
+            stated = pieces.present(camera, "distortion_model")
+            model = pieces.model_of_distortion(stated) or "pinhole"
         with under("intrinsics"):
-            K = _matrix(plain(camera["intrinsics"]))
+            intrinsics = pieces.plain(camera["intrinsics"])
+            if not isinstance(intrinsics, list) or len(intrinsics) != 4:
+                raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
+            fu, fv, pu, pv = intrinsics
+            K = pieces.camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
-            coefficients = [] if stated == "none" else present(camera, "distortion_coeffs")
-            D = distortion(plain(coefficients), model)
+            coefficients = [] if stated == "none" else pieces.present(camera, "distortion_coeffs")
+            D = pieces.distortion(pieces.plain(coefficients), model)
         with under("resolution"):
-            size = size_of(camera.get("resolution"))
-    pose = _pose(group[0].mapping, _cameras(group[0]), name)
-    return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, "m")
-
-
-def _matrix(intrinsics: Any) -> Floats:
-    if not isinstance(intrinsics, list) or len(intrinsics) != 4:
-        raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
-    fu, fv, pu, pv = intrinsics
-    return camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+            size = pieces.size_of(camera.get("resolution"))
+    return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
 
 
 def _pose(chain: dict[str, Any], names: list[str], wanted: str) -> Floats | None:
     """From the first camera's coordinates to those of another; None where a link is missing."""
     T = np.eye(4)
-    for before, name in zip([None, *names], names):
-        if before is not None:
-            step = _step(chain, before, name)
-            if step is None:
-                return None
-            T = step @ T
-        if name == wanted:
-            break
+    for before, name in pairwise(names[: names.index(wanted) + 1]):
+        step = _step(chain, before, name)
+        if step is None:
+            return None
+        T = step @ T
     # a camera alone has no place in anything
     return T if len(names) > 1 else None
 
@@ -95,14 +94,13 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
         return None
     with under(name):
         with under(key):
-            matrix = numbers(plain(chain[name][key]), (4, 4), _MATRIX)
+            matrix = numbers(pieces.plain(chain[name][key]), (4, 4), _MATRIX)
         return rigid(matrix, key)
 
 
 KALIBR = Format(
     "a Kalibr file",
     "Kalibr camchain (cam0: intrinsics ...)",
-    recognises=lambda content: bool(_cameras(content)),
-    names=lambda group: _cameras(group[0]),
-    read=_read,
+    recognises=lambda content: bool(_cameras([content])),
+    cameras=_cameras,
 )

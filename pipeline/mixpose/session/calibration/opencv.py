@@ -1,9 +1,8 @@
 """Calibrations in OpenCV's FileStorage format: YAML, XML or JSON.
 
-A file holds one camera under usual names (``camera_matrix``), several numbered ones
-(``M1``, ``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a
-file of their own, as OpenCV's sample for stereo writes them), or a map for each (MC-Calib's
-``camera_0``).
+A file holds one camera under usual names (``camera_matrix``), several numbered ones (``M1``,
+``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a file of their
+own), or a map for each (MC-Calib's ``camera_0``).
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import cv2
@@ -20,9 +20,9 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
-from mixpose.session.calibration.pieces import model_of_distortion, motion_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session import intrinsics as pieces
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
@@ -57,9 +57,8 @@ class _Nodes:
 
 
 def _recognises(content: Content) -> bool:
-    head = content.text.lstrip()
-    starts = head.startswith(("%YAML:", "%YAML ", "<?xml", "<opencv_storage"))
-    return starts or "opencv-matrix" in content.text
+    starts = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
+    return content.text.lstrip().startswith(starts) or "opencv-matrix" in content.text
 
 
 def _open(group: Iterable[Content]) -> _Nodes:
@@ -91,14 +90,14 @@ def _require_shallow(content: Content) -> None:
 
 def _groups(contents: Group) -> list[Group]:
     """Files with cameras; one without belongs to the only other."""
-    with_cameras = [content for content in contents if _cameras(_open([content]), content.stem)]
+    with_cameras = [content for content in contents if _places(_open([content]), content.stem)]
     others = [content for content in contents if content not in with_cameras]
     if len(with_cameras) == 1:
         return [[*with_cameras, *others]]
     return [[content] for content in contents]
 
 
-def _cameras(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
+def _places(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
     """By name: the map of a camera, or its nodes of matrix and distortion."""
     nested: dict[str, str | tuple[str, str]] = {
         name: name
@@ -126,26 +125,26 @@ def _usual(opened: _Nodes, names: tuple[str, ...]) -> str | None:
     return next((name for name in names if name in opened.nodes), None)
 
 
-def _names(group: Group) -> list[str]:
+def _cameras(group: Group) -> dict[str, Reader]:
     opened = _open(group)
-    names = list(_cameras(opened, group[0].stem))
-    if not names and {"R", "T"} <= set(opened.nodes):
+    places = _places(opened, group[0].stem)
+    if not places and {"R", "T"} <= set(opened.nodes):
         raise BadKeyError(
             "holds R and T, where one camera stands to another, and no camera matrix; allowed: "
             "beside it the file that has the matrices of the two"
         )
-    if not names:  # which says what is there and how to name it
+    if not places:  # which says what is there and how to name it
         choose_node(opened, "camera_matrix", None)
-    return names
+    names = list(places)
+    return {name: partial(_read, opened, names, name, place) for name, place in places.items()}
 
 
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
-    opened = _open(group)
-    cameras = _cameras(opened, group[0].stem)
-    place = cameras[name]
+def _read(
+    opened: _Nodes, names: list[str], name: str, place: str | tuple[str, str], model: CameraModel
+) -> CalibratedCamera:
     if not isinstance(place, str):
         intrinsics = _intrinsics(opened, model, place[0], place[1] or None)
-        return CalibratedCamera(name, intrinsics, _stereo_pose(opened, list(cameras), name))
+        return CalibratedCamera(name, intrinsics, _stereo_pose(opened, names, name))
     node = opened.nodes[place]
     own = _Nodes({key: node.getNode(key) for key in list(node.keys())}, opened.storages)
     with under(place):
@@ -155,11 +154,7 @@ def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
 def read_nodes(
     content: Content, model: CameraModel, matrix: str | None, distortion_name: str | None
 ) -> CalibratedCamera:
-    """Read the camera whose nodes the user names.
-
-    Raises BadKeyError if the text cannot be parsed, or a node is missing or is no camera matrix or
-    distortion.
-    """
+    """Read the camera whose nodes the user names; BadKeyError if they are not there or not such."""
     intrinsics = _intrinsics(_open([content]), model, matrix, distortion_name)
     return CalibratedCamera(content.stem, intrinsics)
 
@@ -171,9 +166,9 @@ def _intrinsics(
     distortion_node = choose_node(opened, "distortion", coefficients)
     stated = _stated_model(opened)
     with under(matrix_node):
-        K = camera_matrix(_values(opened.nodes[matrix_node]))
+        K = pieces.camera_matrix(_values(opened.nodes[matrix_node]))
     with under(distortion_node):
-        D = distortion(_values(opened.nodes[distortion_node]), stated or model)
+        D = pieces.distortion(_values(opened.nodes[distortion_node]), stated or model)
     return Intrinsics(K, D, _resolution(opened), stated)
 
 
@@ -201,7 +196,7 @@ def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
         return None
     if name == names[0]:
         return np.eye(4)
-    return motion_of(_values(opened.nodes["R"]), _values(opened.nodes["T"]), key="R")
+    return pieces.motion_of(_values(opened.nodes["R"]), _values(opened.nodes["T"]), key="R")
 
 
 def _own_pose(own: _Nodes) -> Floats | None:
@@ -248,7 +243,7 @@ def _stated_model(opened: _Nodes) -> CameraModel | None:
     name = opened.nodes.get("distortion_model")
     if name is not None and name.isString():
         with under("distortion_model"):
-            return model_of_distortion(name.string())
+            return pieces.model_of_distortion(name.string())
     return None
 
 
@@ -261,4 +256,4 @@ def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     return None
 
 
-OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _names, _read, _groups)
+OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _cameras, _groups)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
-from mixpose.session.calibration.pieces import motion_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion, motion_of
 from mixpose.session.messages import BadKeyError, under
 
 _DEEP = 3  # a list of matrices; one matrix alone is a camera of another format
@@ -19,14 +19,14 @@ def _depth(value: Any) -> int:
     return depth
 
 
-def _names(group: Group) -> list[str]:
-    count = len(group[0].mapping["K"])
-    return [f"cam{k + 1:0{len(str(count))}}" for k in range(count)]
-
-
-def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+def _cameras(group: Group) -> dict[str, Reader]:
     content = group[0].mapping
-    k = int(name.removeprefix("cam")) - 1
+    count = len(content["K"])
+    names = [f"cam{k + 1:0{len(str(count))}}" for k in range(count)]
+    return {name: partial(_read, content, k, name) for k, name in enumerate(names)}
+
+
+def _read(content: dict[str, Any], k: int, name: str, model: CameraModel) -> CalibratedCamera:
     with under("K", k):
         K = camera_matrix(content["K"][k])
     coefficients = _entry(content, "d", k)
@@ -57,6 +57,5 @@ PYCALIB = Format(
     "a pycalib file",
     "pycalib (K, d, R, t, lists)",
     recognises=lambda content: _depth(content.mapping.get("K")) == _DEEP,
-    names=_names,
-    read=_read,
+    cameras=_cameras,
 )

@@ -8,11 +8,12 @@ map the world to the camera.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeAlias
 
-from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group
-from mixpose.session.calibration.pieces import motion_of, present, size_of
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session import intrinsics as pieces
+from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, Key, found, under
 from mixpose.units import Unit
 
@@ -41,21 +42,20 @@ def _is_camera(table: Any) -> bool:
     return isinstance(table, dict) and "matrix" in table and "distortions" in table
 
 
-def _read_table(table: dict[str, Any], name: str, unit: Unit | None) -> CalibratedCamera:
-    """Read the table of a camera."""
+def _read(table: dict[str, Any], name: str, unit: Unit | None, _: CameraModel) -> CalibratedCamera:
     fisheye = table.get("fisheye", False)
     if not isinstance(fisheye, bool):
         raise BadKeyError(found(fisheye, "true or false"), "fisheye")
     model: CameraModel = "fisheye" if fisheye else "pinhole"
     with under("matrix"):
-        K = camera_matrix(table["matrix"])
+        K = pieces.camera_matrix(table["matrix"])
     with under("distortions"):
-        D = distortion(table["distortions"], model)
+        D = pieces.distortion(table["distortions"], model)
     with under("size"):
-        size = size_of(present(table, "size"))
+        size = pieces.size_of(pieces.present(table, "size"))
     pose = None
     if table.get("rotation") is not None and table.get("translation") is not None:
-        pose = motion_of(table["rotation"], table["translation"])
+        pose = pieces.motion_of(table["rotation"], table["translation"])
     return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, unit)
 
 
@@ -64,18 +64,11 @@ def _format(
 ) -> Format:
     """A format of such tables, by what finds them in a file, with the unit of its lengths."""
 
-    def read(group: Group, camera: str, model: CameraModel) -> CalibratedCamera:
-        key, table = cameras_of(group[0])[camera]
-        with under(*key):
-            return _read_table(table, camera, unit)
+    def cameras(group: Group) -> dict[str, Reader]:
+        found = cameras_of(group[0]).items()
+        return {one: partial(under(*key)(_read), table, one, unit) for one, (key, table) in found}
 
-    return Format(
-        name,
-        shown,
-        recognises=lambda content: bool(cameras_of(content)),
-        names=lambda group: list(cameras_of(group[0])),
-        read=read,
-    )
+    return Format(name, shown, lambda content: bool(cameras_of(content)), cameras)
 
 
 ANIPOSELIB = _format("an aniposelib file", "aniposelib ([cam_0])", _aniposelib, None)

@@ -149,7 +149,12 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
             'and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
         )
     for camera in cameras:
-        warnings += _outside(camera)
+        (cx, cy), size = camera.intrinsics.camera_matrix[:2, 2], camera.intrinsics.resolution
+        if size and not (0 <= cx <= size[0] - 1 and 0 <= cy <= size[1] - 1):
+            warnings.append(
+                f"{camera.name}: the principal point cx = {cx:g}, cy = {cy:g} is outside of its "
+                f"images of {size[0]}x{size[1]} px: was it calibrated at another size?"
+            )
     for a, b in combinations(cameras, 2):
         if _same(a, b):
             warnings.append(
@@ -157,19 +162,6 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
                 "copy by mistake; drop it or calibrate it again"
             )
     return warnings
-
-
-def _outside(camera: CalibratedCamera) -> list[str]:
-    size = camera.intrinsics.resolution
-    if size is None:
-        return []
-    cx, cy = camera.intrinsics.camera_matrix[:2, 2]
-    if 0 <= cx <= size[0] - 1 and 0 <= cy <= size[1] - 1:
-        return []
-    return [
-        f"{camera.name}: the principal point cx = {cx:g}, cy = {cy:g} is outside of its images of "
-        f"{size[0]}x{size[1]} px: was it calibrated at another size?"
-    ]
 
 
 def _same(a: CalibratedCamera, b: CalibratedCamera) -> bool:
