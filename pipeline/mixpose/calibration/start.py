@@ -9,14 +9,14 @@ pairs with most frames in agreement.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.searching import joint_poses, likeliest_poses
+from mixpose.calibration.searching import Posed, posed
 from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse, mean_motion, rotation_angle_deg, transform
@@ -37,8 +37,15 @@ class Start:
     state: State
     frames: tuple[SeenFrame, ...]  # those with a pose
     # through which sensor each was linked (None: through known poses), and frames that agree
-    through: Mapping[int, tuple[int | None, int]]
-    unlinked: tuple[int, ...]  # sensors that share no view with the others
+    through: Mapping[int, tuple[int | None, int]] = field(default_factory=dict)
+    unlinked: tuple[int, ...] = ()  # sensors that share no view with the others
+    factor: float = 1.0  # times σ_ε, with which poses were searched
+
+    @classmethod
+    def of(cls, rig: Rig, found: Sequence[Posed], factor: float = 1.0) -> Start:
+        """A rig as it is believed to be, and frames whose pose is known."""
+        poses = np.array([one.T_world_object for one in found]).reshape(-1, 4, 4)
+        return cls(State(rig, poses), tuple(one.frame for one in found), factor=factor)
 
     def only(self, mask: Mask) -> Start:
         """Some of the frames (K,)."""
@@ -99,21 +106,24 @@ def _from_known_poses(
     return Start(State(rig, poses), frames, through, tuple(unlinked))
 
 
-def start_where_they_stand(task: Task, progress: Progress) -> Start:
-    """The rig as it is believed to be, and the likeliest poses that all sensors together know."""
-    frames, poses = likeliest_poses(task, progress)
-    return Start(State(task.rig, poses), frames, {}, ())
-
-
 def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
-    """Poses that all sensors together know, or that are known anyway."""
-    if task.known is None:
-        for frames, poses in joint_poses(task, rules, progress):
-            yield Start(State(task.rig, poses), frames, {}, ())
+    """Poses that all sensors together know, blur after blur, or that are known anyway."""
+    if task.known is not None:
+        known = task.known
+        start = Start.of(
+            task.rig, [Posed(f, known[f.number]) for f in task.frames if f.number in known]
+        )
+        rig = _biased(task, start.frames, start.state.poses)
+        yield replace(start, state=start.state._replace(rig=rig))
         return
-    frames = tuple(frame for frame in task.frames if frame.number in task.known)
-    poses = np.array([task.known[frame.number] for frame in frames]).reshape(-1, 4, 4)
-    yield Start(State(_biased(task, frames, poses), poses), frames, {}, ())
+    for factor in rules.widened:
+        found = posed(task, factor, progress)
+        sure = [one for one in found if one.is_sure]
+        # where hardly any pose is believed, the likeliest are a start, and deviations will tell
+        few = len(sure) < rules.believed * len(task.frames)
+        yield Start.of(
+            task.rig, sorted(found, key=lambda one: one.frame.number) if few else sure, factor
+        )
 
 
 def _likeliest_poses(
