@@ -18,7 +18,7 @@ from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_o
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import posed, searched
 from mixpose.calibration.start import Start, start_from_cameras, starts_together
-from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
+from mixpose.calibration.task import Known, Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
 from mixpose.sensors import CalibrationError, CloudSensor
@@ -66,10 +66,8 @@ def calibrate(
 
 
 def _as_it_stands(task: Task, rules: CalibrationRules, progress: Progress) -> _Run | None:
-    """The run from where the session has all cameras; None where that leaves any unexplained.
-
-    Together they know the body among others that each alone may take for it.
-    """
+    """The run from where the session has all cameras; None where that leaves any unexplained."""
+    # together they know the body among others that each alone may take for it
     if task.known is not None or task.times_matter or len(task.cameras) < 2 or not task.frames:
         return None
     few = _few(task, rules)
@@ -186,11 +184,10 @@ class _Run:
         # from wider blurs, as features that crowd let the noise that is learnt first be too small
         self._progress("adjusting again, without bad frames", 1, _STAGES)
         part, adjusted = self._adjusted(part, adjusted.noise)
-        late = self._latecomers(part, adjusted.noise)
-        if late:
+        whole = self._with_latecomers(part, adjusted.noise)
+        if whole is not part:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
-            part = self._with_latecomers(part, late)
-            part, adjusted = self._adjusted(part, adjusted.noise)
+            part, adjusted = self._adjusted(whole, adjusted.noise)
         self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
@@ -235,29 +232,25 @@ class _Run:
         sizes = {"length": self._length, "interval": self._interval}
         return contradiction(self._bundle(self._part), self._best, **sizes)
 
-    def _latecomers(self, part: Start, noise: Floats) -> dict[int, Floats]:
-        """T_sensor_world of cameras that could not be linked by what they see alone."""
-        linked = [s for s in self._task.cameras if s not in self._unlinked]
-        known = linked, self._whole(part), noise, self._rules
-        # by lines of sight, which a cloud has none of
-        sensors = self._task.rig.sensors
-        cameras = [s for s in self._unlinked if not isinstance(sensors[s], CloudSensor)]
-        found = {s: placed(self._task, part.state, s, *known) for s in cameras}
-        return {s: T for s, T in found.items() if T is not None}
-
-    def _with_latecomers(self, part: Start, late: dict[int, Floats]) -> Start:
-        """Frames with what the cameras that came late saw, and the rig with them."""
-        self._lay_out([s for s in self._unlinked if s not in late])
-        rig = part.state.rig
-        for sensor, T in late.items():
-            rig = rig.placed(sensor, T)
-        frames = tuple(frame.without(self._unlinked) for frame in self._whole(part))
-        return replace(part, frames=frames, state=part.state._replace(rig=rig))
-
-    def _whole(self, part: Start) -> tuple[SeenFrame, ...]:
-        """The frames with all that sensors saw."""
+    def _with_latecomers(self, part: Start, noise: Floats) -> Start:
+        """The part with cameras that could not be linked by what they see, placed by its poses."""
         numbers = {frame.number: frame for frame in self._task.frames}
-        return tuple(numbers[frame.number] for frame in part.frames)
+        frames = tuple(numbers[frame.number] for frame in part.frames)  # with all that was seen
+        linked = [s for s in self._task.cameras if s not in self._unlinked]
+        rig, left = part.state.rig, list[int]()
+        for s in self._unlinked:
+            T = None
+            if not isinstance(rig.sensors[s], CloudSensor):  # which has no lines of sight
+                T = placed(self._task, part.state, s, linked, frames, noise, self._rules)
+            if T is None:
+                left.append(s)
+            else:
+                rig = rig.placed(s, T)
+        if rig is part.state.rig:
+            return part
+        self._lay_out(left)
+        frames = tuple(frame.without(left) for frame in frames)
+        return replace(part, frames=frames, state=part.state._replace(rig=rig))
 
     def _bundle(self, part: Start) -> Bundle:
         task = self._task

@@ -66,16 +66,12 @@ class Calibration:
     residuals: Mapping[int, Residual]
     noise: Floats  # (L,)
     inflation: float
-    # share of the weight of pairs of which each is the nearest that the other has: near 1, or
-    # detections cannot be told apart
-    certainty: float
+    certainty: float  # as of `Adjusted`: near 1, or detections cannot be told apart
     # (G,): standard deviations that come of what is held of sensors of which nothing is stated:
     # biases of ranges as large as σ_ε, and lenses that are off by `HELD_LENS`
     moved_by_biases: Floats
     moved_by_lenses: Floats
-    # (L,): share of what each sensor could show that is met, weighted as in the objective; NaN
-    # without
-    explained: Floats
+    explained: Floats  # (L,): share of what each sensor could show that is met; NaN without
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]  # (4, 4), by frame number
     contradicted: Contradiction | None = None  # what is held, and the recording says otherwise
@@ -192,22 +188,18 @@ def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
     # that of the sensor from which the others differ least: the bumped ones are outvoted
     poses = [before_and_after(before, after, k) for k in linked]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
+    if not told:  # range sensors alone
+        a, b = (np.array([centre_of(rig.sensors[k]) for k in linked]) for rig in (after, before))
+        if len(a) < 3:
+            return from_parts(np.eye(3), (b - a).mean(axis=0))
+        return motions(a, b[None])[0]  # type: ignore[no-any-return]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
-        return told[0] if told else _from_places(before, after, linked)
+        return told[0]
     worth = []
     for G in told:
         apart = [_apart(before, after, k, G) for k in linked]
         worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
     return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
-
-
-def _from_places(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
-    """The best motion between range sensors."""
-    a = np.array([centre_of(after.sensors[k]) for k in linked])
-    b = np.array([centre_of(before.sensors[k]) for k in linked])
-    if len(a) < 3:
-        return from_parts(np.eye(3), (b - a).mean(axis=0))
-    return motions(a, b[None])[0]  # type: ignore[no-any-return]
 
 
 def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:

@@ -53,7 +53,7 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
     # the world is put where the camera is, so that poses are relative to it
     own = view.sensor.moved(inverse(view.sensor.T_sensor_world))  # type: ignore[attr-defined]
     views = plane_views(View(view.name, own, view.observation))
-    tracker = Tracker.create(task.body, EstimatorOptions())
+    tracker = Tracker.create(task.rig.body, EstimatorOptions())
     ranked = tracker.explain(tracker.data(tracker.begin(), 0, None, views))
     best = ranked[0].log_evidence if ranked else 0.0
     kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
@@ -67,7 +67,9 @@ def posed(task: Task, factor: float = 1.0, progress: Progress = silent) -> list[
     free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
     turn, distance = task.around
     options = EstimatorOptions(free=free, fuse=task.fuse)
-    tracker = Tracker.create(task.body, options, task.T_held, rotation_deg=turn, distance=distance)
+    tracker = Tracker.create(
+        task.rig.body, options, task.T_held, rotation_deg=turn, distance=distance
+    )
     track, found = tracker.begin(), list[Posed]()
     for done, frame in enumerate(task.frames):
         seen = [_view(task, s, y, factor) for s, y in frame.points.items() if len(y)]
@@ -95,23 +97,21 @@ class Saved(Known):
         super().__init__()
         self._path, first = path, f"{MARK}{json.dumps(key)}}}"
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        known = Known()
         for line in lines[1:] if lines and lines[0] == first else []:
             with suppress(ValueError):  # the last line was cut off
                 frame, sensor, poses, evidence = json.loads(line)
                 T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-                known = Hypotheses(T, np.array(evidence, dtype=np.float64))
-                super().__setitem__((int(frame), int(sensor)), known)
-        self.resumed = len(self)
+                one = Hypotheses(T, np.array(evidence, dtype=np.float64))
+                known[int(frame), int(sensor)] = one
+        self.resumed = len(known)
         self._stream = path.open("w", encoding="utf-8", newline="\n")
         self._stream.write(first + "\n")
-        for key_, one in self.items():
-            self._write(key_, one)
+        for place, one in known.items():
+            self[place] = one
 
     def __setitem__(self, key: tuple[int, int], one: Hypotheses) -> None:
         super().__setitem__(key, one)
-        self._write(key, one)
-
-    def _write(self, key: tuple[int, int], one: Hypotheses) -> None:
         self._stream.write(json.dumps([*key, one.poses.tolist(), one.evidence.tolist()]) + "\n")
         self._stream.flush()
 
