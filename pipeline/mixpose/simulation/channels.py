@@ -40,8 +40,7 @@ class Channel:
     view: View
     options: SimulationOptions  # as they hold for this sensor
     open: Callable[[Path], SensorWriter]  # takes the recording's folder and starts to write there
-    # seconds by which its frames are later than those of the first sensor, as its times say
-    step_s: float = 0.0
+    step_s: float = 0.0  # seconds after the first sensor, as its times say
 
 
 def check_setup(session: Session) -> None:

@@ -37,8 +37,7 @@ class SourceFiles:
     path: str  # the one file of a video or table; for images what comes before the frame number
     ending: str = ""  # for images: what comes after the frame number
     digits: int = 0  # for images: how many digits the frame number has at least
-    # for images of a list: the name of each frame
-    listed: dict[int, str] = field(default_factory=dict)
+    listed: dict[int, str] = field(default_factory=dict)  # for images of a list: their names
     pattern: str = ""  # the glob that the session reads the images by; empty for all other sources
 
     def name(self, number: int) -> str:

@@ -43,8 +43,7 @@ class VisibleSpots:
     points: Floats  # (M, m), places of the spots
     levels: Floats  # (M,), their brightness; 1 for the mean feature
     features: NDArray[np.intp]  # (M,), that spots belong to; numbers from N on are false features
-    # edges (K, 2) of those spots that have a size
-    outlines: Mapping[int, Floats] = field(default_factory=dict)
+    outlines: Mapping[int, Floats] = field(default_factory=dict)  # edges (K, 2) of sized spots
     covers: tuple[Floats, ...] = ()  # corners (4, 2) of what is dark before all spots
 
     def __len__(self) -> int:
@@ -56,8 +55,7 @@ class View:
     """How one sensor looks at the body throughout a recording."""
 
     sensor: Sensor
-    # bounds (m,) of false features
-    lowest: Floats
+    lowest: Floats  # (m,): bounds of false features
     highest: Floats
     levels: Floats  # (N,), brightness of the features
     spacing: float  # distance of the spots of which a line consists, sensor units
@@ -100,18 +98,15 @@ def look(
     own = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
     actors = [own, *view.scenery.actors]
     poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
-    cores = [
-        (
-            transform(T, actor.body.means.mean(axis=0)[None])[0],
-            0.0 if actor is own and is_away else _CORE * actor.body.radius,
-        )
-        for actor, T in zip(actors, poses, strict=True)
-    ]
+    means = [actor.body.means.mean(axis=0)[None] for actor in actors]
+    middles = [transform(T, mean)[0] for T, mean in zip(poses, means, strict=True)]
+    radii = [0.0 if one is own and is_away else _CORE * one.body.radius for one in actors]
     for actor, T in zip(actors, poses, strict=True):
         seen = facing(view.sensor, actor.body, T, actor.mirror)
         if actor.is_body:
             seen &= ~_hidden(len(actor.body), options, rng)
-            others = [c for a, c in zip(actors, cores) if a.is_body and a is not actor]
+            cores = zip(actors, middles, radii, strict=True)
+            others = [(m, r) for one, m, r in cores if one.is_body and one is not actor]
             seen &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
         if is_away and (actor is own or actor.is_image):
             continue
@@ -121,8 +116,7 @@ def look(
             offset = offsets[i] if actor is own and offsets is not None else np.zeros(3)
             spots.add(view, actor, i, first + i, pose_later, offset)
     late = time_s + view.shutter.late_s
-    arms = view.scenery.arms if view.sensor.dimension == 2 else ()
-    covers = [arm.outline(view.unbounded, late) for arm in arms]
+    covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
     return spots.visible(tuple(one for one in covers if len(one)))
 
 
