@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mixpose.body.symmetry import congruent_triples_of_each, motions
-from mixpose.calibration.task import Progress, silent
+from mixpose.calibration.task import Progress
 from mixpose.learning.copies import is_chance, left_by, with_copies
 from mixpose.learning.growing import Found, Places, grown, least_met, placed
 from mixpose.learning.placing import FEWEST, Shape, triples_of
@@ -28,7 +28,7 @@ _OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those
 
 
 def find_bodies(
-    clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress = silent
+    clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress
 ) -> list[Found]:
     """Find what moves rigidly in clouds without what stands still; most points seen first.
 
@@ -44,18 +44,15 @@ def find_bodies(
         least = least_met(len(body.shape))
         more = _missed(body, left_by(body.places, left), least, RULES.many_bases)
         body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
-        found.append(_of_all(body, left))
-        left = _without(left, body)
+        places = []
+        for k, one in body.places:  # with points numbered as they were before any were left out
+            met = np.where(one.met >= 0, left[k].rows[one.met], -1)
+            places.append((k, replace(one, met=met)))
+        found.append(replace(body, places=tuple(places)))
+        # also where too few of its points are seen for a frame to count
+        left = left_by(body.places, left)
+        left = left_by(_missed(body, left, FEWEST, RULES.bases), left)
     return sorted(found, key=lambda each: -each.met)
-
-
-def _of_all(body: Found, clouds: Sequence[Cloud]) -> Found:
-    """The body with points numbered as they were before any were left out."""
-    places = tuple(
-        (k, replace(one, met=np.where(one.met >= 0, clouds[k].rows[one.met], -1)))
-        for k, one in body.places
-    )
-    return replace(body, places=places)
 
 
 def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> Found | None:
@@ -83,12 +80,6 @@ def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found 
         # with as few points as a looser shape is met by, where it has other bodies' among them
         frames = len(placed(best.shape, looser, best.count, FEWEST))
     return best
-
-
-def _without(clouds: Sequence[Cloud], body: Found) -> list[Cloud]:
-    """Clouds without a body, also where too few of its points are seen for a frame to count."""
-    left = left_by(body.places, clouds)
-    return left_by(_missed(body, left, FEWEST, RULES.bases), left)
 
 
 def _missed(body: Found, left: Sequence[Cloud], least: int, bases: int) -> Places:

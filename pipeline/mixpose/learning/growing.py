@@ -29,8 +29,7 @@ class Found:
     """A body, and where it is in which frames."""
 
     shape: Shape  # in a frame of its own
-    # with the index of the cloud; of congruent bodies several of one
-    places: tuple[tuple[int, Placement], ...]
+    places: tuple[tuple[int, Placement], ...]  # of congruent bodies several in a cloud
     count: int = 1  # congruent bodies that are seen at a time
     loose: float = 1.0  # times the error of triangulation that its points may be off
 
@@ -93,11 +92,7 @@ def usual_reach(places: Places, clouds: Sequence[Cloud]) -> float:
 
 
 def _poses_apart(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple[Indices, int]:
-    """Numbers (K,) of the poses of placements, from 0, and how many are apart from each other.
-
-    The number is the same where the body is at the same place: where no point of the shape is far
-    from where an earlier pose has it.
-    """
+    """Numbers (K,) of the poses of placements, the same where no point is far, and how many."""
     if not places:
         return np.zeros(0, dtype=np.intp), 0
     points = transform(np.array([one.T_world_shape for _, one in places]), shape.points)

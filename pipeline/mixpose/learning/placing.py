@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -60,9 +59,9 @@ class Placement:
         return len(self.own)
 
 
-def body_of(name: str, points: Floats, names: Sequence[str] = ()) -> Body:
+def body_of(name: str, points: Floats) -> Body:
     """A body of points without spread."""
-    return Body(name, tuple(PointFeature(point) for point in points), names=tuple(names))
+    return Body(name, tuple(PointFeature(point) for point in points))
 
 
 def triples_of(points: Floats, reach: Floats) -> Indices:
