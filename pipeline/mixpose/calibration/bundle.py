@@ -8,7 +8,7 @@ and a dense system of G remains (Schur complement).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
@@ -47,11 +47,6 @@ class Bundle:
     def count(self) -> int:
         """Free parameters of the rig, G."""
         return sum(len(block.names) for block in self.blocks)
-
-    @property
-    def of_poses(self) -> Bundle:
-        """The same without free parameters of the rig, for poses that suit a rig."""
-        return replace(self, blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
 
     @property
     def scales(self) -> Floats:

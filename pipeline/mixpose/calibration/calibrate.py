@@ -206,7 +206,7 @@ class _Run:
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
         # without parameters of the rig, so that all rigs are held to the same
-        bundle = self._bundle(part).of_poses
+        bundle = replace(self._bundle(part), blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
         _, before = fitted(bundle, self._task.rig, best)
         _, after = fitted(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]
