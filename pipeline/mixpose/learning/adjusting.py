@@ -15,10 +15,9 @@ from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import State, blocks_of
-from mixpose.learning.growing import Found, Places, only_once, usual_reach
-from mixpose.learning.placing import FEWEST, body_of
 from mixpose.learning.points import Cloud, are_points
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Places, body_of, only_once, usual_reach
 from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
 from mixpose.sensors import CalibrationError

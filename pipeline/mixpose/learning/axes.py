@@ -12,7 +12,7 @@ import numpy as np
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.errors import SessionError
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.placing import body_of
+from mixpose.learning.shapes import body_of
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 

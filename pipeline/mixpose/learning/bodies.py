@@ -15,11 +15,11 @@ from scipy.spatial.distance import cdist
 
 from mixpose.body.symmetry import congruent_triples_of_each, motions
 from mixpose.calibration.task import Progress
+from mixpose.learning import shapes
 from mixpose.learning.copies import is_chance, left_by, with_copies
-from mixpose.learning.growing import Found, Places, grown, least_met, placed
-from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Places, Shape, placed
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 
@@ -41,7 +41,7 @@ def find_bodies(
         if body is None:
             break
         # a frame that shows few points of a body may show none of the triples it was found by
-        least = least_met(len(body.shape))
+        least = shapes.least_met(len(body.shape))
         more = _missed(body, left_by(body.places, left), least, RULES.many_bases)
         body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
         places = []
@@ -71,7 +71,7 @@ def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found 
     best, frames = None, 0
     for loose in RULES.looser[RULES.looser.index(least) :]:
         looser = [cloud.loosened(loose) for cloud in clouds]
-        body = grown(shape, looser)
+        body = shapes.grown(shape, looser)
         if body is None or is_chance(body, looser):
             break
         if best is not None and len(body.places) < RULES.worth * frames:
@@ -120,7 +120,7 @@ def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int
     _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
     found = set[tuple[int, int, int]]()
     for row in near:
-        own = np.sort(row[triples_of(cloud.points[row], cloud.reach[row])], axis=1)
+        own = np.sort(row[shapes.triples_of(cloud.points[row], cloud.reach[row])], axis=1)
         found |= {(a, b, c) for a, b, c in own.tolist()}
     drawn = sorted(found)
     if len(drawn) > RULES.triples:
@@ -128,7 +128,7 @@ def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int
     for _ in range(RULES.far_triples if len(cloud) > reach else 0):
         a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
         some = [a, b, c]
-        if (a, b, c) not in found and len(triples_of(cloud.points[some], cloud.reach[some])):
+        if (a, b, c) not in found and len(shapes.triples_of(cloud.points[some], cloud.reach[some])):
             drawn.append((a, b, c))
     return drawn
 

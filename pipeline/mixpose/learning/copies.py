@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import pdtr
 
-from mixpose.learning.growing import Found, Places, averaged, placed
-from mixpose.learning.placing import FEWEST, Placement, Shape
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Placement, Places, Shape, averaged, placed
 from mixpose.records import Floats, Indices, Mask
 
 _OF_COPY = 0.6  # of the points of a shape that another one of it must show

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.placing import body_of
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import body_of
 from mixpose.records import Floats
 from mixpose.session.marker_files import LEARNT_COLUMNS
 
