@@ -232,23 +232,16 @@ def _worst_lines(found: Calibration) -> list[str]:
     return lines
 
 
-def coverage(found: Calibration, sensor: int) -> Floats | None:
-    """Detections met in each of 4 x 4 parts of a camera's image; None for other sensors."""
-    eye = found.after.sensors[sensor]
-    resolution = getattr(eye, "resolution", None)
-    if eye.dimension != 2 or resolution is None:
-        return None
-    y = found.sights[sensor].y
-    edges = [np.linspace(-0.5, size - 0.5, _CELLS + 1) for size in resolution]
-    return np.asarray(np.histogram2d(y[:, 1], y[:, 0], bins=(edges[1], edges[0]))[0])
-
-
 def _coverage_lines(found: Calibration) -> list[str]:
+    """In how many of 4 x 4 parts of each camera's image detections were met."""
     lines = []
-    for sensor, name in enumerate(found.after.names):
-        counts = coverage(found, sensor)
-        if counts is None:
+    for sensor, (name, eye) in enumerate(zip(found.after.names, found.after.sensors, strict=True)):
+        resolution = getattr(eye, "resolution", None)
+        if eye.dimension != 2 or resolution is None:
             continue
+        y = found.sights[sensor].y
+        edges = [np.linspace(-0.5, size - 0.5, _CELLS + 1) for size in resolution]
+        counts = np.histogram2d(y[:, 1], y[:, 0], bins=(edges[1], edges[0]))[0]
         empty = np.count_nonzero(counts == 0)
         said = f"{counts.size - empty} of {counts.size} parts of the image seen"
         if empty:
