@@ -71,7 +71,7 @@ class Calibration:
     # biases of ranges as large as σ_ε, and lenses that are off by `HELD_LENS`
     moved_by_biases: Floats
     moved_by_lenses: Floats
-    explained: Floats  # (L,): share of what each sensor could show that is met; NaN without
+    explained: Floats  # (L,): share of what each could show that the objective has met; NaN without
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]  # (4, 4), by frame number
     contradicted: Contradiction | None = None  # what is held, and the recording says otherwise

@@ -185,6 +185,7 @@ def _biased(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
 
 def _agreed_bias(shifts: Floats, farthest: float, sigma: float) -> float:
     """The shift that most ranges agree on: the objective over one number, at a wide blur."""
+    # Σ over all frames, features and ranges of a kernel at range − distance − bias
     step = sigma / _BIAS_STEPS
     places = np.arange(-farthest, farthest, step)
     counts, _ = np.histogram(shifts, bins=np.append(places, places[-1] + step) - step / 2)

@@ -64,7 +64,7 @@ class Prediction:
     """What is expected at P poses."""
 
     poses: Floats  # (P, 4, 4): T_world_object
-    covariances: Floats  # (P, 6, 6): infinite on the diagonal where open, zero where not free
+    covariances: Floats  # (P, 6, 6), world axes: infinite on the diagonal where open, 0 where held
     seen: Mask  # (P, L, N): features that are in view of a sensor and face it
 
 

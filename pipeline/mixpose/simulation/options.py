@@ -68,7 +68,7 @@ class SimulationOptions:
     # false features per frame and sensor: the whole part always, the rest by chance
     clutter: float = _option(0.0, _FALSE)
     hidden: float = _option(0.0, _PROBABILITY)  # that a feature is, in each view anew
-    hidden_count: int = _option(0, _COUNT)  # features hidden in each view for certain
+    hidden_count: int = _option(0, _COUNT)  # features hidden in each view, drawn by chance
     # that a sensor has no frame; of a video or profiles that is a frame without features
     missing: float = _option(0.0, _PROBABILITY)
     # displaces features, in each frame anew, by the spread that the object states; the truth
