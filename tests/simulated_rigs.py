@@ -102,7 +102,7 @@ def task_of(
     names = [f"s{k}" for k in range(len(sensors))]
     rig = Rig.of(names, sensors, BODY)
     defaults: dict[str, Any] = {"free": dict.fromkeys(range(1, len(sensors)), ("pose",))}
-    return Task(rig, BODY, frames, np.full(len(sensors), sigma), **{**defaults, **options})
+    return Task(rig, frames, np.full(len(sensors), sigma), **{**defaults, **options})
 
 
 def bumped(task: Task, index: int, deg: float, mm: float) -> Task:

@@ -94,7 +94,7 @@ def _by_a_flat_body(sensors: list[PinholeCamera], tilt: float) -> tuple[Floats, 
     body = Body("flat", tuple(PointFeature(p) for p in flat))
     free = {s: ("pose", "focal") if s else ("focal",) for s in range(len(sensors))}
     task = task_of(believed, frames, free=free)
-    task = replace(task, rig=Rig.of(task.rig.names, believed, body), body=body)
+    task = replace(task, rig=Rig.of(task.rig.names, believed, body))
     known = alone(believed, frames, pose=lambda number: pose(number / FPS))
     found = calibrate(task, NO_FRAME_HELD_BACK, found=known)
     after: Any = found.after.sensors
@@ -167,7 +167,7 @@ def test_images_of_large_spheres_move_no_camera() -> None:
         return shown.y[0, 0], shown.seen[0, 0]
 
     frames = recording(true, 24, 0.02, look=look)
-    task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large), body=large)
+    task = replace(task_of(true, frames), rig=Rig.of(("s0", "s1"), true, large))
     found = calibrate(task, NO_FRAME_HELD_BACK, found=alone(true, frames))
     off = centre_of(found.after.sensors[1]) - centre_of(true[1])
     # as points they would move it by 0.4 mm, nine standard deviations
@@ -206,7 +206,7 @@ def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_
     rig = replace(rig, points=small.means)
     task = task_of(true, frames, free={1: ("pose",)}, body_free=True)
     pair, _ = known_length(rig, f"s0:s1={length}")
-    task = replace(task, rig=rig, body=small, length=pair)
+    task = replace(task, rig=rig, length=pair)
     small_poses = {
         key: replace(one, poses=from_parts(one.poses[:, :3, :3], 0.97 * one.poses[:, :3, 3]))
         for key, one in alone(true, frames).items()

@@ -41,7 +41,7 @@ def calibrated(session: Session, **options: Any) -> Calibration:
     """From a recording by the session's own sensors."""
     sensors: Any = [one.sensor for one in session.sensors]
     frames = recording(sensors, FRAMES, 0.01)
-    task = replace(task_of(sensors, frames, **options), rig=rig_of(session), body=session.body)
+    task = replace(task_of(sensors, frames, **options), rig=rig_of(session))
     return calibrate(task, NO_FRAME_HELD_BACK, found=alone(sensors, frames))
 
 

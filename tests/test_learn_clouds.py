@@ -24,8 +24,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame
 from mixpose.learning import Eyes, learn_from
 from mixpose.learning.copies import _averaged
-from mixpose.learning.placing import Placement, Shape
 from mixpose.learning.points import Cloud
+from mixpose.learning.shapes import Placement, Shape
 from mixpose.rigid import from_rotation_vector, inverse, transform
 from mixpose.sensors import CloudSensor, PinholeCamera
 from mixpose.session.marker_files import read_marker_file

@@ -13,10 +13,9 @@ from mixpose.calibration import SeenFrame
 from mixpose.learning import like
 from mixpose.learning.adjusting import Learnt, _spread
 from mixpose.learning.copies import _never_with, is_chance
-from mixpose.learning.growing import Found, least_met
-from mixpose.learning.placing import Placement, Shape
 from mixpose.learning.points import Cloud, _supported
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import Found, Placement, Shape, least_met
 from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector

@@ -146,7 +146,7 @@ def cameras_of(case: Case) -> Outcome:
     if "pose" in case.free:
         rig = rig.placed(1, off @ cameras[1].T_sensor_world)
     rig = rig.exchanged(1, _believed(rig.sensors[1], case.free))
-    found = calibrate(Task(rig, BODY, frames, np.full(2, 1.5), {1: case.free}))
+    found = calibrate(Task(rig, frames, np.full(2, 1.5), {1: case.free}))
     eye: Any = found.after.sensors[1]
     T = eye.T_sensor_world @ inverse(cameras[1].T_sensor_world)
     values = {
@@ -226,7 +226,7 @@ def ranges_of(case: Case) -> Outcome:
     rig = Rig.of(("first", "second", "third"), [RangeSensor(p) for p in PLACES + off], BODY)
     start = perturb(motion(case.seed, np.zeros(1)), np.array([[2, -2, 1, 0.03, 0.02, -0.03]]))[0]
     free: dict[int, tuple[Kind, ...]] = dict.fromkeys(range(3), ("position",))
-    found = calibrate(Task(rig, BODY, frames, np.full(3, 5.0), free, T_held=start))
+    found = calibrate(Task(rig, frames, np.full(3, 5.0), free, T_held=start))
     places = np.array([one.position for one in found.after.sensors])  # type: ignore[attr-defined]
     errors = _triangle(places) - _triangle(PLACES)
     J = np.array(

@@ -22,8 +22,8 @@ _SIMULATION = (
     Mutant(
         "simulation-deformed-in-world-axes",
         "simulation/visible_spots.py",
-        "M[:3, 3] += M[:3, :3] @ offset",
-        "M[:3, 3] += offset",
+        "T[:3, 3] += T[:3, :3] @ offset",
+        "T[:3, 3] += offset",
         "features are displaced by another spread than the body's once it turns",
     ),
     Mutant(

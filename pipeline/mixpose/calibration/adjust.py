@@ -8,23 +8,27 @@ far, and a Gaussian kernel would drop it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
-from mixpose.calibration.bundle import Bundle, Step, Weighted, rows_of, solved, stepped
+from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
 from mixpose.calibration.matching import feature_spacing, match, nearest_distance
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats, Mask
+
+MET = 0.05
+"""Weight of a pair: 5 standard deviations off have 0.2."""
 
 _MOST_BLURS = 40
 _UNKNOWN = 0.1  # of a parameter's squared length along directions that are not determined
 _SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
 _BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
 _FARTHEST = 0.3  # rad: the linear model reaches no farther
+_CLIMBS = 12
+_CLIMBED = 1e-6  # of the squared residuals: less gained, and poses are fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +40,18 @@ class Adjusted:
     covariance: Floats  # (G, G): of the free parameters, in the gauge
     unknown: Floats  # (G, u): directions that are not determined, in the parameters' sizes
     weighted: tuple[Weighted, ...]  # of each sensor; weights are 1 for what agrees
-    # by which variances are larger than independent errors of detections would make them
-    inflation: float
+    inflation: float  # of variances, over what independent errors of detections make of them
 
     @property
     def undetermined(self) -> Mask:
         """Parameters (G,) of which data tell nothing."""
         return np.asarray((self.unknown**2).sum(axis=1) > _UNKNOWN)
+
+    @property
+    def deviations(self) -> Floats:
+        """Standard deviations of the parameters (G,); infinite where not determined."""
+        told = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.where(self.undetermined, np.inf, told)
 
     @property
     def certainty(self) -> float:
@@ -83,11 +92,11 @@ def adjust(
             break
         blur = np.maximum(blur * rules.narrowing, last)
     if noise is not None:
-        return _ended(bundle, state, noise, lambda *_: noise)
-    found = _ended(bundle, state, last / rules.blur, partial(_noise, bundle, 1.0))
+        return _ended(bundle, state, noise, None)
+    found = _ended(bundle, state, last / rules.blur, 1.0)
     if found.inflation > 1:
         return found
-    return _ended(bundle, found.state, found.noise, partial(_noise, bundle, rules.unlike))
+    return _ended(bundle, found.state, found.noise, rules.unlike)
 
 
 def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
@@ -96,32 +105,25 @@ def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
     return np.array([sigma * (blur / sigmas)[units == u].max() for sigma, u in zip(sigmas, units)])
 
 
-def _ended(
-    bundle: Bundle, state: State, noise: Floats, learnt: Callable[[State, Floats], Floats]
-) -> Adjusted:
-    """The last steps, at the noise that is learnt."""
+def _ended(bundle: Bundle, state: State, noise: Floats, unlike: float | None) -> Adjusted:
+    """The last steps, at the noise that is learnt as of `_noise`; None: that is known."""
     rules = bundle.rules
     most = rules.unlike * noise
     for _ in range(rules.last_steps):
         weighted, _ = weighted_at_the_end(bundle, state, noise)
         state, size = _climbed(bundle, state, weighted)
-        before, noise = noise, np.minimum(learnt(state, rules.blur * noise), most)
+        before = noise
+        if unlike is not None:
+            noise = np.minimum(_noise(bundle, unlike, state, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
-    weighted, alone, step = _at_the_end(bundle, state, noise)
+    weighted, alone = weighted_at_the_end(bundle, state, noise)
+    step = solved(bundle, state, weighted)
     scattered = step.covariance * variance_ratio(state.rig, rules)
     inflation = _inflation(bundle, weighted, scattered)
     covariance = scattered * inflation + step.of_held
     pairs = tuple((rows, weight) for (rows, _), weight in zip(weighted, alone, strict=True))
     return Adjusted(state, noise, covariance, step.unknown, pairs, inflation)
-
-
-def _at_the_end(
-    bundle: Bundle, state: State, noise: Floats
-) -> tuple[list[Weighted], list[Floats], Step]:
-    """What is weighed at the maximum, and the step that is left."""
-    weighted, alone = weighted_at_the_end(bundle, state, noise)
-    return weighted, alone, solved(bundle, state, weighted)
 
 
 def weighted_at_the_end(
@@ -133,8 +135,8 @@ def weighted_at_the_end(
 
 def moved_by_held(bundle: Bundle, found: Adjusted) -> Floats:
     """Standard deviations (G,) of the rig's parameters that come of errors of what is held."""
-    *_, step = _at_the_end(bundle, found.state, found.noise)
-    return np.asarray(np.sqrt(np.diag(step.of_held)))
+    weighted, _ = weighted_at_the_end(bundle, found.state, found.noise)
+    return np.asarray(np.sqrt(np.diag(solved(bundle, found.state, weighted).of_held)))
 
 
 def _weighted(
@@ -181,11 +183,12 @@ def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
     # err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it
     # had no noise at all
     rules, sigmas, sensors = bundle.rules, bundle.sigmas, state.rig.sensors
+    count, spent = np.zeros((2, len(sensors)))
     weighted, alone = _weighted(bundle, state, blur, np.ones(len(blur)))
-    rows = [each for each, _ in weighted]
-    near = [weight * each.pairs.nearest for each, weight in zip(rows, alone)]
-    count = np.array([eye.dimension * float(w.sum()) for eye, w in zip(sensors, near)])
-    spent = np.array([float(w @ (r.residual**2).sum(axis=1)) for r, w in zip(rows, near)])
+    for s, ((rows, _), weight) in enumerate(zip(weighted, alone, strict=True)):
+        near = weight * rows.pairs.nearest
+        count[s] = sensors[s].dimension * float(near.sum())
+        spent[s] = near @ (rows.residual**2).sum(axis=1)
     unknowns = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
     used = unknowns / np.maximum(blur**2 * (count / blur**2).sum(), 1.0)
     left = count * (1 - np.minimum(used, 0.9))
@@ -247,3 +250,25 @@ def _of_frame(
         parts.append(np.concatenate([root * one for one in each], axis=2))
     told = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
     return told[:, 0], told[:, 1 : 1 + bundle.count], told[:, 1 + bundle.count :]
+
+
+def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
+    """How far a bundle's parameters go (G,) from a rig to suit pairs best, with poses.
+
+    And squared residuals (n,) of each sensor's pairs then; NaN of pairs that are not met.
+    """
+    state, spent, gone = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
+    for _ in range(_CLIMBS):
+        rows = list[Weighted]()
+        for s, (seen, weight) in enumerate(adjusted.weighted):
+            found = rows_of(bundle, state, s, seen.pairs)
+            rows.append((found, (weight > MET) * found.known / adjusted.noise[s] ** 2))
+        squared = [(found.residual**2).sum(axis=1) for found, _ in rows]
+        weighed = zip(rows, squared, strict=True)
+        before, spent = spent, sum(float(weight @ each) for (_, weight), each in weighed)
+        if before - spent < _CLIMBED * spent or not bundle.pose_free.any():
+            break
+        step = solved(bundle, state, rows, 1e-6)
+        state, gone = stepped(bundle, state, step), gone + step.rig
+    pairs = zip(rows, squared, strict=True)
+    return gone, [np.where(w > 0, each, np.nan) for (_, w), each in pairs]

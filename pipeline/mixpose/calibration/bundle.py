@@ -8,7 +8,7 @@ and a dense system of G remains (Schur complement).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
@@ -33,12 +33,10 @@ class Bundle:
     frames: tuple[SeenFrame, ...]
     blocks: tuple[Block, ...]  # free parameters of the rig
     pose_free: Mask  # (6,): world directions of the poses that are free; none where poses are known
-    # rows (r, G) of the conditions on a step from a rig, in the parameters' sizes
-    gauge: Callable[[Rig], Floats]
+    gauge: Callable[[Rig], Floats]  # conditions (r, G) on a step, in the parameters' sizes
     sigmas: Floats  # (L,): σ_ε by sensor
     rules: CalibrationRules
-    # by sensor, how far what is held of it may be off
-    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)  # of what is held
 
     @cached_property
     def clock(self) -> Clock:
@@ -49,11 +47,6 @@ class Bundle:
     def count(self) -> int:
         """Free parameters of the rig, G."""
         return sum(len(block.names) for block in self.blocks)
-
-    @property
-    def of_poses(self) -> Bundle:
-        """The same without free parameters of the rig, for poses that suit a rig."""
-        return replace(self, blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
 
     @property
     def scales(self) -> Floats:
@@ -171,8 +164,7 @@ class Step:
 
     rig: Floats  # (G,)
     poses: Floats  # (K, 6)
-    # (G, G): of the rig, in the gauge; directions that are not determined left out
-    covariance: Floats
+    covariance: Floats  # (G, G): of the rig, in the gauge, without what is not determined
     of_held: Floats  # (G, G): what errors of the held parameters add to it
     unknown: Floats  # (G, u): directions that are not determined, in units of the parameters' sizes
 

@@ -8,23 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose.calibration import result
-from mixpose.calibration.adjust import Adjusted, adjust, moved_by_held
+from mixpose.calibration.adjust import Adjusted, adjust, fitted, moved_by_held
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.contradicted import Contradiction, contradiction
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import placed
-from mixpose.calibration.profile import profiled
+from mixpose.calibration.profile import Contradiction, contradiction, profiled
 from mixpose.calibration.recorded import held_back_with
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.searching import are_sure_together, searched
-from mixpose.calibration.start import (
-    Start,
-    start_from_cameras,
-    start_where_they_stand,
-    starts_together,
-)
-from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
+from mixpose.calibration.searching import posed, searched
+from mixpose.calibration.start import Start, start_from_cameras, starts_together
+from mixpose.calibration.task import Known, Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
 from mixpose.sensors import CalibrationError, CloudSensor
@@ -59,8 +53,7 @@ def calibrate(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
             "check` finds its features"
         )
-    run = best[1]
-    off = run.found.noise / task.sigmas
+    off = best.found.noise / task.sigmas
     if (off >= rules.failed).any():
         name = task.rig.names[int(np.argmax(off))]
         raise RecordingError(
@@ -68,78 +61,76 @@ def calibrate(
             "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
-    told = run.profiled()
-    return replace(told, residuals=run.residuals(), contradicted=run.contradicted())
+    told = best.profiled()
+    return replace(told, residuals=best.residuals(), contradicted=best.contradicted())
 
 
-def _as_it_stands(
-    task: Task, rules: CalibrationRules, progress: Progress
-) -> tuple[int, _Run] | None:
-    """The run from where the session has all cameras; None where that leaves any unexplained.
-
-    Together they know the body among others that each alone may take for it.
-    """
+def _as_it_stands(task: Task, rules: CalibrationRules, progress: Progress) -> _Run | None:
+    """The run from where the session has all cameras; None where that leaves any unexplained."""
+    # together they know the body among others that each alone may take for it
     if task.known is not None or task.times_matter or len(task.cameras) < 2 or not task.frames:
         return None
-    few = task.frames[:: -(-len(task.frames) // rules.probes)]
-    if not are_sure_together(replace(task, frames=few)):
+    few = _few(task, rules)
+    if sum(one.is_sure for one in posed(few)) <= len(few.frames) / 2:
         return None
-    start = start_where_they_stand(task, progress)
+    start = Start.of(task.rig, posed(task, progress=progress))
     best = _best(task, [start], rules, progress)
-    wrong = () if best is None else best[1].found.doubtful(rules)
+    wrong = () if best is None else best.found.doubtful(rules)
     if any("pose" not in task.free.get(s, ()) for s in wrong):  # one that is held stays
         return None
     if wrong:  # they are placed by what the others know
         frames = tuple(frame.without(wrong) for frame in start.frames)
         best = _best(task, [replace(start, frames=frames, unlinked=wrong)], rules, progress)
-    if best is None:
+    if best is None or not (best.fits and best.found.are_linked) or best.found.doubtful(rules):
         return None
-    run, found = best[1], best[1].found
-    return best if run.fits and found.are_linked and not found.doubtful(rules) else None
+    return best
+
+
+def _few(task: Task, rules: CalibrationRules) -> Task:
+    """The task with a few of its frames, spread evenly."""
+    return replace(task, frames=task.frames[:: -(-len(task.frames) // rules.probes)])
 
 
 def _from_cameras(
     task: Task, known: Known, rules: CalibrationRules, progress: Progress
-) -> tuple[int, _Run] | None:
+) -> _Run | None:
     """The run from what cameras know alone, and again without those it misplaced."""
     # what these know alone may have linked them wrongly; they are placed by the poses that the
     # others tell then
     best = _best(task, [start_from_cameras(task, known, rules)], rules, progress)
     if best is None or task.known is not None:
         return best
-    wrong = {s for s in best[1].found.doubtful(rules) if "pose" in task.free.get(s, ())}
+    wrong = {s for s in best.found.doubtful(rules) if "pose" in task.free.get(s, ())}
     if not wrong or len(wrong) + 1 > len(task.cameras):
         return best
     others = {key: one for key, one in known.items() if key[1] not in wrong}
     again = _best(task, [start_from_cameras(task, others, rules)], rules, progress)
-    return max(best, again or best, key=lambda one: float(np.nansum(one[1].found.explained)))
+    return max(best, again or best, key=lambda one: float(np.nansum(one.found.explained)))
 
 
 def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> CalibrationRules:
     """Rules with the one blur that suits best, by a few of many frames that are searched singly."""
-    few = task.frames[:: -(-len(task.frames) // rules.probes)]
-    if task.known is not None or task.fuse or len(few) == len(task.frames):
+    probe = _few(task, rules)
+    if task.known is not None or task.fuse or len(probe.frames) == len(task.frames):
         return rules
-    probe = replace(task, frames=few)
     best = _best(probe, starts_together(probe, rules, progress), rules, progress)
-    return rules if best is None else replace(rules, widened=(rules.widened[best[0]],))
+    return rules if best is None else replace(rules, widened=(best.start.factor,))
 
 
 def _best(
     task: Task, starts: Iterable[Start], rules: CalibrationRules, progress: Progress
-) -> tuple[int, _Run] | None:
-    """Number and run of the first start that tells features apart, else of the best."""
-    best: tuple[tuple[bool, float], int, _Run] | None = None
-    for number, start in enumerate(starts):
+) -> _Run | None:
+    """The run of the first start that tells features apart, else the best."""
+    best: _Run | None = None
+    for start in starts:
         if not len(start.frames):
             continue
         one = _Run(task, start, rules, progress)
-        worth = (one.fits, one.found.certainty)
-        if best is None or worth > best[0]:
-            best = (worth, number, one)
-        if worth >= (True, rules.certain):
+        if best is None or one.worth > best.worth:
+            best = one
+        if one.worth >= (True, rules.certain):
             break
-    return None if best is None else best[1:]
+    return best
 
 
 class _Run:
@@ -148,7 +139,8 @@ class _Run:
     def __init__(
         self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
     ) -> None:
-        self._asked, self._start, self._rules, self._progress = task, start, rules, progress
+        self.start = start
+        self._asked, self._rules, self._progress = task, rules, progress
         self._pose_free = task.pose_free & (task.known is None)
         times = [f.time_s for f in start.frames if f.time_s is not None]
         steps = np.diff(np.unique(times)) if len(times) > 1 else np.ones(1)
@@ -161,12 +153,17 @@ class _Run:
         """Whether residuals are smaller than chance leaves them."""
         return bool((self.found.noise < self._rules.failed * self._asked.sigmas).all())
 
+    @property
+    def worth(self) -> tuple[bool, float]:
+        """By which the best of several is chosen."""
+        return self.fits, self.found.certainty
+
     def _lay_out(self, unlinked: Collection[int]) -> None:
         """Seek what is free of sensors that are linked by now."""
         self._unlinked = tuple(unlinked)
         free = {s: kinds for s, kinds in self._asked.free.items() if s not in unlinked}
         self._task = replace(self._asked, free=free)
-        rig, poses = self._start.state
+        rig, poses = self.start.state
         # median distance from sensors to the body
         centres = np.array([centre_of(s) for s in rig.sensors])
         places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
@@ -176,7 +173,7 @@ class _Run:
 
     def _result(self) -> result.Calibration:
         """The calibration, but for its residuals."""
-        part = self._start
+        part = self.start
         self._progress("adjusting all sensors together", 0, _STAGES)
         part, adjusted = self._adjusted(part)
         good = result.met_share(adjusted, part.frames, self._task) > self._rules.least_met
@@ -187,19 +184,18 @@ class _Run:
         # from wider blurs, as features that crowd let the noise that is learnt first be too small
         self._progress("adjusting again, without bad frames", 1, _STAGES)
         part, adjusted = self._adjusted(part, adjusted.noise)
-        late = self._latecomers(part, adjusted.noise)
-        if late:
+        whole = self._with_latecomers(part, adjusted.noise)
+        if whole is not part:
             self._progress("adjusting with cameras that came late", 2, _STAGES)
-            part = self._with_latecomers(part, late)
-            part, adjusted = self._adjusted(part, adjusted.noise)
+            part, adjusted = self._adjusted(whole, adjusted.noise)
         self._part, self._best = part, adjusted
         return self._told(part, adjusted, bad)
 
     def profiled(self) -> result.Calibration:
         """The same, with deviations by how much worse the fit gets."""
         self._best = profiled(self._bundle(self._part), self._best)
-        deviations, _ = _determined(self._blocks, self._best, self._task.rig.names)
-        return replace(self.found, deviations=deviations, covariance=self._best.covariance)
+        best = self._best
+        return replace(self.found, deviations=best.deviations, covariance=best.covariance)
 
     def residuals(self) -> dict[int, result.Residual]:
         """Residuals before and after, and of every frame by a rig that was adjusted without it.
@@ -210,9 +206,9 @@ class _Run:
         folds = held_back_with(len(part.frames), self._rules, runs=self._task.times_matter)
         sensors = range(len(self._task.rig.sensors))
         # without parameters of the rig, so that all rigs are held to the same
-        bundle = self._bundle(part).of_poses
-        _, before = result.fitted(bundle, self._task.rig, best)
-        _, after = result.fitted(bundle, best.state.rig, best)
+        bundle = replace(self._bundle(part), blocks=(), gauge=lambda _: np.zeros((0, 0)), errors={})
+        _, before = fitted(bundle, self._task.rig, best)
+        _, after = fitted(bundle, best.state.rig, best)
         held: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
@@ -222,7 +218,7 @@ class _Run:
                 for block in self._blocks
                 if (fit.undetermined & ~best.undetermined)[block.place].any()
             }
-            _, found = result.fitted(bundle, fit.state.rig, best)
+            _, found = fitted(bundle, fit.state.rig, best)
             for s in sensors:
                 if s not in lost:
                     held[s].append(found[s][folds[best.weighted[s][0].pairs.frame] == fold])
@@ -236,29 +232,25 @@ class _Run:
         sizes = {"length": self._length, "interval": self._interval}
         return contradiction(self._bundle(self._part), self._best, **sizes)
 
-    def _latecomers(self, part: Start, noise: Floats) -> dict[int, Floats]:
-        """T_sensor_world of cameras that could not be linked by what they see alone."""
-        linked = [s for s in self._task.cameras if s not in self._unlinked]
-        known = linked, self._whole(part), noise, self._rules
-        # by lines of sight, which a cloud has none of
-        sensors = self._task.rig.sensors
-        cameras = [s for s in self._unlinked if not isinstance(sensors[s], CloudSensor)]
-        found = {s: placed(self._task, part.state, s, *known) for s in cameras}
-        return {s: T for s, T in found.items() if T is not None}
-
-    def _with_latecomers(self, part: Start, late: dict[int, Floats]) -> Start:
-        """Frames with what the cameras that came late saw, and the rig with them."""
-        self._lay_out([s for s in self._unlinked if s not in late])
-        rig = part.state.rig
-        for sensor, T in late.items():
-            rig = rig.placed(sensor, T)
-        frames = tuple(frame.without(self._unlinked) for frame in self._whole(part))
-        return replace(part, frames=frames, state=part.state._replace(rig=rig))
-
-    def _whole(self, part: Start) -> tuple[SeenFrame, ...]:
-        """The frames with all that sensors saw."""
+    def _with_latecomers(self, part: Start, noise: Floats) -> Start:
+        """The part with cameras that could not be linked by what they see, placed by its poses."""
         numbers = {frame.number: frame for frame in self._task.frames}
-        return tuple(numbers[frame.number] for frame in part.frames)
+        frames = tuple(numbers[frame.number] for frame in part.frames)  # with all that was seen
+        linked = [s for s in self._task.cameras if s not in self._unlinked]
+        rig, left = part.state.rig, list[int]()
+        for s in self._unlinked:
+            T = None
+            if not isinstance(rig.sensors[s], CloudSensor):  # which has no lines of sight
+                T = placed(self._task, part.state, s, linked, frames, noise, self._rules)
+            if T is None:
+                left.append(s)
+            else:
+                rig = rig.placed(s, T)
+        if rig is part.state.rig:
+            return part
+        self._lay_out(left)
+        frames = tuple(frame.without(left) for frame in frames)
+        return replace(part, frames=frames, state=part.state._replace(rig=rig))
 
     def _bundle(self, part: Start) -> Bundle:
         task = self._task
@@ -293,17 +285,16 @@ class _Run:
 
     def _told(self, part: Start, adjusted: Adjusted, bad: list[int]) -> result.Calibration:
         task, rig = self._task, adjusted.state.rig
-        deviations, refused = _determined(self._blocks, adjusted, task.rig.names)
         numbers = [f.number for f in part.frames]
         return result.Calibration(
             before=task.rig,
             after=rig,
             blocks=self._blocks,
-            deviations=deviations,
+            deviations=adjusted.deviations,
             covariance=adjusted.covariance,
-            refused=refused,
+            refused=_refused(self._blocks, adjusted, task.rig.names),
             gauge=self._gauge(part.state)[1],
-            through=self._start.through,
+            through=self.start.through,
             unlinked=self._unlinked,
             used=tuple(numbers),
             bad=tuple(sorted(bad)),
@@ -320,11 +311,8 @@ class _Run:
         )
 
 
-def _determined(
-    blocks: Sequence[Block], adjusted: Adjusted, names: Sequence[str]
-) -> tuple[Floats, tuple[str, ...]]:
-    """Standard deviations, infinite where not determined, and what is refused in words."""
-    deviations = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))
+def _refused(blocks: Sequence[Block], adjusted: Adjusted, names: Sequence[str]) -> tuple[str, ...]:
+    """Directions that are not determined, in words."""
     labels = [
         f"{'body' if b.sensor is None else names[b.sensor]}:{b.kind} {name}"
         for b in blocks
@@ -333,7 +321,5 @@ def _determined(
     said = []
     for direction in adjusted.unknown.T:
         strongest = np.argsort(-np.abs(direction), kind="stable")[:3]
-        parts = [labels[k] for k in strongest if abs(direction[k]) > 0.2]
-        said.append(" with ".join(parts))
-    deviations[adjusted.undetermined] = np.inf
-    return deviations, tuple(said)
+        said.append(" with ".join(labels[k] for k in strongest if abs(direction[k]) > 0.2))
+    return tuple(said)

@@ -52,10 +52,8 @@ def placed(
     before: Any = task.rig.sensors  # of which those that are asked for stand somewhere, turned
     now: Any = state.rig.sensors
     own_T = before[sensor].T_sensor_world
-    told = [own_T @ inverse(before[a].T_sensor_world) @ now[a].T_sensor_world for a in linked] or [
-        own_T
-    ]
-    for T in _starts(state, sensor, np.array(told), own, rules):
+    told = [own_T @ inverse(before[a].T_sensor_world) @ now[a].T_sensor_world for a in linked]
+    for T in _starts(state, sensor, np.array(told or [own_T]), own, rules):
         start = State(state.rig.placed(sensor, T), state.poses)
         blurs = np.array(noise)
         blurs[sensor] = rules.widest * min(feature_spacing(start, sensor), 1e6)

@@ -154,7 +154,11 @@ def match(
     parts = [(none, none, none, y[none, 0], np.zeros(0), none > 0)]
     for first in range(0, len(frames), _TOGETHER):
         some = slice(first, first + _TOGETHER)
-        points = _filled_up(frames[some], sensor, y.shape[2])
+        seen = [frame.points.get(sensor, np.zeros((0, y.shape[2]))) for frame in frames[some]]
+        # infinitely far where there are fewer
+        points = np.full((len(seen), max(1, *map(len, seen)), y.shape[2]), np.inf)
+        for number, each in enumerate(seen):
+            points[number, : len(each)] = each
         k, i, j, share, nearest = _near(y[some], visible[some], points, blur, reach)
         parts.append((first + k, i, j, points[k, j], share, nearest))
     return Pairs(*(np.concatenate(each) for each in zip(*parts, strict=True)))
@@ -176,15 +180,6 @@ def _seen(state: State, clock: Clock, sensor: int) -> tuple[Floats, Mask]:
         after = moments(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / rows_apart(eye))
         y, visible = y + rate * after[..., None], visible & there
     return y, visible
-
-
-def _filled_up(frames: Sequence[SeenFrame], sensor: int, dimension: int) -> Floats:
-    """Detections (K, D, m) of frames, infinitely far where there are fewer."""
-    seen = [frame.points.get(sensor, np.zeros((0, dimension))) for frame in frames]
-    points = np.full((len(frames), max(1, *map(len, seen)), dimension), np.inf)
-    for k, each in enumerate(seen):
-        points[k, : len(each)] = each
-    return points
 
 
 def _near(

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.body.symmetry import motions
-from mixpose.calibration.adjust import Adjusted
-from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
-from mixpose.calibration.contradicted import Contradiction
-from mixpose.calibration.rig import Block, Rig, State, centre_of
+from mixpose.calibration.adjust import MET, Adjusted
+from mixpose.calibration.profile import Contradiction
+from mixpose.calibration.rig import Block, Rig, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame, Task
 from mixpose.records import Floats, Indices
@@ -27,10 +26,6 @@ from mixpose.sensors import CalibrationError
 
 HELD_LENS = CalibrationError(focal=1e-3, principal_point=1.0)
 """What a lens that was calibrated by itself is easily off by."""
-
-_MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
-_CLIMBS = 12
-_CLIMBED = 1e-6  # of the squared residuals: less gained, and poses are fitted
 
 
 @dataclass(frozen=True)
@@ -71,16 +66,12 @@ class Calibration:
     residuals: Mapping[int, Residual]
     noise: Floats  # (L,)
     inflation: float
-    # share of the weight of pairs of which each is the nearest that the other has: near 1, or
-    # detections cannot be told apart
-    certainty: float
+    certainty: float  # as of `Adjusted`: near 1, or detections cannot be told apart
     # (G,): standard deviations that come of what is held of sensors of which nothing is stated:
     # biases of ranges as large as σ_ε, and lenses that are off by `HELD_LENS`
     moved_by_biases: Floats
     moved_by_lenses: Floats
-    # (L,): share of what each sensor could show that is met, weighted as in the objective; NaN
-    # without
-    explained: Floats
+    explained: Floats  # (L,): share of what each could show that the objective has met; NaN without
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]  # (4, 4), by frame number
     contradicted: Contradiction | None = None  # what is held, and the recording says otherwise
@@ -101,28 +92,6 @@ class Calibration:
         return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))
 
 
-def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
-    """How far a bundle's parameters go (G,) from a rig to suit pairs best, with poses.
-
-    And squared residuals (n,) of each sensor's pairs then; NaN of pairs that are not met.
-    """
-    state, spent, gone = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
-    for _ in range(_CLIMBS):
-        rows = list[Weighted]()
-        for s, (seen, weight) in enumerate(adjusted.weighted):
-            found = rows_of(bundle, state, s, seen.pairs)
-            rows.append((found, (weight > _MET) * found.known / adjusted.noise[s] ** 2))
-        squared = [(found.residual**2).sum(axis=1) for found, _ in rows]
-        weighed = zip(rows, squared, strict=True)
-        before, spent = spent, sum(float(weight @ each) for (_, weight), each in weighed)
-        if before - spent < _CLIMBED * spent or not bundle.pose_free.any():
-            break
-        step = solved(bundle, state, rows, 1e-6)
-        state, gone = stepped(bundle, state, step), gone + step.rig
-    pairs = zip(rows, squared, strict=True)
-    return gone, [np.where(w > 0, each, np.nan) for (_, w), each in pairs]
-
-
 def rms(squared: Sequence[Floats]) -> float:
     """Root mean square of what is not NaN; NaN of nothing."""
     flat = np.concatenate([np.zeros(0), *squared])
@@ -139,7 +108,7 @@ def _could_show(frames: Sequence[SeenFrame], task: Task) -> Floats:
 def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
     """Share (K,) of the features that frames could show which were met, all sensors together."""
     met = sum(
-        np.bincount(rows.pairs.frame, weight > _MET, len(frames))
+        np.bincount(rows.pairs.frame, weight > MET, len(frames))
         for rows, weight in adjusted.weighted
     )
     return np.asarray(met / np.maximum(_could_show(frames, task).sum(axis=1), 1))
@@ -156,7 +125,7 @@ def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
     """What each sensor saw and met."""
     found, largest = {}, np.iinfo(np.intp).max
     for s, (rows, weight) in enumerate(adjusted.weighted):
-        pairs, kept = rows.pairs, weight > _MET
+        pairs, kept = rows.pairs, weight > MET
         # of longer numbers the first digits are enough for people
         named = np.array([min(n, largest) for n in numbers], dtype=np.intp)[pairs.frame[kept]]
         found[s] = Sights(pairs.y[kept], rows.residual[kept], named, pairs.feature[kept])
@@ -219,22 +188,18 @@ def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
     # that of the sensor from which the others differ least: the bumped ones are outvoted
     poses = [before_and_after(before, after, k) for k in linked]
     told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
+    if not told:  # range sensors alone
+        a, b = (np.array([centre_of(rig.sensors[k]) for k in linked]) for rig in (after, before))
+        if len(a) < 3:
+            return from_parts(np.eye(3), (b - a).mean(axis=0))
+        return motions(a, b[None])[0]  # type: ignore[no-any-return]
     if len(told) < 3:  # of two, none is outvoted: the first is believed
-        return told[0] if told else _from_places(before, after, linked)
+        return told[0]
     worth = []
     for G in told:
         apart = [_apart(before, after, k, G) for k in linked]
         worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
     return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
-
-
-def _from_places(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
-    """The best motion between range sensors."""
-    a = np.array([centre_of(after.sensors[k]) for k in linked])
-    b = np.array([centre_of(before.sensors[k]) for k in linked])
-    if len(a) < 3:
-        return from_parts(np.eye(3), (b - a).mean(axis=0))
-    return motions(a, b[None])[0]  # type: ignore[no-any-return]
 
 
 def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 from mixpose.objective.projection import BodyProjection, pose_jacobian
 from mixpose.records import Floats, Mask
-from mixpose.rigid import from_parts, inverse, transform
+from mixpose.rigid import TWIST_NAMES, from_rotation_vector, inverse, transform
 from mixpose.sensors import CloudSensor, FisheyeCamera, RangeSensor, Sensor, facing
 
 Kind: TypeAlias = Literal[
@@ -28,6 +27,9 @@ Kind: TypeAlias = Literal[
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:-1]  # of sensors
 
+_IN_MATRIX = {"focal": ([0, 1], [0, 1]), "principal_point": ([0, 1], [2, 2])}
+_NAMES = {"position": TWIST_NAMES[:3], "principal_point": ("cx", "cy"), "range_bias": ("bias",)}
+_UNITS = {"position": "length", "range_bias": "length", "delay": "s"}
 _LENS = ("k1", "k2", "p1", "p2", "k3")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
 
@@ -101,8 +103,7 @@ class Block:
     start: int  # of the block among all parameters
     names: tuple[str, ...]
     units: tuple[str, ...]  # of "length", "rad", "px", "s" and ""
-    # size of what is sought, in `units`: by it a standard deviation is large or small
-    scales: tuple[float, ...]
+    scales: tuple[float, ...]  # in `units`: by these standard deviations are large or small
 
     @property
     def place(self) -> slice:
@@ -157,31 +158,21 @@ def _laid_out(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
     """Names, units and scales of a sensor's parameters of one kind."""
     if kind == "pose":
-        units = ("length",) * 3 + ("rad",) * 3
-        return ("x", "y", "z", "rx", "ry", "rz"), units, (length,) * 3 + (1.0,) * 3
-    names: tuple[str, ...] = (kind,)
-    unit, scale = "", 1.0
-    match kind:
-        case "position":
-            names, unit, scale = ("x", "y", "z"), "length", length
-        case "focal":
-            K = sensor.camera_matrix
-            names = ("f",) if np.isclose(K[0, 0], K[1, 1], rtol=1e-9) else ("fx", "fy")
-            unit, scale = "px", float(K[0, 0])
-        case "principal_point":
-            names, unit = ("cx", "cy"), "px"
-            scale = 1000.0 if sensor.resolution is None else float(max(sensor.resolution)) / 2
-        case "distortion":
-            # of rational and tilted models the first five are sought
-            most = max(4, min(5, len(sensor.distortion)))
-            is_fisheye = isinstance(sensor, FisheyeCamera)
-            names = _FISHEYE_LENS if is_fisheye else _LENS[:most]
-        case "range_bias":
-            names, unit, scale = ("bias",), "length", length
-        case "delay":
-            unit, scale = "s", interval
-        case _:
-            scale = 1e-2
+        return TWIST_NAMES, ("length",) * 3 + ("rad",) * 3, (length,) * 3 + (1.0,) * 3
+    names, unit = _NAMES.get(kind, (kind,)), _UNITS.get(kind, "")
+    scale = {"length": length, "s": interval}.get(unit, 1.0)
+    if kind == "focal":
+        K = sensor.camera_matrix
+        names = ("f",) if np.isclose(K[0, 0], K[1, 1], rtol=1e-9) else ("fx", "fy")
+        unit, scale = "px", float(K[0, 0])
+    elif kind == "principal_point":
+        size = sensor.resolution
+        unit, scale = "px", 1000.0 if size is None else float(max(size)) / 2
+    elif kind == "distortion":  # of rational and tilted models the first five are sought
+        most = max(4, min(5, len(sensor.distortion)))
+        names = _FISHEYE_LENS if isinstance(sensor, FisheyeCamera) else _LENS[:most]
+    elif kind == "drift":
+        scale = 1e-2
     return names, (unit,) * len(names), (scale,) * len(names)
 
 
@@ -215,10 +206,8 @@ def values_of(rig: Rig, block: Block) -> Floats:
 
 def _values(sensor: Any, kind: Kind) -> Floats:
     """Values of all parameters of one kind, of a lens four or more."""
-    if kind == "focal":
-        return sensor.camera_matrix.diagonal()[:2]  # type: ignore[no-any-return]
-    if kind == "principal_point" and hasattr(sensor, "camera_matrix"):
-        return sensor.camera_matrix[:2, 2]  # type: ignore[no-any-return]
+    if kind in _IN_MATRIX and hasattr(sensor, "camera_matrix"):
+        return sensor.camera_matrix[_IN_MATRIX[kind]]  # type: ignore[no-any-return]
     if kind == "distortion":
         return np.pad(sensor.distortion, (0, max(4 - len(sensor.distortion), 0)))
     return np.atleast_1d(getattr(sensor, kind)).astype(np.float64)
@@ -227,21 +216,18 @@ def _values(sensor: Any, kind: Kind) -> Floats:
 def _changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
     """A sensor after a step of its parameters of one kind."""
     if kind == "pose":
-        turn = Rotation.from_rotvec(delta[3:]).as_matrix()
-        T = from_parts(turn, delta[:3]) @ sensor.T_sensor_world
+        T = from_rotation_vector(delta[3:], delta[:3]) @ sensor.T_sensor_world
         return replace(sensor, T_sensor_world=T)
     values = _values(sensor, kind).copy()
     if kind == "focal":  # one number may stand for both
         values += delta
     else:
         values[: len(delta)] += delta
-    if kind == "range_bias":
-        return replace(sensor, range_bias=float(values[0]))
-    if kind == "focal" or (kind == "principal_point" and hasattr(sensor, "camera_matrix")):
+    if kind in _IN_MATRIX and hasattr(sensor, "camera_matrix"):
         K = sensor.camera_matrix.copy()
-        K[[0, 1], [0, 1] if kind == "focal" else [2, 2]] = values
+        K[_IN_MATRIX[kind]] = values
         return replace(sensor, camera_matrix=K)
-    return replace(sensor, **{kind: values})
+    return replace(sensor, **{kind: float(values[0]) if kind == "range_bias" else values})
 
 
 _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}

@@ -8,14 +8,14 @@ be adjusted to what was found.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
+from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task, silent
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
@@ -25,6 +25,14 @@ from mixpose.tracking import Tracker, plane_views
 
 _LEAST = 4  # detections: three leave four poses of any triangle
 MARK = '{"mixpose-calibration": '
+
+
+class Posed(NamedTuple):
+    """A frame and where the body is."""
+
+    frame: SeenFrame
+    T_world_object: Floats  # (4, 4)
+    is_sure: bool = True  # whether that is believed
 
 
 def searched(task: Task, rules: CalibrationRules, progress: Progress, found: Known) -> Known:
@@ -45,7 +53,7 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
     # the world is put where the camera is, so that poses are relative to it
     own = view.sensor.moved(inverse(view.sensor.T_sensor_world))  # type: ignore[attr-defined]
     views = plane_views(View(view.name, own, view.observation))
-    tracker = Tracker.create(task.body, EstimatorOptions())
+    tracker = Tracker.create(task.rig.body, EstimatorOptions())
     ranked = tracker.explain(tracker.data(tracker.begin(), 0, None, views))
     best = ranked[0].log_evidence if ranked else 0.0
     kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
@@ -54,59 +62,23 @@ def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules
     return Hypotheses(poses, np.array([one.log_evidence for one in kept]))
 
 
-def likeliest_poses(task: Task, progress: Progress) -> tuple[tuple[SeenFrame, ...], Floats]:
-    """Frames of which all sensors together know a pose, believed or not, and these (K, 4, 4)."""
-    return _apart(_posed(task, 1.0, progress))
-
-
-def joint_poses(
-    task: Task, rules: CalibrationRules, progress: Progress
-) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
-    """Frames whose pose all sensors together know, and the poses (K, 4, 4), blur after blur."""
-    for factor in rules.widened:
-        found = _posed(task, factor, progress)
-        sure = [each for each in found if each[2]]
-        # where hardly any pose is believed, the likeliest are a start, and deviations will tell
-        few = len(sure) < rules.believed * len(task.frames)
-        yield _apart(sorted(found, key=lambda each: each[0].number) if few else sure)
-
-
-def _posed(task: Task, factor: float, progress: Progress) -> list[tuple[SeenFrame, Floats, bool]]:
-    """Frames that have a pose at a factor times σ_ε, the pose, and whether it is believed."""
-    found = []
-    for done, (frame, T, is_sure) in enumerate(_tracked(task, factor)):
-        progress("searching the body with all sensors", done, len(task.frames))
-        if T is not None:
-            found.append((frame, T, is_sure))
-    return found
-
-
-def _apart(
-    found: Sequence[tuple[SeenFrame, Floats, bool]],
-) -> tuple[tuple[SeenFrame, ...], Floats]:
-    """Frames, and their poses (K, 4, 4)."""
-    poses = np.array([T for _, T, _ in found]).reshape(-1, 4, 4)
-    return tuple(frame for frame, _, _ in found), poses
-
-
-def are_sure_together(task: Task) -> bool:
-    """Whether all sensors together are sure of the body in most frames."""
-    sure = [is_sure for _, _, is_sure in _tracked(task, 1.0)]
-    return sum(sure) > len(sure) / 2
-
-
-def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats | None, bool]]:
-    """Each frame with its pose, and whether it is believed, at a factor times σ_ε."""
+def posed(task: Task, factor: float = 1.0, progress: Progress = silent) -> list[Posed]:
+    """Frames of which all sensors together know a pose, at a factor times σ_ε."""
     free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
     turn, distance = task.around
     options = EstimatorOptions(free=free, fuse=task.fuse)
-    tracker = Tracker.create(task.body, options, task.T_held, rotation_deg=turn, distance=distance)
-    track = tracker.begin()
-    for frame in task.frames:
+    tracker = Tracker.create(
+        task.rig.body, options, task.T_held, rotation_deg=turn, distance=distance
+    )
+    track, found = tracker.begin(), list[Posed]()
+    for done, frame in enumerate(task.frames):
         seen = [_view(task, s, y, factor) for s, y in frame.points.items() if len(y)]
         views = [own for view in seen for own in plane_views(view)]
         track, estimate = tracker.advance(track, frame.number, frame.time_s, views)
-        yield frame, estimate.T_world_object, estimate.status == "ok"
+        progress("searching the body with all sensors", done, len(task.frames))
+        if estimate.T_world_object is not None:
+            found.append(Posed(frame, estimate.T_world_object, estimate.status == "ok"))
+    return found
 
 
 def _view(task: Task, sensor: int, points: Floats, factor: float) -> View:
@@ -125,23 +97,21 @@ class Saved(Known):
         super().__init__()
         self._path, first = path, f"{MARK}{json.dumps(key)}}}"
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        known = Known()
         for line in lines[1:] if lines and lines[0] == first else []:
             with suppress(ValueError):  # the last line was cut off
                 frame, sensor, poses, evidence = json.loads(line)
                 T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-                known = Hypotheses(T, np.array(evidence, dtype=np.float64))
-                super().__setitem__((int(frame), int(sensor)), known)
-        self.resumed = len(self)
+                one = Hypotheses(T, np.array(evidence, dtype=np.float64))
+                known[int(frame), int(sensor)] = one
+        self.resumed = len(known)
         self._stream = path.open("w", encoding="utf-8", newline="\n")
         self._stream.write(first + "\n")
-        for key_, one in self.items():
-            self._write(key_, one)
+        for place, one in known.items():
+            self[place] = one
 
     def __setitem__(self, key: tuple[int, int], one: Hypotheses) -> None:
         super().__setitem__(key, one)
-        self._write(key, one)
-
-    def _write(self, key: tuple[int, int], one: Hypotheses) -> None:
         self._stream.write(json.dumps([*key, one.poses.tolist(), one.evidence.tolist()]) + "\n")
         self._stream.flush()
 

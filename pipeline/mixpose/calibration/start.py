@@ -9,14 +9,14 @@ pairs with most frames in agreement.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.searching import joint_poses, likeliest_poses
+from mixpose.calibration.searching import Posed, posed
 from mixpose.calibration.task import NOTHING, Hypotheses, Known, Progress, SeenFrame, Task
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse, mean_motion, rotation_angle_deg, transform
@@ -37,8 +37,15 @@ class Start:
     state: State
     frames: tuple[SeenFrame, ...]  # those with a pose
     # through which sensor each was linked (None: through known poses), and frames that agree
-    through: Mapping[int, tuple[int | None, int]]
-    unlinked: tuple[int, ...]  # sensors that share no view with the others
+    through: Mapping[int, tuple[int | None, int]] = field(default_factory=dict)
+    unlinked: tuple[int, ...] = ()  # sensors that share no view with the others
+    factor: float = 1.0  # times σ_ε, with which poses were searched
+
+    @classmethod
+    def of(cls, rig: Rig, found: Sequence[Posed], factor: float = 1.0) -> Start:
+        """A rig as it is believed to be, and frames whose pose is known."""
+        poses = np.array([one.T_world_object for one in found]).reshape(-1, 4, 4)
+        return cls(State(rig, poses), tuple(one.frame for one in found), factor=factor)
 
     def only(self, mask: Mask) -> Start:
         """Some of the frames (K,)."""
@@ -48,11 +55,10 @@ class Start:
 
 def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Start:
     """Link cameras by what each sees alone, and choose a pose for every frame."""
-    seen: list[dict[int, Hypotheses]] = [{} for _ in task.frames]
-    for frame, each in zip(task.frames, seen, strict=True):
-        for s in task.cameras:
-            if len(known.get((frame.number, s), NOTHING).poses):
-                each[s] = known[frame.number, s]
+    seen = []
+    for frame in task.frames:
+        each = {s: known.get((frame.number, s), NOTHING) for s in task.cameras}
+        seen.append({s: one for s, one in each.items() if len(one.poses)})
     if task.known is not None:
         return _from_known_poses(task, task.known, seen, rules)
     rig = task.rig
@@ -87,7 +93,7 @@ def _from_known_poses(
         for k, T_world_object in zip(kept, poses, strict=True):
             if sensor in seen[k]:
                 own = seen[k][sensor].poses
-                motions = own[:, None] @ task.body.symmetries[None] @ inverse(T_world_object)
+                motions = own[:, None] @ task.rig.body.symmetries[None] @ inverse(T_world_object)
                 told.append(_Votes(motions, float(np.linalg.norm(own[0][:3, 3]))))
         link = _agreed(told, _pose_of(task, sensor), rules)
         if link is None or link.frames < 1:
@@ -99,29 +105,31 @@ def _from_known_poses(
     return Start(State(rig, poses), frames, through, tuple(unlinked))
 
 
-def start_where_they_stand(task: Task, progress: Progress) -> Start:
-    """The rig as it is believed to be, and the likeliest poses that all sensors together know."""
-    frames, poses = likeliest_poses(task, progress)
-    return Start(State(task.rig, poses), frames, {}, ())
-
-
 def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
-    """Poses that all sensors together know, or that are known anyway."""
-    if task.known is None:
-        for frames, poses in joint_poses(task, rules, progress):
-            yield Start(State(task.rig, poses), frames, {}, ())
+    """Poses that all sensors together know, blur after blur, or that are known anyway."""
+    if task.known is not None:
+        known = task.known
+        start = Start.of(
+            task.rig, [Posed(f, known[f.number]) for f in task.frames if f.number in known]
+        )
+        rig = _biased(task, start.frames, start.state.poses)
+        yield replace(start, state=start.state._replace(rig=rig))
         return
-    frames = tuple(frame for frame in task.frames if frame.number in task.known)
-    poses = np.array([task.known[frame.number] for frame in frames]).reshape(-1, 4, 4)
-    yield Start(State(_biased(task, frames, poses), poses), frames, {}, ())
+    for factor in rules.widened:
+        found = posed(task, factor, progress)
+        sure = [one for one in found if one.is_sure]
+        # where hardly any pose is believed, the likeliest are a start, and deviations will tell
+        few = len(sure) < rules.believed * len(task.frames)
+        yield Start.of(
+            task.rig, sorted(found, key=lambda one: one.frame.number) if few else sure, factor
+        )
 
 
 def _likeliest_poses(
     rig: Rig, task: Task, seen: _Seen, linked: Sequence[int]
 ) -> tuple[Floats, Floats]:
     """The pose of each frame (K, 4, 4) that most detections of all linked sensors agree with."""
-    # and the mean share (K,) of features in view that are met. Where no sensor knew a pose these
-    # are the identity and -1
+    # and the mean share (K,) of features in view that are met; -1 where no sensor knew a pose
     frames = task.frames
     poses, worth = np.tile(np.eye(4), (len(frames), 1, 1)), np.full(len(frames), -1.0)
     for k, (frame, each) in enumerate(zip(frames, seen, strict=True)):
@@ -176,9 +184,8 @@ def _biased(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
 
 
 def _agreed_bias(shifts: Floats, farthest: float, sigma: float) -> float:
-    """The shift that most ranges agree on."""
-    # that is the objective over one number at a wide blur: Σ over all frames, features and ranges
-    # of a kernel at range − distance − bias
+    """The shift that most ranges agree on: the objective over one number, at a wide blur."""
+    # Σ over all frames, features and ranges of a kernel at range − distance − bias
     step = sigma / _BIAS_STEPS
     places = np.arange(-farthest, farthest, step)
     counts, _ = np.histogram(shifts, bins=np.append(places, places[-1] + step) - step / 2)
@@ -243,7 +250,7 @@ def _pair_link(task: Task, seen: _Seen, a: int, b: int, rules: CalibrationRules)
     for each in seen:
         if a in each and b in each:
             T_a, T_b = each[a].poses, each[b].poses
-            S = task.body.symmetries[None, None]
+            S = task.rig.body.symmetries[None, None]
             motions = T_a[:, None, None] @ S @ inverse(T_b)[None, :, None]
             reach = float(np.linalg.norm(T_a[0][:3, 3]) + np.linalg.norm(T_b[0][:3, 3])) / 2
             told.append(_Votes(motions, reach))
@@ -257,8 +264,7 @@ def _link_all(
     task: Task, seen: _Seen, placed: Collection[int], wanted: Sequence[int], rules: CalibrationRules
 ) -> tuple[dict[int, Floats], dict[int, tuple[int, int]]]:
     """Place sensors one after the other, along the strongest links to those that stay."""
-    # of all that are linked T_sensor_world (4, 4); and through which sensor each was linked, and in
-    # how many frames the two agree
+    # T_sensor_world of all that are linked; through which sensor, and in how many frames they agree
     T, through = {s: _pose_of(task, s) for s in placed}, {}
     left = [one for one in wanted if one not in T]
     links: dict[tuple[int, int], _Link | None] = {}

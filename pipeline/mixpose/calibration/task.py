@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mixpose.body import Body
 from mixpose.calibration.rig import Kind, Rig
 from mixpose.records import Floats, Mask
 from mixpose.sensors import CalibrationError, CloudSensor
@@ -52,7 +51,6 @@ class Task:
     """A calibration to be made."""
 
     rig: Rig  # as it is believed to be
-    body: Body
     frames: tuple[SeenFrame, ...]
     sigmas: Floats  # (L,): σ_ε by sensor
     free: Mapping[int, tuple[Kind, ...]]  # free parameters by sensor
@@ -62,12 +60,10 @@ class Task:
     T_held: Floats | None = None  # (4, 4): where the other directions stay
     # half-widths in degrees and length of where the body is about `T_held`
     around: tuple[float | None, float | None] = (None, None)
-    # whether a frame's pose tells of the next one's where sensors alone tell little
-    fuse: bool = True
+    fuse: bool = True  # whether a frame's pose tells of the next one's
     known: Mapping[int, Floats] | None = None  # poses by frame number, where they are known
     length: tuple[int, int] | None = None  # sensors whose distance is known
-    # by sensor, how far what is held of it may be off
-    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)  # of what is held
 
     @property
     def cameras(self) -> tuple[int, ...]:

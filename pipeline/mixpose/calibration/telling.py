@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.calibration.result import (
-    HELD_LENS,
-    Calibration,
-    Displacement,
-    before_and_after,
-    displacements,
-    residuals_by,
-)
+from mixpose.calibration import result
+from mixpose.calibration.result import HELD_LENS, Calibration, Displacement
 from mixpose.calibration.rig import Block, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
@@ -29,10 +23,7 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
     lines += [f"{'gauge':<10}{text}" for text in found.gauge]
     lines += [""]
     for block in found.blocks:
-        if block.kind != "body":
-            lines += _block_lines(found, block, unit)
-    if any(block.kind == "body" for block in found.blocks):
-        lines += _body_lines(found, unit)
+        lines += _block_lines(found, block, unit)
     if (scale := found.after.scale) != 1:
         lines.append(f"{'scale':<28}all lengths, the body's too, are {scale:.5g} times as large")
     lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found)]
@@ -81,7 +72,7 @@ def _held_lines(found: Calibration, unit: str) -> list[str]:
 def _held_size(found: Calibration, unit: str) -> list[str]:
     """What the size of the body would do, which alone tells cameras how far apart they stand."""
     cameras = [one for one in found.after.sensors if hasattr(one, "camera_matrix")]
-    moved = [block for block in found.blocks if block.kind == "pose" and block.sensor is not None]
+    moved = [block for block in found.blocks if block.kind == "pose"]
     # of all of them it is told by poses that are known
     told_otherwise = found.after.scale != 1 or len(cameras) < len(found.after.sensors)
     if told_otherwise or not 0 < len(moved) < len(cameras):
@@ -133,13 +124,12 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
 
 
 def _doubt_of_size(found: Calibration) -> list[str]:
-    """That sensors stand as the session has them, but nearer to each other or farther apart.
-
-    So they do where the body is of another size than the session tells.
-    """
+    """That sensors only came nearer or farther apart, as where the body is of another size."""
     if found.after.scale != 1:
         return []
-    each = [before_and_after(found.before, found.after, k) for k in range(len(found.after.names))]
+    each = [
+        result.before_and_after(found.before, found.after, k) for k in range(len(found.after.names))
+    ]
     poses = [pair for pair in each if pair is not None]
     told = [found.deviations[block.place][:3] for block in found.blocks if block.kind == "pose"]
     if len(poses) < 2 or not told:
@@ -173,9 +163,10 @@ def _frames_line(found: Calibration) -> str:
 
 
 def _block_lines(found: Calibration, block: Block, unit: str) -> list[str]:
-    assert block.sensor is not None, "the body has lines of its own"
+    if block.sensor is None:
+        return _body_lines(found, block, unit)
     if block.kind == "pose":
-        return [_moved_line(found, block, unit)]
+        return [_moved_line(found, block.sensor, found.deviations[block.place], unit)]
     name = found.after.names[block.sensor]
     before, after = values_of(found.before, block), values_of(found.after, block)
     lines = []
@@ -189,28 +180,24 @@ def _block_lines(found: Calibration, block: Block, unit: str) -> list[str]:
     return lines
 
 
-def _moved_line(found: Calibration, block: Block, unit: str) -> str:
-    assert block.sensor is not None
-    one, two = (rig.sensors[block.sensor] for rig in (found.before, found.after))
+def _moved_line(found: Calibration, sensor: int, deviation: Floats, unit: str) -> str:
+    one, two = (rig.sensors[sensor] for rig in (found.before, found.after))
     turn = float(rotation_angle_deg(one.T_sensor_world, two.T_sensor_world))  # type: ignore[attr-defined]
     shift = float(np.linalg.norm(centre_of(two) - centre_of(one)))
-    deviation = found.deviations[block.place]
     words = []
     for part, of, scale in ((deviation[:3], unit, 1.0), (deviation[3:], "deg", 180 / np.pi)):
-        known = np.isfinite(part)
-        total = np.sqrt((part[known] ** 2).sum()) * scale
-        words.append(f"{total:.2g} {of}" if known.all() else "not determined")
-    via = found.through.get(block.sensor)
+        total = np.sqrt((part**2).sum()) * scale
+        words.append(f"{total:.2g} {of}" if np.isfinite(total) else "not determined")
     link = ""
-    if via is not None:
-        other = "known poses" if via[0] is None else found.after.names[via[0]]
-        link = f"; linked through {other} in {via[1]} frames"
-    title = f"{found.after.names[block.sensor]} pose"
+    if sensor in found.through:
+        via, frames = found.through[sensor]
+        other = "known poses" if via is None else found.after.names[via]
+        link = f"; linked through {other} in {frames} frames"
+    title = f"{found.after.names[sensor]} pose"
     return f"{title:<28}turned by {turn:.4g} ± {words[1]}, moved by {shift:.5g} ± {words[0]}{link}"
 
 
-def _body_lines(found: Calibration, unit: str) -> list[str]:
-    block = next(b for b in found.blocks if b.kind == "body")
+def _body_lines(found: Calibration, block: Block, unit: str) -> list[str]:
     deviation = found.deviations[block.place].reshape(-1, 3)
     shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
     lines = []
@@ -236,7 +223,7 @@ def _worst_lines(found: Calibration) -> list[str]:
     """Frames and features that fit worst, by name."""
     lines = []
     for kind in ("frame", "feature"):
-        keys, rms = residuals_by(found, kind)
+        keys, rms = result.residuals_by(found, kind)
         called = found.after.body.labels if kind == "feature" else dict(zip(keys, keys.astype(str)))
         typical = np.median(rms) if len(rms) else 1.0
         worst = np.lexsort((keys, -rms))[:_WORST]
@@ -245,23 +232,16 @@ def _worst_lines(found: Calibration) -> list[str]:
     return lines
 
 
-def coverage(found: Calibration, sensor: int) -> Floats | None:
-    """Detections met in each of 4 x 4 parts of a camera's image; None for other sensors."""
-    eye = found.after.sensors[sensor]
-    resolution = getattr(eye, "resolution", None)
-    if eye.dimension != 2 or resolution is None:
-        return None
-    y = found.sights[sensor].y
-    edges = [np.linspace(-0.5, size - 0.5, _CELLS + 1) for size in resolution]
-    return np.asarray(np.histogram2d(y[:, 1], y[:, 0], bins=(edges[1], edges[0]))[0])
-
-
 def _coverage_lines(found: Calibration) -> list[str]:
+    """In how many of 4 x 4 parts of each camera's image detections were met."""
     lines = []
-    for sensor, name in enumerate(found.after.names):
-        counts = coverage(found, sensor)
-        if counts is None:
+    for sensor, (name, eye) in enumerate(zip(found.after.names, found.after.sensors, strict=True)):
+        resolution = getattr(eye, "resolution", None)
+        if eye.dimension != 2 or resolution is None:
             continue
+        y = found.sights[sensor].y
+        edges = [np.linspace(-0.5, size - 0.5, _CELLS + 1) for size in resolution]
+        counts = np.histogram2d(y[:, 1], y[:, 0], bins=(edges[1], edges[0]))[0]
         empty = np.count_nonzero(counts == 0)
         said = f"{counts.size - empty} of {counts.size} parts of the image seen"
         if empty:
@@ -279,7 +259,7 @@ def _where(counts: Floats) -> str:
 
 def check_lines(found: Calibration, unit: str) -> list[str]:
     """Whether the calibration that a session has still holds, and which sensor was bumped."""
-    told = displacements(found, CalibrationRules())
+    told = result.displacements(found, CalibrationRules())
     bumped = [one.name for one in told if one.moved]
     are_told = 2 * len(bumped) < len(told)  # most of them agree
     lines = [_frames_line(found)]

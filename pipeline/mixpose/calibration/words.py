@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.calibration.gauge import body_change, length_parts, sensor_change
 from mixpose.calibration.result import Calibration
-from mixpose.calibration.rig import KINDS, Block, Kind, Rig, centre_of, kinds_of
+from mixpose.calibration.rig import KINDS, Kind, Rig, centre_of, kinds_of
 from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
@@ -147,8 +147,11 @@ def in_length(found: Calibration, words: str) -> Calibration:
     units = [unit for block in found.blocks for unit in block.units]
     sizes = [factor if unit == "length" else 1.0 for unit in units]
     change, along = np.zeros((2, len(units)))
-    for block in found.blocks:
-        change[block.place] = _scale_change(found.after, block)
+    for block in found.blocks:  # how each changes with the scale of all lengths
+        if block.kind == "body":
+            change[block.place] = body_change(found.after.points)[:, -1]
+        elif block.kind == "pose" and block.sensor is not None:
+            change[block.place] = sensor_change(found.after.sensors[block.sensor])[:, -1]
     for block, values in length_parts(found.after, found.blocks, pair):
         along[block.place] += values
     # what the distance errs by scales all
@@ -160,15 +163,6 @@ def in_length(found: Calibration, words: str) -> Calibration:
         after=_scaled(found.after, factor),
         poses={number: _shifted(T, factor) for number, T in found.poses.items()},
     )
-
-
-def _scale_change(rig: Rig, block: Block) -> Floats:
-    """Change of a block's parameters by a scale of all lengths."""
-    if block.kind == "body":
-        return body_change(rig.points)[:, -1]
-    if block.kind == "pose" and block.sensor is not None:
-        return sensor_change(rig.sensors[block.sensor])[:, -1]
-    return np.zeros(len(block.names))
 
 
 def _by_linear(found: Calibration, by_old: Floats) -> Calibration:

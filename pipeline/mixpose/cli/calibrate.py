@@ -114,7 +114,6 @@ def task_of(
     start = session.start
     return Task(
         rig=rig,
-        body=session.body,
         frames=frames,
         sigmas=np.array([one.extract.sigma for one in setups]),
         free=free,

@@ -36,12 +36,10 @@ class Confirmation:
     frames: int  # estimated, lost ones included
     poses: int  # at which they were simulated
     statuses: dict[str, int]
-    # (6,): root mean square error over the predicted one, per direction; NaN where held or open
-    ratios: Floats
+    ratios: Floats  # (6,): RMS error over the predicted one, by direction; NaN where held or open
     overall: float  # the same over all directions at once: of errors in units of their covariance
     chance: float  # what `overall` is off 1 by through chance alone, one standard deviation
-    # (3,): position, rotation (radians) and tip: root mean squares over the frames
-    predicted: Floats
+    predicted: Floats  # (3,): position, rotation (radians) and tip: RMS over the frames
     found: Floats  # (3,)
 
 
@@ -127,10 +125,7 @@ def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
 
 
 def _plan_text(session: Session, plan: Plan, T_world_object: Floats) -> str:
-    """A session in which a plan's body starts at a pose, whose recordings are tables of detections.
-
-    Numbers are told to the last bit.
-    """
+    """A session of a plan's body at a pose, with tables of detections, exact to the last bit."""
     rows = zip(plan.names, plan.sensors, plan.sigmas, strict=True)
     free = [name for name, is_free in zip(TWIST_NAMES, plan.free, strict=True) if is_free]
     tables = {

@@ -41,10 +41,8 @@ class Plan:
 
     names: tuple[str, ...]  # of the sensors
     sensors: tuple[Sensor, ...]
-    # standard deviation of a measured feature along each coordinate, px or length units
-    noises: tuple[float, ...]
-    # σ_ε of the sensors, by which a run weighs them against each other at first
-    sigmas: tuple[float, ...]
+    noises: tuple[float, ...]  # deviation of a feature along each coordinate, px or length units
+    sigmas: tuple[float, ...]  # σ_ε, by which a run weighs sensors against each other at first
     body: Body  # spreads of its features are errors of markers
     free: Mask  # (6,): directions that are estimated
 
@@ -66,9 +64,7 @@ class Prediction:
     """What is expected at P poses."""
 
     poses: Floats  # (P, 4, 4): T_world_object
-    # (P, 6, 6): in the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a
-    # direction open, zero where it is not free
-    covariances: Floats
+    covariances: Floats  # (P, 6, 6), world axes: infinite on the diagonal where open, 0 where held
     seen: Mask  # (P, L, N): features that are in view of a sensor and face it
 
 
@@ -164,8 +160,7 @@ class Summary:
     # there detections are mixed up, and errors larger than predicted
     crowded: Floats
     symmetries: int  # orientations that look the same
-    # poses that look nearly the same as one of the first, the most alike first
-    alike: tuple[LookAlike, ...]
+    alike: tuple[LookAlike, ...]  # poses that look nearly like one of the first; the most first
 
 
 def summarise(

@@ -16,7 +16,7 @@ from mixpose.design.confirmation import Confirmation, confirm
 from mixpose.design.prediction import Plan, Summary, at_tip, plan_of, pooled, predict, summarise
 from mixpose.executing import Executor
 from mixpose.records import Floats
-from mixpose.session import SensorSetup, Session
+from mixpose.session import Session
 
 SHARE_OF_RADIUS = 0.1
 """Bodies whose markers lie alike to within this share of the smaller one's radius are told: two of
@@ -33,8 +33,7 @@ class Request:
     noises: Mapping[tuple[int | None, str], float] = field(default_factory=dict)
     runs: int = 0  # frames to simulate for each system; 0 for none
     seed: int = 0
-    # within which markers of bodies lie alike; None for a share of the radius
-    tolerance: float | None = None
+    tolerance: float | None = None  # of markers that lie alike; None for a share of the radius
 
     @property
     def point(self) -> Floats:
@@ -115,8 +114,11 @@ def study(
 def _system(name: str, session: Session, plan: Plan, request: Request) -> System:
     error_of = request.error_of
     prediction = predict(plan, request.poses)
-    setups = tuple(_with_noise(s, n) for s, n in zip(session.sensors, plan.noises, strict=True))
-    summary = summarise(plan, setups, prediction, request.point)
+    setups = []  # whose `sigma` stands for the noise: look-alikes go by it
+    for setup, noise in zip(session.sensors, plan.noises, strict=True):
+        sigma = setup.extract.sigma * noise / noise_of(setup)
+        setups.append(replace(setup, extract=replace(setup.extract, sigma=sigma)))
+    summary = summarise(plan, tuple(setups), prediction, request.point)
     middle = (request.poses[:, :3, :3] @ plan.body.means.mean(axis=0)).mean(axis=0)
     middle = middle + request.poses[:, :3, 3].mean(axis=0)
     return System(
@@ -129,12 +131,6 @@ def _system(name: str, session: Session, plan: Plan, request: Request) -> System
         move=advice.best_marker_move(plan, error_of),
         new=advice.best_new_sensor(plan, error_of, middle),
     )
-
-
-def _with_noise(setup: SensorSetup, noise: float) -> SensorSetup:
-    """A sensor whose `sigma` stands for a noise, as poses that look alike go by it."""
-    sigma = setup.extract.sigma * noise / noise_of(setup)
-    return replace(setup, extract=replace(setup.extract, sigma=sigma))
 
 
 def _confirmed(

@@ -15,10 +15,9 @@ from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.recorded import informative
 from mixpose.calibration.rig import State, blocks_of
-from mixpose.learning.growing import Found, Places, only_once, usual_reach
-from mixpose.learning.placing import FEWEST, body_of
 from mixpose.learning.points import Cloud, are_points
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Places, body_of, only_once, usual_reach
 from mixpose.records import Floats, Indices
 from mixpose.rigid import inverse, transform
 from mixpose.sensors import CalibrationError
@@ -32,8 +31,7 @@ class Eyes:
 
     rig: Rig  # its body is none of those that are learnt
     sigmas: Floats  # (L,): σ_ε of each
-    # by sensor, how far what is told of it may be off
-    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)  # of what is told
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,18 +40,15 @@ class Learnt:
 
     names: tuple[str, ...]  # of the markers
     points: Floats  # (N, 3)
-    # (N, 3, 3): of each marker, the body's frame being where its markers are on average
-    covariances: Floats
+    covariances: Floats  # (N, 3, 3): in the frame in which markers are where they are on average
     frames: Indices  # (N,): frames in which two cameras or more saw it, or a cloud
     poses: Floats  # (K, 4, 4): T_world_object in the frames that were adjusted
     numbers: Indices  # (K,): of these frames; of congruent bodies each has its own pose
     count: int  # congruent bodies that were seen at a time
     residual: float  # deviation of detections, as a share of σ_ε
-    # standard deviation of markers about their places on the body, along an axis, beyond what
-    # errors of detections explain; 0 of a rigid body
+    # deviation of markers about their places, along an axis, beyond errors of detections; or 0
     spread: float
-    # by sensor, how many markers it meets in a frame on average
-    met: Mapping[str, float] = field(default_factory=dict)
+    met: Mapping[str, float] = field(default_factory=dict)  # by sensor, markers in a frame
 
     @property
     def deviations(self) -> Floats:
@@ -92,7 +87,8 @@ def adjusted(bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes) -> li
             found = _adjusted(points, frames, poses, eyes)
             seen = _seen(found, len(points), len(frames), eyes)
             kept = seen >= max(RULES.least_frames, RULES.least_share * len(frames))
-            near = RULES.alike * RULES.gate * usual_reach(body.places, clouds)
+            reach = usual_reach(body.places, clouds)
+            near = RULES.alike * RULES.gate * reach
             kept &= only_once(found.state.rig.points, seen, np.full(len(points), near))
             if kept.all():
                 rig, blocks = found.state.rig, found.covariance.reshape(len(points), 3, -1, 3)
@@ -106,9 +102,12 @@ def adjusted(bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes) -> li
                     count=body.count,
                     residual=float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2))),
                     spread=_spread(body, clouds),
-                    met=dict(zip(rig.names, _met(found) / len(frames), strict=True)),
+                    met={
+                        name: len(pairs) / len(frames)
+                        for name, pairs in zip(rig.names, _pairs_met(found), strict=True)
+                    },
                 )
-                learnt.append(as_symmetric(one, usual_reach(body.places, clouds)))
+                learnt.append(as_symmetric(one, reach))
                 break
             points = points[kept]
     return learnt
@@ -156,11 +155,8 @@ def _frames_of(
 
 
 def _told_apart(body: Found, clouds: Sequence[Cloud]) -> Places:
-    """Placements whose points lie like no others of the shape; all, where these are too few.
-
-    Of the others nobody knows how the body is turned.
-    """
-    model = body_of("", body.shape.points)
+    """Placements whose points lie like no others of the shape; all, where these are too few."""
+    model = body_of("", body.shape.points)  # of the others nobody knows how it is turned
     off = RULES.gate * usual_reach(body.places, clouds)
     told = [
         (k, one)
@@ -199,11 +195,6 @@ def _pairs_met(found: Adjusted) -> Iterator[Indices]:
     for rows, weight in found.weighted:
         good = rows.pairs.nearest & (weight > _MET)
         yield np.column_stack([rows.pairs.frame, rows.pairs.feature])[good]
-
-
-def _met(found: Adjusted) -> Floats:
-    """How often each sensor (L,) met a marker."""
-    return np.array([len(pairs) for pairs in _pairs_met(found)], dtype=np.float64)
 
 
 def _seen(found: Adjusted, markers: int, frames: int, eyes: Eyes) -> Indices:

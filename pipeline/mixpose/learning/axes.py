@@ -12,7 +12,7 @@ import numpy as np
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.errors import SessionError
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.placing import body_of
+from mixpose.learning.shapes import body_of
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 
@@ -88,12 +88,8 @@ def like(learnt: Learnt, points: Floats, names: Sequence[str]) -> Likeness | Non
     known = names or [str(k + 1) for k in range(len(points))]
     order = sorted(range(len(learnt.points)), key=lambda k: (partner.get(k, len(points)), k))
     found = learnt.within(best.T_body_other, np.array(order, dtype=np.intp))
-    called = _called([partner.get(k) for k in order], known)
+    # names of partners, else the next number that is no name
+    others = (str(number) for number in count(len(known) + 1) if str(number) not in known)
+    called = tuple(known[partner[k]] if k in partner else next(others) for k in order)
     same = [part for part in parts[1:] if len(part.features) == len(best.features)]
     return Likeness(replace(found, names=called), len(best.features), best.off, len(same))
-
-
-def _called(partners: Sequence[int | None], known: Sequence[str]) -> tuple[str, ...]:
-    """Names of markers: those of partners, else the next number that is no name."""
-    others = (str(number) for number in count(len(known) + 1) if str(number) not in known)
-    return tuple(next(others) if partner is None else known[partner] for partner in partners)

@@ -14,12 +14,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mixpose.body.symmetry import congruent_triples_of_each, motions
-from mixpose.calibration.task import Progress, silent
+from mixpose.calibration.task import Progress
+from mixpose.learning import shapes
 from mixpose.learning.copies import is_chance, left_by, with_copies
-from mixpose.learning.growing import Found, Places, grown, least_met, placed
-from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Places, Shape, placed
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 
@@ -28,7 +28,7 @@ _OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those
 
 
 def find_bodies(
-    clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress = silent
+    clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress
 ) -> list[Found]:
     """Find what moves rigidly in clouds without what stands still; most points seen first.
 
@@ -41,21 +41,18 @@ def find_bodies(
         if body is None:
             break
         # a frame that shows few points of a body may show none of the triples it was found by
-        least = least_met(len(body.shape))
+        least = shapes.least_met(len(body.shape))
         more = _missed(body, left_by(body.places, left), least, RULES.many_bases)
         body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
-        found.append(_of_all(body, left))
-        left = _without(left, body)
+        places = []
+        for k, one in body.places:  # with points numbered as they were before any were left out
+            met = np.where(one.met >= 0, left[k].rows[one.met], -1)
+            places.append((k, replace(one, met=met)))
+        found.append(replace(body, places=tuple(places)))
+        # also where too few of its points are seen for a frame to count
+        left = left_by(body.places, left)
+        left = left_by(_missed(body, left, FEWEST, RULES.bases), left)
     return sorted(found, key=lambda each: -each.met)
-
-
-def _of_all(body: Found, clouds: Sequence[Cloud]) -> Found:
-    """The body with points numbered as they were before any were left out."""
-    places = tuple(
-        (k, replace(one, met=np.where(one.met >= 0, clouds[k].rows[one.met], -1)))
-        for k, one in body.places
-    )
-    return replace(body, places=places)
 
 
 def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> Found | None:
@@ -74,7 +71,7 @@ def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found 
     best, frames = None, 0
     for loose in RULES.looser[RULES.looser.index(least) :]:
         looser = [cloud.loosened(loose) for cloud in clouds]
-        body = grown(shape, looser)
+        body = shapes.grown(shape, looser)
         if body is None or is_chance(body, looser):
             break
         if best is not None and len(body.places) < RULES.worth * frames:
@@ -83,12 +80,6 @@ def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found 
         # with as few points as a looser shape is met by, where it has other bodies' among them
         frames = len(placed(best.shape, looser, best.count, FEWEST))
     return best
-
-
-def _without(clouds: Sequence[Cloud], body: Found) -> list[Cloud]:
-    """Clouds without a body, also where too few of its points are seen for a frame to count."""
-    left = left_by(body.places, clouds)
-    return left_by(_missed(body, left, FEWEST, RULES.bases), left)
 
 
 def _missed(body: Found, left: Sequence[Cloud], least: int, bases: int) -> Places:
@@ -129,7 +120,7 @@ def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int
     _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
     found = set[tuple[int, int, int]]()
     for row in near:
-        own = np.sort(row[triples_of(cloud.points[row], cloud.reach[row])], axis=1)
+        own = np.sort(row[shapes.triples_of(cloud.points[row], cloud.reach[row])], axis=1)
         found |= {(a, b, c) for a, b, c in own.tolist()}
     drawn = sorted(found)
     if len(drawn) > RULES.triples:
@@ -137,7 +128,7 @@ def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int
     for _ in range(RULES.far_triples if len(cloud) > reach else 0):
         a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
         some = [a, b, c]
-        if (a, b, c) not in found and len(triples_of(cloud.points[some], cloud.reach[some])):
+        if (a, b, c) not in found and len(shapes.triples_of(cloud.points[some], cloud.reach[some])):
             drawn.append((a, b, c))
     return drawn
 

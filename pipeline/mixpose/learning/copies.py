@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import pdtr
 
-from mixpose.learning.growing import Found, Places, averaged, placed
-from mixpose.learning.placing import FEWEST, Placement, Shape
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import FEWEST, Found, Placement, Places, Shape, averaged, placed
 from mixpose.records import Floats, Indices, Mask
 
 _OF_COPY = 0.6  # of the points of a shape that another one of it must show
@@ -110,10 +109,8 @@ def _of_copy(shape: Shape) -> int:
 
 
 def _count(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> int:
-    """How many placements there are at a time, in enough frames.
-
-    In some of them all must show more than the three points that a mirror image has alike.
-    """
+    """How many placements there are at a time, in enough frames."""
+    # in some of them all must show more than the three points that a mirror image has alike
     full = [(k, one) for k, one in places if one.count > min(FEWEST, len(shape) - 1)]
     per_frame, full_per_frame = _per_frame(places, clouds), _per_frame(full, clouds)
     often = seen_often(int((per_frame > 0).sum()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,8 +28,7 @@ class Lesson:
     bodies: tuple[Learnt, ...]  # in their principal axes, those of which most was seen first
     still: int  # other things that were seen and stood still all the time
     frames: int  # that were read
-    # deviation of detections of cameras as a share of σ_ε, by how closely lines of sight meet
-    noise: float
+    noise: float  # of detections, as a share of σ_ε, by how closely lines of sight meet
 
 
 def eyes_of(session: Session) -> Eyes:
@@ -57,9 +56,7 @@ def learn(
     cannot be read, or shows no body that moves.
     """
     eyes = eyes_of(session)
-    read = replace(
-        CalibrationRules(), most_read=RULES.most_frames, most_candidates=RULES.most_frames
-    )
+    read = CalibrationRules(most_read=RULES.most_frames, most_candidates=RULES.most_frames)
     runs = eyes.rig.is_late
     frames = read_frames(session, sources or {}, read, progress, runs=runs, known=None)
     if runs:
@@ -102,11 +99,8 @@ def _shown(lesson: Lesson) -> tuple[int, int]:
 def _farther_off(
     clouds: Sequence[Cloud], still: Sequence[Floats], noise: float, eyes: Eyes
 ) -> Iterator[tuple[list[Cloud], list[Cloud], float]]:
-    """Clouds by the noise of what moves, without what stands still, and that noise.
-
-    Where that is surely larger: of cameras out of step lines of sight of what moves meet less
-    closely, so that they do not by the noise of all.
-    """
+    """Clouds by the noise of what moves, without what stands still, and that, if surely larger."""
+    # of cameras out of step lines of sight of what moves do not meet by the noise of all
     sensors, gates = eyes.rig.sensors, RULES.gate * noise * eyes.sigmas
     rest = [without_places(cloud.seen, still, sensors, gates) for cloud in clouds if still]
     if not any(len(points) for frame in rest for points in frame.points.values()):

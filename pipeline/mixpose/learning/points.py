@@ -46,13 +46,8 @@ class Cloud:
         for sensor in range(self.detections.shape[1]):
             taken = detections[:, sensor]
             left &= ~np.isin(self.detections[:, sensor], taken[taken >= 0])
-        return replace(
-            self,
-            points=self.points[left],
-            reach=self.reach[left],
-            detections=self.detections[left],
-            rows=self.rows[left],
-        )
+        points, reach, rows = self.points[left], self.reach[left], self.rows[left]
+        return Cloud(points, reach, self.detections[left], rows, self.seen)
 
 
 def clouds_of(
@@ -104,18 +99,15 @@ def _meetings(rays: dict[int, Rays], gates: Floats) -> tuple[Floats, Indices, Fl
 
 
 def _deviation(gaps: Floats) -> float:
-    """Standard deviation of gaps (n,) between rays that belong together, among others.
-
-    Gaps are shares of a gate.  Those of rays that meet by chance are spread evenly from 0 to 1,
-    the others are half a Gaussian, cut at 1; the likeliest mixture is taken.
-    """
+    """Standard deviation of gaps (n,), shares of a gate, between rays that belong together."""
+    # those of rays that meet by chance are spread evenly from 0 to 1, the others are half a
+    # Gaussian, cut at 1; the likeliest mixture is taken
     if not len(gaps):
         return 0.0
     best, found = -np.inf, 1.0
     for deviation in _SHARES:
-        within = erf(1 / (np.sqrt(2) * deviation))
         density = np.exp(-(gaps**2) / (2 * deviation**2)) / (deviation * np.sqrt(np.pi / 2))
-        density /= within
+        density /= erf(1 / (np.sqrt(2) * deviation))
         share = 0.5
         for _ in range(20):
             share = float(np.mean(share * density / (share * density + 1 - share)))
@@ -161,12 +153,9 @@ def _supported(
     sensors: Sequence[Sensor],
     gates: Floats,
 ) -> Indices:
-    """Detections (P, L) of all sensors that see the points; -1 throughout for those left out.
-
-    Of points that share detections the one that most sensors confirm stays; what only two cameras
-    see is a ghost where one of its detections belongs to a point of three or more, as which a point
-    of a cloud counts.
-    """
+    """Detections (P, L) of all sensors that see the points; -1 throughout for those left out."""
+    # of points that share detections the one that most sensors confirm stays; what only two cameras
+    # see is a ghost where one of its detections belongs to a point of three or more, or of a cloud
     off, each = gaps.copy(), np.where(are_points(sensors), 3, 1)
     for sensor, pixels in frame.points.items():
         y, visible = sensors[sensor].project(points)
@@ -205,7 +194,9 @@ def _refined(
             r = np.where(visible[:, None], pixels[detections[seen, sensor]] - y, 0.0)
             information[seen] += np.swapaxes(J, 1, 2) @ J
             pull[seen] += np.einsum("nmk,nm->nk", J, r / noise[sensor])
-        fixed = _are_fixed(information)
+        finite: Mask = np.asarray(np.isfinite(information).all(axis=(1, 2)))
+        values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))
+        fixed = values[:, 0] > 1e-12 * values[:, 2]  # known in all directions
         information[~fixed] = np.nan
         step = np.full(points.shape, np.nan)
         step[fixed] = np.linalg.solve(information[fixed], pull[fixed][..., None])[..., 0]
@@ -214,13 +205,6 @@ def _refined(
     reach = np.full(len(points), np.nan)
     reach[known] = 1 / np.sqrt(np.linalg.eigvalsh(information[known])[:, 0])
     return points, reach
-
-
-def _are_fixed(information: Floats) -> Mask:
-    """Whether a point (P,) is known in all directions."""
-    finite: Mask = np.asarray(np.isfinite(information).all(axis=(1, 2)))
-    values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))
-    return np.asarray(values[:, 0] > 1e-12 * values[:, 2])
 
 
 def gathered_places(
@@ -256,8 +240,7 @@ def gathered_places(
             weight = 1 / reach[inside] ** 2
             place = weight @ points[inside] / weight.sum()
         away = np.linalg.norm(points[there] - place, axis=1)
-        left[there] = False
-        left[k] = False
+        left[there] = left[k] = False
         near_by = len(np.unique(frame[there]))
         chosen = there[np.argsort(away, kind="stable")]
         chosen = chosen[np.sort(away) <= allowed[chosen]]

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import congruent_parts, tolerance_of
 from mixpose.learning.adjusting import Learnt
-from mixpose.learning.placing import body_of
 from mixpose.learning.rules import RULES
+from mixpose.learning.shapes import body_of
 from mixpose.records import Floats
 from mixpose.session.marker_files import LEARNT_COLUMNS
 
@@ -115,15 +115,9 @@ def _doubts_of_motion(learnt: Learnt, name: str) -> list[str]:
 def _turns(learnt: Learnt) -> Floats:
     """Rotation vectors (K, 3) in the world from the middle one of all poses."""
     turns = Rotation.from_matrix(learnt.poses[:, :3, :3])
-    if learnt.count > 1:  # poses of several bodies are no motion of one
-        return np.asarray((turns * turns[0].inv()).as_rotvec())
-    return np.asarray((turns * turns.mean().inv()).as_rotvec())
-
-
-def _are_together(one: Learnt, other: Learnt) -> bool:
-    """Whether two bodies are seen at the same time, now and then."""
-    seen = [set(each.numbers.tolist()) for each in (one, other)]
-    return len(seen[0] & seen[1]) >= _TOGETHER * min(map(len, seen))
+    # poses of several bodies are no motion of one
+    middle = turns[0] if learnt.count > 1 else turns.mean()
+    return np.asarray((turns * middle.inv()).as_rotvec())
 
 
 def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
@@ -138,7 +132,8 @@ def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
                 b = ", ".join(bodies[other].names[n] for n in parts[0].partners)
                 said = "where no others are seen the two cannot be told apart"
                 most = 2 * len(parts[0].features) > min(len(first), len(second))
-                if most and not _are_together(bodies[k], bodies[other]):
+                seen, also = (set(bodies[each].numbers.tolist()) for each in (k, other))
+                if most and len(seen & also) < _TOGETHER * min(len(seen), len(also)):
                     said = "the two are hardly ever seen at a time, and may be one: leave one out"
                 told.append(f"markers {a} of {names[k]} lie like {b} of {names[other]}: {said}")
     return told

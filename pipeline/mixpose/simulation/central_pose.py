@@ -115,8 +115,7 @@ class _Ray:
 
     origin: Floats
     direction: Floats
-    # where the body fills its share of the image; None: nowhere or everywhere
-    distance: float | None
+    distance: float | None  # where the body fills its share of the image; None: anywhere
 
     def suits(self, place: Floats) -> bool:
         """Whether the body is in front there, and neither too near nor too small."""
@@ -129,19 +128,17 @@ class _Ray:
 
 def _ray(setup: SensorSetup, radius: float) -> _Ray | None:
     sensor = setup.sensor
+    if not isinstance(sensor, ParallelBeam | PinholeCamera | FisheyeCamera):
+        return None
     size = np.asarray(setup.resolution, dtype=np.float64)
-    middle = (size - 1) / 2
+    middle, R, t = (size - 1) / 2, sensor.T_sensor_world[:3, :3], sensor.T_sensor_world[:3, 3]
     if isinstance(sensor, ParallelBeam):
-        R, t = sensor.T_sensor_world[:3, :3], sensor.T_sensor_world[:3, 3]
         offset = np.append((middle - sensor.principal_point) * sensor.pixel_size, 0.0)
         return _Ray(R.T @ (offset - t), R[2], None)
-    if isinstance(sensor, PinholeCamera | FisheyeCamera):
-        R, t = sensor.T_sensor_world[:3, :3], sensor.T_sensor_world[:3, 3]
-        K = sensor.camera_matrix
-        sight = np.append((middle - K[:2, 2]) / K.diagonal()[:2], 1.0)
-        distance = 2 * radius * K[0, 0] / (_SIDE_FILLED * size.min())
-        return _Ray(-R.T @ t, R.T @ sight / np.linalg.norm(sight), float(distance))
-    return None
+    K = sensor.camera_matrix
+    sight = np.append((middle - K[:2, 2]) / K.diagonal()[:2], 1.0)
+    distance = 2 * radius * K[0, 0] / (_SIDE_FILLED * size.min())
+    return _Ray(-R.T @ t, R.T @ sight / np.linalg.norm(sight), float(distance))
 
 
 def _meeting_point(rays: list[_Ray]) -> Floats | None:
@@ -183,9 +180,8 @@ def plan_companions(
     for k, (one, instance) in enumerate(members, start=1):
         own = session.alone(one.body.name)
         seed = options.seed + _SEEDS_APART * k
-        is_at_start = one.start is not None and not instance
         T = central_pose(own, seed)
-        if not is_at_start:
+        if one.start is None or instance:
             T = _aside(own, T, placed, seed, turned=one.start is not None)
         placed.append((_middle(T, one.body), one.body.radius))
         motion = swinging(own, T, options, seed)

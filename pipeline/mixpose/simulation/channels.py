@@ -40,8 +40,7 @@ class Channel:
     view: View
     options: SimulationOptions  # as they hold for this sensor
     open: Callable[[Path], SensorWriter]  # takes the recording's folder and starts to write there
-    # seconds by which its frames are later than those of the first sensor, as its times say
-    step_s: float = 0.0
+    step_s: float = 0.0  # seconds after the first sensor, as its times say
 
 
 def check_setup(session: Session) -> None:
@@ -76,19 +75,18 @@ class Planner:
         first, and says so.
         """
         shutter = shutter_of(setup, self.options, step_s)
+        is_image = setup.sensor.dimension == 2
         is_profile = setup.range_min is not None and setup.bin_size is not None
-        is_table = files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile)
-        if is_table:
+        if files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile):
             channel = self._table(setup, files)
-        elif setup.sensor.dimension == 1:
-            channel = self._profiles(setup, files, index)
-        else:
-            channel = self._camera(setup, files, index)
-        view = replace(channel.view, shutter=shutter)
-        if setup.sensor.dimension == 2:
-            if is_table:  # a detection is where the middle of a streak is
+            if is_image:  # a detection is where the middle of a streak is
                 shutter = replace(shutter, exposure_s=0.0)
-            view = replace(view, shutter=shutter, scenery=self.scenery)
+        elif is_image:
+            channel = self._camera(setup, files, index)
+        else:
+            channel = self._profiles(setup, files, index)
+        scenery = self.scenery if is_image else Scenery()
+        view = replace(channel.view, shutter=shutter, scenery=scenery)
         return replace(channel, view=view, step_s=step_s)
 
     def _camera(self, setup: SensorSetup, files: SourceFiles, index: int) -> Channel:

@@ -24,6 +24,7 @@ VIDEO_SUFFIXES = (".avi", ".mp4")
 IMAGES_WRITTEN = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 _OTHER_VIDEOS = (".mkv", ".mov", ".m4v", ".webm", ".wmv", ".mpg", ".mpeg", ".h264", ".flv", ".ts")
 _WILD = re.compile(r"\*\*/|\*|\?|\[!?[^\]]+\]")
+_SINGLES = re.compile(r"(?:\?|\[!?[^\]]+\])+")
 _FEWEST_DIGITS = 4
 
 
@@ -36,8 +37,7 @@ class SourceFiles:
     path: str  # the one file of a video or table; for images what comes before the frame number
     ending: str = ""  # for images: what comes after the frame number
     digits: int = 0  # for images: how many digits the frame number has at least
-    # for images of a list: the name of each frame
-    listed: dict[int, str] = field(default_factory=dict)
+    listed: dict[int, str] = field(default_factory=dict)  # for images of a list: their names
     pattern: str = ""  # the glob that the session reads the images by; empty for all other sources
 
     def name(self, number: int) -> str:
@@ -232,21 +232,12 @@ def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> Source
 
 def _split_at_number(pattern: str, sensor: str) -> tuple[str, str, int]:
     """What stands before and after the number, and how many digits it has room for; 0 for any."""
-    wild = list(_WILD.finditer(pattern))
-    stars = [match for match in wild if match.group() == "*"]
-    if stars:
-        start, end, room = stars[-1].start(), stars[-1].end(), 0
-    else:
-        singles = [match for match in wild if match.group() != "**/"]
-        if not singles:
-            raise SessionError(
-                f'{_where(sensor)}: found {pattern!r}; use a glob like "{sensor}*.png"'
-            )
-        end, start, room = singles[-1].end(), singles[-1].start(), 1
-        for match in reversed(singles[:-1]):
-            if match.end() != start:
-                break
-            start, room = match.start(), room + 1
+    stars = [match for match in _WILD.finditer(pattern) if match.group() == "*"]
+    found = stars or list(_SINGLES.finditer(pattern))
+    if not found:
+        raise SessionError(f'{_where(sensor)}: found {pattern!r}; use a glob like "{sensor}*.png"')
+    start, end = found[-1].span()
+    room = 0 if stars else len(_WILD.findall(found[-1].group()))
     return _filled(pattern[:start]), _filled(pattern[end:]), room
 
 

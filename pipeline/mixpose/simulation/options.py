@@ -54,70 +54,58 @@ class SimulationOptions:
     """Frames, noise, clutter and motion of a recording, or a `SessionError` for a wrong number."""
 
     frames: int = field(metadata={"rule": _FRAMES})
-    # the same seed, session and options give the same recording
-    seed: int = _option(0, _COUNT)
+    seed: int = _option(0, _COUNT)  # the same seed, session and options: the same recording
     fps: float | None = _option(None, _POSITIVE)  # None takes that of the session, or else 25
     # grey level without features; below 0 the camera clips most of its noise at black
     background: float = _option(10.0, _ANY, _IMAGES)
-    # standard deviation of every pixel, grey levels
-    noise: float = _option(2.0, _NOT_NEGATIVE, _IMAGES)
+    noise: float = _option(2.0, _NOT_NEGATIVE, _IMAGES)  # deviation of every pixel, grey levels
     shot_noise: float = _option(0.02, _NOT_NEGATIVE, _IMAGES)  # variance per grey level of signal
-    # standard deviation of a feature's spot, px; None is `spot_sigma` of the sensor's [extract]
-    # where that is given, else 1.6
+    # standard deviation of a feature's spot, px; None: `spot_sigma` of its [extract], else 1.6
     spot_sigma: float | None = _option(None, _SIGMA, _IMAGES)
-    # peak of a feature's spot above the background, grey levels
-    brightness: float = _option(170.0, _POSITIVE, _IMAGES)
+    brightness: float = _option(170.0, _POSITIVE, _IMAGES)  # peak of a spot, grey levels
     # standard deviation from feature to feature, as a share
     brightness_spread: float = _option(0.1, _NOT_NEGATIVE, ("images", "profiles"))
     # false features per frame and sensor: the whole part always, the rest by chance
     clutter: float = _option(0.0, _FALSE)
     hidden: float = _option(0.0, _PROBABILITY)  # that a feature is, in each view anew
-    # features hidden in each view for certain, chosen by chance
-    hidden_count: int = _option(0, _COUNT)
-    # that a sensor has no frame; a video or a table of profiles cannot lack one: there it is a
-    # frame without features
+    hidden_count: int = _option(0, _COUNT)  # features hidden in each view, drawn by chance
+    # that a sensor has no frame; of a video or profiles that is a frame without features
     missing: float = _option(0.0, _PROBABILITY)
     # displaces features, in each frame anew, by the spread that the object states; the truth
     # remains the pose of the undeformed body
     deform: bool = False
-    # largest displacement along each world axis, length units; None is 0.4 times the radius of the
-    # body
+    # largest displacement along each world axis, length units; None: 0.4 times the body's radius
     amplitude_translation: float | None = _option(None, _NOT_NEGATIVE)
-    # largest turn about each world axis
-    amplitude_rotation_deg: float = _option(20.0, _NOT_NEGATIVE)
-    # in which the slow part of the motion comes round, more or less
-    period_s: float = _option(4.0, _POSITIVE)
+    amplitude_rotation_deg: float = _option(20.0, _NOT_NEGATIVE)  # largest about each world axis
+    period_s: float = _option(4.0, _POSITIVE)  # in which the slow part of the motion comes round
     # standard deviation of detections in a camera's table, px
     pixel_noise: float = _option(0.1, _NOT_NEGATIVE, ("pixels",))
-    # standard deviation of detections in tables of ranges and clouds, length units; None is `sigma`
-    # of its [extract], of clouds a fifth of it
+    # of detections in tables of ranges and clouds, length units; None: `sigma` of the sensor's
+    # [extract], of clouds a fifth of it
     range_noise: float | None = _option(None, _NOT_NEGATIVE, ("lengths",))
-    # standard deviation of a feature's peak in a range profile, length units; None is `spot_sigma`
-    # of the sensor's [extract] where that is given, else one and a half bins
+    # standard deviation of a feature's peak in a range profile, length units; None: `spot_sigma`
+    # of the sensor's [extract], else one and a half bins
     range_width: float | None = _option(None, _POSITIVE, ("profiles",))
     # height of a peak divided by the standard deviation of the profile's noise
     range_snr: float = _option(30.0, _POSITIVE, ("profiles",))
-    # seconds from the first row of a camera to its last, and for which a row collects light; None
-    # is what the session states of each camera
+    # seconds from a camera's first row to its last, and for which a row collects light; None: as
+    # the session states
     readout: float | None = _option(None, _SECOND, _CAMERAS)
     exposure: float | None = _option(None, _SECOND, _CAMERAS)
-    # seconds that sensors are late without knowing, by name; the others are as late as the session
-    # states
+    # seconds that sensors are late without knowing, by name; else as the session states
     delay: Mapping[str, float] = field(default_factory=dict)
-    # seconds by which sensors differ that have tables of times, as these say: the last is this much
-    # later than the first
+    # seconds from the first sensor to the last, as their tables of times say
     out_of_step: float = _option(0.0, _NOT_NEGATIVE)
     lamps: int = _option(0, _FEW, _CAMERAS)  # behind the body
     others: int = _option(0, _FEW, _CAMERAS)  # bodies with as many markers
     occluder: int = _option(0, _FEW, _CAMERAS)  # dark bars that swing before it
     # brightness of mirror images in a table below the body, as a share; 0 without one
     mirror: float = _option(0.0, _PROBABILITY, _CAMERAS)
-    # of the compression that images went through
-    jpeg: int | None = _option(None, _QUALITY, _IMAGES)
-    # images come from a colour sensor, its colours interpolated
-    bayer: bool = _option(False, None, _IMAGES)
-    # by which the last camera was turned after its calibration
-    turned_camera_deg: float = _option(0.0, _ANY, _CAMERAS)
+    jpeg: int | None = _option(None, _QUALITY, _IMAGES)  # of the compression of images
+    bayer: bool = _option(False, None, _IMAGES)  # images of a colour sensor, interpolated
+    turned_camera_deg: float = _option(
+        0.0, _ANY, _CAMERAS
+    )  # of the last one, since its calibration
     away_from: int | None = _option(None, _COUNT)  # frames after which the body is gone
 
     def __post_init__(self) -> None:

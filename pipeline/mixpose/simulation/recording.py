@@ -110,20 +110,17 @@ def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -
             raise SessionError(
                 f"delay: found the sensor {name!r}; allowed: {', '.join(sorted(names))}"
             )
-    last = max(len(session.sensors) - 1, 1)
-    steps = []
-    for i, (setup, kind) in enumerate(zip(session.sensors, kinds, strict=True)):
-        tells = setup.times is not None or (kind == "detections" and setup.fps is None)
-        if options.out_of_step and not tells:
+    for setup, kind in zip(session.sensors, kinds, strict=True) if options.out_of_step else ():
+        if setup.times is None and (kind != "detections" or setup.fps is not None):
             raise SessionError(
                 f"sensor {setup.name!r}: times: missing; sensors that are out of step need a table "
                 "of times each"
             )
-        steps.append(options.out_of_step * i / last)
     tables = [setup.times for setup in session.sensors if setup.times is not None]
     if options.out_of_step and len(set(tables)) < len(tables):
         raise SessionError("times: found one table for several sensors; allowed: one for each")
-    return steps
+    count = len(session.sensors)
+    return [options.out_of_step * i / max(count - 1, 1) for i in range(count)]
 
 
 def _as_they_stand(
@@ -145,16 +142,14 @@ def _as_they_stand(
 
 
 def _frames_per_second(session: Session, options: SimulationOptions) -> float:
-    given = {setup.name: setup.fps for setup in session.sensors if setup.fps is not None}
-    rates = set(given.values()) | ({options.fps} if options.fps is not None else set())
-    if len(rates) > 1:
-        stated = [f"{fps:g} (sensor {name!r})" for name, fps in given.items()]
-        stated += [f"{options.fps:g} (asked for)"] if options.fps is not None else []
+    stated = [(f"sensor {setup.name!r}", setup.fps) for setup in session.sensors]
+    given = {who: fps for who, fps in (*stated, ("asked for", options.fps)) if fps is not None}
+    if len(set(given.values())) > 1:
+        told = ", ".join(f"{fps:g} ({who})" for who, fps in given.items())
         raise SessionError(
-            f"fps: found {', '.join(stated)}; allowed: the same for all, as frames are "
-            "taken together"
+            f"fps: found {told}; allowed: the same for all, as frames are taken together"
         )
-    return rates.pop() if rates else DEFAULT_FPS
+    return next(iter(given.values()), DEFAULT_FPS)
 
 
 def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:

@@ -162,26 +162,25 @@ def _shares(cells: range, centre: float, sigma: float) -> Floats:
     return np.asarray(np.diff(0.5 * erf((edges - centre) / (np.sqrt(2) * sigma))))
 
 
-def _made(files: SourceFiles, folder: Path) -> Path:
-    """The one file of a source, in a folder that is there."""
-    path = folder / files.path
+def _made(path: Path) -> Path:
+    """A path whose folder is there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
+@dataclass(frozen=True)
 class ImageWriter:
     """A file per image."""
 
-    def __init__(
-        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ImageFormat
-    ) -> None:
-        self._files, self._folder, self._options, self._form = files, folder, options, form
+    files: SourceFiles
+    folder: Path
+    options: SimulationOptions
+    form: ImageFormat
 
     def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Draw and write one image."""
-        image = render_image(visible, self._form, self._options, rng)
-        path = self._folder / self._files.name(number)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        image = render_image(visible, self.form, self.options, rng)
+        path = _made(self.folder / self.files.name(number))
         suffix = path.suffix.casefold()
         path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
 
@@ -201,7 +200,7 @@ class VideoWriter:
         fps: float,
     ) -> None:
         self._options, self._form = options, form
-        path = _made(files, folder)
+        path = _made(folder / files.path)
         # OpenCV's own writer of MJPEG lets the quality be set
         own = path.suffix.casefold() == ".avi"
         self._video = cv2.VideoWriter(
@@ -228,16 +227,27 @@ class VideoWriter:
         self._video.release()
 
 
-class ProfileWriter:
+class _TableWriter:
+    """Rows of one file."""
+
+    def __init__(self, files: SourceFiles, folder: Path) -> None:
+        self._path = _made(folder / files.path)
+        self._file = self._path.open("wb")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class ProfileWriter(_TableWriter):
     """A row per frame: .npy of float32, or .csv without a header."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
     ) -> None:
+        super().__init__(files, folder)
         self._options, self._form = options, form
-        path = _made(files, folder)
-        self._is_text = path.suffix.casefold() == ".csv"
-        self._file = path.open("wb")
+        self._is_text = self._path.suffix.casefold() == ".csv"
         if not self._is_text:
             shape = (options.frames, form.bins)
             header = {"descr": "<f4", "fortran_order": False, "shape": shape}
@@ -251,20 +261,19 @@ class ProfileWriter:
             row = (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")
         self._file.write(row)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
-
-class DetectionWriter:
+class DetectionWriter(_TableWriter):
     """A row per detection, in no order, or one of weight 0: the sensor looked, and saw none."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
     ) -> None:
+        super().__init__(files, folder)
         self._noise, self._coordinates = noise, coordinates
-        self._file = _made(files, folder).open("w", encoding="ascii", newline="\n")
-        self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
+        self._append("frame", "time_s", *coordinates, "weight")
+
+    def _append(self, *cells: str) -> None:
+        self._file.write((",".join(cells) + "\n").encode("ascii"))
 
     def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Append the detections of one frame."""
@@ -279,11 +288,7 @@ class DetectionWriter:
             points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
         for i in rng.permutation(len(points)):
             cells = [f"{value:.9g}" for value in (*points[i], weights[i])]
-            self._file.write(",".join([str(number), f"{time_s:.6f}", *cells]) + "\n")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+            self._append(str(number), f"{time_s:.6f}", *cells)
 
 
 SensorWriter: TypeAlias = ImageWriter | VideoWriter | ProfileWriter | DetectionWriter

@@ -14,7 +14,7 @@ from numpy.random import Generator
 
 from mixpose.body import Body, PointFeature
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, rotation_matrix
+from mixpose.rigid import from_rotation_vector
 from mixpose.sensors import Sensor
 from mixpose.simulation.motion import Motion, PoseAt, plan_motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
@@ -142,9 +142,9 @@ class _Stage:
         other = Body("other", features, normals, None, body.shape, radii)
         angle = rng.uniform(0, 2 * np.pi)
         aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
-        R = rotation_matrix(0.3 * rng.standard_normal(3))
+        turn = 0.3 * rng.standard_normal(3)
         motion = plan_motion(
-            from_parts(R, self.middle + body.radius * (aside @ self.frame)),
+            from_rotation_vector(turn, self.middle + body.radius * (aside @ self.frame)),
             np.zeros(3),
             translation=_OTHERS_MOVE * body.radius,
             rotation_deg=options.amplitude_rotation_deg,

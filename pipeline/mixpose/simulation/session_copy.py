@@ -14,7 +14,7 @@ from typing import Any
 
 import tomlkit
 
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, reporting
 from mixpose.session import Session
 from mixpose.session.rewriting import places_of
 
@@ -28,8 +28,7 @@ class SessionCopy:
     content: bytes  # the session file
     sources: tuple[str | tuple[str, ...], ...]  # sources of the sensors in `content`, in order
     times: Mapping[str, str]  # tables of frame times that it names, with the first sensor of each
-    # marker and calibration files and the user's own extraction: where they are, and their paths in
-    # the recording
+    # marker and calibration files and own extraction: where they are, and paths in the recording
     files: tuple[tuple[Path, str], ...]
 
     def write(self, folder: Path) -> None:
@@ -43,11 +42,10 @@ class SessionCopy:
 
 def copy_session(session: Session) -> SessionCopy:
     """Read a session file for a recording; a `SessionError` if what it names cannot go along."""
-    try:
+    with reporting(SessionError, f"{session.path}: cannot be read"):
         content = session.path.read_bytes()
+    try:
         document = tomlkit.parse(content.decode("utf-8-sig"))
-    except OSError as error:
-        raise SessionError(f"{session.path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise SessionError(f"{session.path}: changed since it was read; try again") from error
     moved = _moved(session, document)

@@ -24,7 +24,7 @@ from mixpose.rigid import transform
 from mixpose.sensors import CloudSensor, Sensor
 from mixpose.simulation.motion import PoseAt, Shutter
 from mixpose.simulation.options import SimulationOptions
-from mixpose.simulation.scenery import Scenery
+from mixpose.simulation.scenery import Actor, Scenery
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
 _CORE = 0.45  # of a body's radius: what others are hidden behind
@@ -43,8 +43,7 @@ class VisibleSpots:
     points: Floats  # (M, m), places of the spots
     levels: Floats  # (M,), their brightness; 1 for the mean feature
     features: NDArray[np.intp]  # (M,), that spots belong to; numbers from N on are false features
-    # edges (K, 2) of those spots that have a size
-    outlines: Mapping[int, Floats] = field(default_factory=dict)
+    outlines: Mapping[int, Floats] = field(default_factory=dict)  # edges (K, 2) of sized spots
     covers: tuple[Floats, ...] = ()  # corners (4, 2) of what is dark before all spots
 
     def __len__(self) -> int:
@@ -56,8 +55,7 @@ class View:
     """How one sensor looks at the body throughout a recording."""
 
     sensor: Sensor
-    # bounds (m,) of false features
-    lowest: Floats
+    lowest: Floats  # (m,): bounds of false features
     highest: Floats
     levels: Floats  # (N,), brightness of the features
     spacing: float  # distance of the spots of which a line consists, sensor units
@@ -97,61 +95,40 @@ def look(
     false = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
     spots = _Spots([false], [brightness_levels(len(false), options.brightness_spread, rng)])
     spots.owners += range(count, count + len(false))
-    seen = facing(view.sensor, body, T_world_object) & ~_hidden(count, options, rng)
-    seen &= not is_away
-    solid = _solid(view, body, T_world_object, time_s, is_away=is_away)
-    seen &= ~hidden_behind(view.sensor, transform(T_world_object, body.means), solid[1:])
-    after = pose_after or (lambda _: T_world_object)
-    for i in np.flatnonzero(seen).tolist():
-        spots.add(view, body, i, i, after, view.levels[i], None if offsets is None else offsets[i])
-    for actor in view.scenery.actors:
-        if is_away and actor.is_image:
-            continue
-        pose_later = later(actor.pose, time_s)
-        T = pose_later(0.0)
-        faced = facing(view.sensor, actor.body, T, actor.mirror)
+    own = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
+    actors = [own, *view.scenery.actors]
+    poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
+    means = [actor.body.means.mean(axis=0)[None] for actor in actors]
+    middles = [transform(T, mean)[0] for T, mean in zip(poses, means, strict=True)]
+    radii = [0.0 if one is own and is_away else _CORE * one.body.radius for one in actors]
+    for actor, T in zip(actors, poses, strict=True):
+        seen = facing(view.sensor, actor.body, T, actor.mirror)
         if actor.is_body:
-            others = [one for one in solid if one[2] is not actor]
-            faced &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
-            faced &= ~_hidden(len(actor.body), options, rng)
-        for i in np.flatnonzero(faced).tolist():
-            owner = count + len(false) + i
-            spots.add(view, actor.body, i, owner, pose_later, actor.levels[i], None, actor.mirror)
+            seen &= ~_hidden(len(actor.body), options, rng)
+            cores = zip(actors, middles, radii, strict=True)
+            others = [(m, r) for one, m, r in cores if one.is_body and one is not actor]
+            seen &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
+        if is_away and (actor is own or actor.is_image):
+            continue
+        pose_later = own.pose if actor is own else later(actor.pose, time_s)
+        first = 0 if actor is own else count + len(false)
+        for i in np.flatnonzero(seen).tolist():
+            offset = offsets[i] if actor is own and offsets is not None else np.zeros(3)
+            spots.add(view, actor, i, first + i, pose_later, offset)
     late = time_s + view.shutter.late_s
-    arms = view.scenery.arms if view.sensor.dimension == 2 else ()
-    covers = [arm.outline(view.unbounded, late) for arm in arms]
+    covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
     return spots.visible(tuple(one for one in covers if len(one)))
 
 
-def _solid(
-    view: View, body: Body, T_world_object: Floats, time_s: float, *, is_away: bool
-) -> list[tuple[Floats, float, object]]:
-    """Middle, radius and owner of the cores of several bodies, behind which others are hidden."""
-    actors = [actor for actor in view.scenery.actors if actor.is_body]
-    if not actors:
-        return []
-    posed = [(body, T_world_object, None), *((a.body, a.pose(time_s), a) for a in actors)]
-    return [
-        (
-            transform(T, one.means.mean(axis=0)[None])[0],
-            0.0 if whose is None and is_away else _CORE * one.radius,
-            whose,
-        )
-        for one, T, whose in posed
-    ]
-
-
-def hidden_behind(
-    sensor: Sensor, points: Floats, others: Sequence[tuple[Floats, float, object]]
-) -> Mask:
-    """Which points (n, 3) the core of a body stands before."""
+def hidden_behind(sensor: Sensor, points: Floats, others: Sequence[tuple[Floats, float]]) -> Mask:
+    """Which points (n, 3) a core stands before, by the middle and radius of each."""
     hidden = np.zeros(len(points), dtype=np.bool_)
     if isinstance(sensor, CloudSensor):  # seen from several sides
         return hidden
     towards = sensor.towards(points)
     lengths = np.linalg.norm(towards, axis=1)
     units = towards / lengths[:, None]
-    for middle, radius, _ in others:
+    for middle, radius in others:
         arms = middle - points
         along = (arms * units).sum(axis=1)
         across = np.linalg.norm(arms - along[:, None] * units, axis=1)
@@ -176,37 +153,31 @@ class _Spots:
     def add(
         self,
         view: View,
-        body: Body,
+        actor: Actor,
         feature: int,
         owner: int,
         pose_after: PoseAt,
-        level: float,
-        offset: Floats | None = None,
-        mirror: Floats | None = None,
+        offset: Floats,
     ) -> None:
         """Add what is seen of one feature, at each moment of its exposure."""
-        point, is_image = body.means[feature], view.sensor.dimension == 2
-        poses = view.shutter.poses(view.sensor, point, pose_after)
-        for T in poses:
-            M = T.copy() if mirror is None else mirror @ T
-            if offset is not None:
-                M[:3, 3] += M[:3, :3] @ offset
-            sized = body.radii is not None and body.radii[feature] > 0
-            if is_image and sized:
-                moved = T.copy()
-                moved[:3, 3] += 0.0 if offset is None else T[:3, :3] @ offset
-                edge = outline(view.unbounded, body, feature, moved, mirror)
+        body, mirror, sensor = actor.body, actor.mirror, view.sensor
+        has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
+        poses = view.shutter.poses(sensor, body.means[feature], pose_after)
+        for pose in poses:
+            T = pose.copy()
+            T[:3, 3] += T[:3, :3] @ offset
+            edge = outline(view.unbounded, body, feature, T, mirror) if has_size else None
+            if edge is None:
+                y, shares = _spots(
+                    view, body.features[feature], T if mirror is None else mirror @ T
+                )
             else:
-                edge = None
-            if edge is not None:
                 y, shares = centroid(edge)[None], np.ones(1)
-                if (y < view.sensor.lower).any() or (y > view.sensor.upper).any():
+                if (y < sensor.lower).any() or (y > sensor.upper).any():
                     continue
                 self.outlines[len(self.owners)] = edge
-            else:
-                y, shares = _spots(view, body.features[feature], M)
             self.points.append(y)
-            self.levels.append(level * shares / len(poses))
+            self.levels.append(actor.levels[feature] * shares / len(poses))
             self.owners += [owner] * len(y)
 
     def visible(self, covers: tuple[Floats, ...]) -> VisibleSpots:
@@ -248,10 +219,9 @@ def _hidden(count: int, options: SimulationOptions, rng: Generator) -> Mask:
 
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
     """Places (K, m) and shares of brightness (K,) of one feature's visible spots."""
-    R, t = T_world_object[:3, :3], T_world_object[:3, 3]
     points, shares = feature.nodes()
     if isinstance(feature, SegmentFeature):
-        ends = np.array([feature.start, feature.end]) @ R.T + t
+        ends = transform(T_world_object, np.array([feature.start, feature.end]))
         # so many that they lie no farther apart than `spacing`
         pieces = np.linspace(0, 1, _PIECES + 1)[:, None]
         y, visible = view.sensor.project(ends[0] + pieces * (ends[1] - ends[0]))
@@ -262,7 +232,7 @@ def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats
         y, visible = view.sensor.project(ends[0] + along * (ends[1] - ends[0]))
         shares = np.full(count, max(1.0 / count, view.ridge))
     else:
-        y, visible = view.sensor.project(points @ R.T + t)
+        y, visible = view.sensor.project(transform(T_world_object, points))
     return y[visible], shares[visible]
 
 
