@@ -98,7 +98,7 @@ def _watches(
         from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
         each = [(label, one.body) for one in session.objects for label in one.labels]
-        foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in each}
+        foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in each}
         publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
         yield stack.enter_context(publishing).watch
     if request.overlay is not None:
