@@ -141,8 +141,8 @@ _CUT = (
     Mutant(
         "judgement-surfaces-hidden-corner-by-corner",
         "judgement/evidence.py",
-        "counts = np.where(own & hidden[..., None], 1 / several[..., None], counts)",
-        "counts = np.where(own & hidden[..., None], 1.0, counts)",
+        "weights = np.where(on_surface & is_hidden[..., None], 1 / in_view[..., None], weights)",
+        "weights = np.where(on_surface & is_hidden[..., None], 1.0, weights)",
         "a tag that is covered counts as four markers that are",
         ("test_judgement_evidence.py",),
     ),
@@ -208,8 +208,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-covered-features-missed-one-by-one",
         "judgement/evidence.py",
-        "most = 2 * detection.log_missed",
-        "most = 20 * detection.log_missed",
+        "floor = 2 * detection.log_missed",
+        "floor = 20 * detection.log_missed",
         "of a rig of many cameras a body with a covered marker is lost",
     ),
     Mutant(
@@ -230,7 +230,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-out-of-view-is-free",
         "judgement/evidence.py",
-        "unseen = found.unseen.sum(axis=-1) * detection.log_unseen",
+        "unseen = matches.unseen.sum(axis=-1) * detection.log_unseen",
         "unseen = 0.0",
         "a pose gains by moving features out of the picture",
     ),
@@ -251,7 +251,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "np.maximum(rarity - _costs(found, roots, spreads), 0.0)",
+        "np.maximum(rarity - _costs(matches, roots, spreads), 0.0)",
         "np.maximum(rarity, 0.0)",
         "a pose that meets features loosely is as good as one that meets them",
     ),
@@ -286,8 +286,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-points-in-space-anywhere-are-the-feature",
         "judgement/evidence.py",
-        "0.5 * (rarity + tight - np.expm1(both - tight))",
-        "0.5 * (rarity + tight)",
+        "0.5 * (rarity + alone - np.expm1(with_pull - alone))",
+        "0.5 * (rarity + alone)",
         "a false point beside a feature is as good as one at it",
     ),
     Mutant(
@@ -303,8 +303,8 @@ _JUDGE = (
     Mutant(
         "judgement-left-out-for-free",
         "judgement/judge.py",
-        "seen = replace(seen, shares=seen.shares * used[:, None])",
-        "seen = replace(seen, weights=seen.weights * used[:, None])",
+        "stacked = replace(stacked, shares=stacked.shares * is_used[:, None])",
+        "stacked = replace(stacked, weights=stacked.weights * is_used[:, None])",
         "leaving a sensor out makes a pose better",
         ("test_tracking_starts.py",),
     ),
