@@ -22,7 +22,7 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "ratio = residual_ratio(own, known, model.by_chance, rules)",
+        "ratio = residual_ratio(in_frame, known, model.by_chance, rules)",
         "ratio = 0.0",
         "a frame of large residuals is as sure as those before it",
     ),
@@ -43,8 +43,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "_level(found, before, count, model, estimate)",
-        "_level(found, before, 0, model, None)",
+        "_level(matches, before, count, model, estimate)",
+        "_level(matches, before, 0, model, None)",
         "noise seems smaller than it is",
     ),
     Mutant(
@@ -71,7 +71,7 @@ _NOISE = (
     Mutant(
         "judgement-choosing-a-pose-costs-nothing",
         "judgement/shape.py",
-        "spent=min(before.spent, one.spent),",
+        "spent=min(before.spent, shape.spent),",
         "spent=0.0,",
         "any thing of four markers is the body",
     ),
@@ -81,36 +81,36 @@ _FIELDS = (
     Mutant(
         "judgement-pairs-of-markers-forgotten",
         "judgement/fields.py",
-        "max(float(pairs - np.vdot(both, both)), 0.0)",
+        "max(float(pairs - np.vdot(shared, shared)), 0.0)",
         "0.0",
         "markers that are off seem to be seen more surely than they are",
     ),
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "variances[0] * at.inverse + (drawn * (kinds @ variances)) @ drawn.T",
-        "variances[0] * at.inverse",
+        "variances[0] * fields.inverse + (shifts * (kinds @ variances)) @ shifts.T",
+        "variances[0] * fields.inverse",
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
         "judgement-what-lasts-is-forgotten",
         "judgement/noise.py",
-        "if names in before and before[names].shape == shown.shape:",
+        "if names in before and before[names].shape == sums.shape:",
         "if False:",
         "what is off by the same in every frame never shows",
     ),
     Mutant(
         "judgement-calibrations-are-exact",
         "judgement/noise.py",
-        "covariance[inner] += pulled @ pulled.T",
+        "covariance[inner] += shifted @ shifted.T",
         "covariance[inner] += 0",
         "a stated error of the focal length leaves the distance as sure as before",
     ),
     Mutant(
         "judgement-markers-off-are-noise",
         "judgement/noise.py",
-        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:]",
-        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:] * [1, 1, 0]",
+        "fields.pulls(unbiased, matches) ** 2 @ fields.kinds[:, 1:]",
+        "fields.pulls(unbiased, matches) ** 2 @ fields.kinds[:, 1:] * [1, 1, 0]",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
@@ -124,8 +124,8 @@ _FIELDS = (
     Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
         "judgement/fields.py",
-        "left = fields - J @ (drawn :=",
-        "left = fields - 0 * J @ (drawn :=",
+        "remaining = fields - J @ (shifts :=",
+        "remaining = fields - 0 * J @ (shifts :=",
         "offsets that a pose takes for its own are thought to be small",
     ),
     Mutant(
