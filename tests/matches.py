@@ -79,7 +79,7 @@ def matches_of(*sensors: Seen) -> Matches:
         crowd=of_each("crowd") * sigmas**dimensions,
         others=of_each("crowd") ** 1.5 * sigmas**3,
         unmatched_nearby=of_each("unmatched_nearby"),
-        beside=np.full(arrays["weights"].shape, np.nan),
+        neighbour_distance=np.full(arrays["weights"].shape, np.nan),
         finest=of_each("finest"),
         extra=np.zeros(arrays["weights"].shape),
         radii=np.zeros(arrays["weights"].shape),

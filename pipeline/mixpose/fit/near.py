@@ -327,7 +327,9 @@ def _are_noise(
     of the noise.
     """
     far = np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)) > 0
-    beside = matches.beside * matches.beside  # NaN of features that are not in view
+    beside = (
+        matches.neighbour_distance * matches.neighbour_distance
+    )  # NaN of features that are not in view
     pulls = beside * np.exp(beside / (-2 * blurs * blurs)[:, None])
     together = np.nansum(pulls, axis=1) + _pulls_of_missed(matches, blurs)
     others = bool((together >= rules.moved**2 * variances).any())

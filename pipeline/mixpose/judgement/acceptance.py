@@ -343,7 +343,7 @@ def others_miss(
     variance = _variance(before, model, model.errors.typical)
     v = min(variance, model.usual**2) + used.extra
     odds = np.log(model.errors.met**2 / (2 * v)) - used.squared / (2 * v)
-    odds = used.summed(np.vecdot(used.shares, odds) * used.each_part)
+    odds = used.summed(np.vecdot(used.shares, odds) * used.coordinate_weight)
     return bool((odds[sees] < -rules.log_doubt).any())
 
 

@@ -187,7 +187,7 @@ def _in_space(
     """
     *K, L, N = near.shape
     J, r = matches.J[..., :3] / roots[..., None, None], matches.offsets / roots[..., None]
-    roots_of_parts = np.sqrt(matches.each_part)[:, None]
+    roots_of_parts = np.sqrt(matches.coordinate_weight)[:, None]
     r, weighed = r * roots_of_parts[..., None], near * roots_of_parts
     rows = (J * weighed[..., None, None]).swapaxes(-4, -3).reshape(*K, N, 2 * L, 3).swapaxes(-2, -1)
     A = rows @ rows.swapaxes(-2, -1)

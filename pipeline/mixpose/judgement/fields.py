@@ -122,7 +122,9 @@ def _fields_of_markers(matches: Matches, by_place: Floats) -> Floats:
     `by_place` are weighted Jacobians (R, 3); rows of other markers, which are zero, are left out.
     """
     # in units of the root mean square by which features in view move with the body
-    counts = 3 * (matches.weights > 0).sum(axis=1) @ (matches.dimensions * matches.each_part)
+    counts = (
+        3 * (matches.weights > 0).sum(axis=1) @ (matches.dimensions * matches.coordinate_weight)
+    )
     moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
     return rows_by_marker(by_place, matches) / max(moved, 1e-6)
 

@@ -148,7 +148,7 @@ def noise_of(
     wide = scale[:, None] + matches.extra
     # what errs by more than noise counts less
     is_off, noise = model.errors.are_off(matches, wide), np.sqrt(scale)
-    counted = matches.shares * matches.each_part[:, None] * scale[:, None] / wide
+    counted = matches.shares * matches.coordinate_weight[:, None] * scale[:, None] / wide
     met = (shares := np.where(is_off, 0.0, counted)).sum(axis=1)
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     fields = fields_at(matches, shares, roots, chosen, anywhere)

@@ -80,7 +80,7 @@ def shape_shown(
     """Add the features that a pose meets to the information of the frames `before`, if any."""
     # weighted so that all sensors have the noise of the best
     noise, N = float(variances.min()), met.shares.shape[1]
-    weights = met.shares * met.each_part[:, None] * noise / (variances[:, None] + met.extra)
+    weights = met.shares * met.coordinate_weight[:, None] * noise / (variances[:, None] + met.extra)
     roots = np.sqrt(weights).T[..., None]
     by_world = (roots[..., None] * met.J[..., :3].swapaxes(0, 1)).reshape(N, -1, 3)
     r = (roots * met.offsets.swapaxes(0, 1)).reshape(N, -1, 1)

@@ -179,7 +179,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         crowd=crowd,
         others=others,
         unmatched_nearby=nothing,
-        beside=np.full(seen.shape, np.nan),
+        neighbour_distance=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),
         radii=np.zeros(seen.shape),
         finest=nothing + 1.0,

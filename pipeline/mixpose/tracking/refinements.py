@@ -171,7 +171,7 @@ def _with_near(frame: Frame, seen: Matches) -> Matches:
     many coordinates as are twice those free is off twice as far.
     """
     reach = 2 * math.sqrt(2 * frame.rules.judgement.association.reach_squared)  # in σ_ε
-    lost = (seen.weights > 0) & (seen.shares == 0) & (seen.beside < reach)
+    lost = (seen.weights > 0) & (seen.shares == 0) & (seen.neighbour_distance < reach)
     if not np.count_nonzero(lost):
         return seen
     shares, offsets = seen.shares.copy(), seen.offsets.copy()
