@@ -237,7 +237,7 @@ def fit_together(
     is_near = here.value >= rules.near * np.array([len(one.views) for one in objectives])
     return [
         (objective, ends.of(slice(k, k + 1))) if is_near[k] else None
-        for k, objective in enumerate(joint.seen(objectives, ends.states))
+        for k, objective in enumerate(joint.split(objectives, ends.states))
     ]
 
 
