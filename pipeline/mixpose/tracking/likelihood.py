@@ -63,7 +63,7 @@ class MatchedLikelihood:
                 least=start.least,
                 noise=seen.noise,
                 fields=seen.track.residuals.fields,
-                beside=max(beside, spread),
+                extra_sigma=max(beside, spread),
                 wide=wide,
                 errors=model.noise.errors,
                 association=model.association,
