@@ -153,8 +153,7 @@ class Atlas:
         return pairs["i"][order], pairs["j"][order]
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """Draw tiles (rows, side, columns, 3 side) around places (P, 2) in cells, by pairs of
-        `_near`.
+        """Draw tiles (rows, side, columns, 3 side) around places (P, 2), by pairs of `_near`.
 
         Those of a column are drawn at once; it is short: places are rounded to 6e-5 cells.
         """

@@ -34,17 +34,13 @@ class AcceptanceRules:
         2e-4, "of sessions, by each mistake: a body mirrored or of another size, a sensor elsewhere"
     )
     widest_turn_deg: float = constant(
-        15.0, "95 % bound on a turn that is known; two poses on one peak are turned by less"
+        15.0, "95 % bound on a turn that is known, and on that between two poses of one peak"
     )
-    convincing: float = constant(
-        0.75, "share of the body met that needs no search: slips meet less"
-    )
+    convincing: float = constant(0.75, "share of the body to need no search: a slip meets less")
     agreeing: float = constant(0.5, "share of the body that a sensor that agrees must meet")
     disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
     changed: float = constant(10.0, "times the residuals that chance makes: frames have up to 7")
-    open: float = constant(
-        300.0, "sum of variances over that if all in view were met by whole spots"
-    )
+    open: float = constant(300.0, "sum of variances over that if all in view were met and whole")
 
     @property
     def log_doubt(self) -> float:
@@ -67,9 +63,9 @@ class Second(NamedTuple):
     """A second pose of a frame that looks like the body."""
 
     pose: ScoredPose | None  # None where there is no second one
-    there: float  # log odds that something is there
-    either: float  # log odds that this is the body, and not the best pose
-    told: bool = False  # whether one of them is known to be a mirror image or another thing
+    log_odds: float  # that it is there
+    odds_over_best: float  # log odds that it is the body, and not the best pose
+    is_explained: bool = False  # whether one of them is seen to be a mirror image or another thing
 
 
 @dataclass(frozen=True)
@@ -300,7 +296,7 @@ def _are_one(
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 
-def met_by_one(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
+def unconfirming_sensors(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
     """Return the other sensors with the body in view, if a single sensor meets most of it.
 
     The list is empty if several sensors do, or none.
@@ -315,7 +311,7 @@ def met_by_one(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
     return others if len(meeting) == 1 else []
 
 
-def others_miss(
+def is_seen_elsewhere(
     judged: ScoredPose, before: Floats, agreed: bool, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
     """Test whether a single sensor meets most of the body while another sees as much elsewhere.
@@ -347,7 +343,7 @@ def others_miss(
     return bool((odds[sees] < -rules.log_doubt).any())
 
 
-def two_agree(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> bool:
+def has_two_agreeing(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Test whether two sensors meet most of the body at a pose, no farther off than chance.
 
     A sensor that is off by more than the noise of the most exact one sees the body elsewhere.

@@ -44,10 +44,8 @@ def information_of(matches: Matches, variances: Floats, spreads: Floats | None =
     With `spreads`, covariances (..., N, 3, 3) of features in the world, it is smaller.
     """
     *poses, sensors, n, m, _ = matches.J.shape
-    weights = (
-        matches.shares * matches.coordinate_weight[:, None] / (variances[..., None] + matches.extra)
-    )
-    rows = np.sqrt(weights)[..., None, None] * matches.J
+    weights = matches.shares * matches.coordinate_weight[:, None]
+    rows = np.sqrt(weights / (variances[..., None] + matches.extra))[..., None, None] * matches.J
     if spreads is None:
         rows = rows.reshape(*poses, sensors * n * m, 6)
         return np.asarray(rows.swapaxes(-2, -1) @ rows)

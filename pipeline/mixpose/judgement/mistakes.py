@@ -52,7 +52,7 @@ class Mistake(NamedTuple):
     log_harm: float  # log probability that it puts this pose outside its ellipsoid
 
 
-def odds_of_each(mistakes: Sequence[Mistake], likely: Sequence[float]) -> list[float]:
+def odds_of_mistakes(mistakes: Sequence[Mistake], likely: Sequence[float]) -> list[float]:
     """Return the log odds of each mistake against the pose; a session has at most one of a kind.
 
     `likely` has their prior probabilities.  A mistake that leaves the pose in place supports it.

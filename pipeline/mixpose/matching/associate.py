@@ -33,9 +33,7 @@ class AssociationRules:
     min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
     crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
     merged: bool = constant(True, "whether two features may share a detection: blobs that touch")
-    middle: float = constant(
-        0.2, "σ_ε: error of a spot of two, one of which may outshine the other"
-    )
+    middle: float = constant(0.2, "σ_ε: of a spot of two features, one of which may be brighter")
     alike: float = constant(
         0.01,
         "of a feature's energy: features within a seventh of C's deviation are not resolved",
@@ -178,8 +176,8 @@ def _to_nearest(
 ) -> Floats:
     """Match features with the nearest detections, each taken once or by a pair of features.
 
-    The result is written to `met`.  Images of one of the `clouds` are matched together, by
-    distances in space.  Returns squared distances (L, n) to the nearest other detections.
+    Writes to `met`, and returns squared distances (L, n) to the nearest other detections.  Images
+    of one of the `clouds` are matched together, by distances in space.
     """
     shares, offsets, by, _ = met
     which, squared = _neighbours(y, detections, reach, clouds)

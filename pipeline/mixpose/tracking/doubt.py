@@ -26,14 +26,14 @@ from mixpose.judgement import (
     Shape,
     Verdict,
     decide,
+    has_two_agreeing,
     is_far_off,
     is_open,
+    is_seen_elsewhere,
     is_sure,
-    odds_of_each,
-    others_miss,
+    odds_of_mistakes,
     possible_mistakes,
     shape_shown,
-    two_agree,
 )
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
@@ -143,7 +143,7 @@ def _alternatives(
     # of a scene with mirrors nobody knows which side a frame shows
     of_image = 0.5 if data.options.mirrors else rules.mistaken
     likely = [of_image if one.name == MIRRORED else rules.mistaken for one in mistakes]
-    yield from map(Alternative, (one.what for one in mistakes), odds_of_each(mistakes, likely))
+    yield from map(Alternative, (one.what for one in mistakes), odds_of_mistakes(mistakes, likely))
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
     if is_open(best, data.free, rules, noise):
@@ -215,9 +215,9 @@ def _of_contradiction(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, known = data.track, (data.rules.acceptance, data.rules.judgement.noise)
     before = track.mistaken.get(CONTRADICTION, 0.0)
-    if others_miss(judged, _noise_before(data, judged), track.agreed, *known):
+    if is_seen_elsewhere(judged, _noise_before(data, judged), track.agreed, *known):
         before = _as_likely_as_not(data)
-    elif before and two_agree(judged, *known):
+    elif before and has_two_agreeing(judged, *known):
         before = 0.0
     return Mistake(CONTRADICTION, APART, before, 0.0 if before else -math.inf)
 

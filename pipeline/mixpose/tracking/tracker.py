@@ -360,7 +360,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
-        twice=track.twice if verdict.second is None else verdict.second.there,
+        twice=track.twice if verdict.second is None else verdict.second.log_odds,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 
@@ -391,9 +391,9 @@ def _branches(
         T, second = one.T_world_object, verdict.second
         other = data.other_at(T)
         if second and one is second.pose:
-            other = -second.either
-        elif second and second.told and one is best:
-            other = second.either
+            other = -second.odds_over_best
+        elif second and second.is_explained and one is best:
+            other = second.odds_over_best
         branch = Branch(T, belief, spread=spread, deviation=momentary, other=other)
         is_new = one.proposer == SECOND_POSE
         alike = None if is_new else [each.T_body_other for each in congruent(data, one)]

@@ -21,7 +21,7 @@ from mixpose.judgement import (
     Second,
     Verdict,
     is_sure,
-    met_by_one,
+    unconfirming_sensors,
 )
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
@@ -232,7 +232,7 @@ def _may_be_elsewhere(data: Frame, best: ScoredPose, rest: SeenTogether) -> list
     """Sensors that see nothing of a pose which one alone meets, and may see the body elsewhere."""
     if (best.matches.dimensions != 2).any():
         return []
-    names = met_by_one(best, data.rules.acceptance)
+    names = unconfirming_sensors(best, data.rules.acceptance)
     views = [one for one in rest.views if one.name in names and _may_fix(one, data)]
     return views if _is_in_turn(data, views) else []
 
