@@ -77,7 +77,7 @@ def matches_of(*sensors: Seen) -> Matches:
         merged=np.zeros(len(sensors), dtype=np.intp),
         count=np.array([n if one.count is None else one.count for one, n in counts]),
         crowd=of_each("crowd") * sigmas**dimensions,
-        others=of_each("crowd") ** 1.5 * sigmas**3,
+        space_crowd=of_each("crowd") ** 1.5 * sigmas**3,
         unmatched_nearby=of_each("unmatched_nearby"),
         neighbour_distance=np.full(arrays["weights"].shape, np.nan),
         finest=of_each("finest"),

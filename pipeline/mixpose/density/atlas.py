@@ -226,7 +226,7 @@ class Atlas:
 class _Scale(NamedTuple):
     """Units of cells in L sensors, and of densities in the array."""
 
-    per_unit: Floats  # (L, 1, 1, 2) as `Atlas` has it
+    per_unit: Floats  # (L, 1, 1, 2) as `Atlas.per_unit`
     widths: list[float]  # drawn deviations, in sensor units; look-ups add the remaining blur
     sigma: float  # the same in cells
     reach: float  # cells around a detection within which it is drawn
@@ -339,7 +339,7 @@ def _middles_of(numbers: Indices, columns: int, side: int) -> Floats:
 
 @lru_cache(maxsize=64)
 def _middles_of_drawn(count: int, side: int) -> Floats:
-    """Return the same of tiles that are drawn column by column."""
+    """Return the middles of tiles that are drawn column by column."""
     columns, place = max(-(-count // _TOGETHER), 1), np.arange(count)
     return _middles_of(place % _TOGETHER * columns + place // _TOGETHER, columns, side)
 

@@ -33,11 +33,11 @@ class DrawingRules:
     rim: int = constant(3, "cells along a tile that splines reach beside it: one before, two after")
     reach: float = constant(
         4.25,
-        "from a detection to where it is drawn: what is farther draws it by less than 1e-3 σ_ε",
+        "from a detection to the end of its drawing: beyond it pulls by less than 1e-3 σ_ε",
     )
     paper_reach: float = constant(4.0, "from predicted samples to the end of their window")
     exact: float = constant(
-        0.14, "of a blur: what detections that may err by more are as high beside others as"
+        0.14, "of a blur: the error of a detection of half height; exact ones have full height"
     )
     cut: float = constant(5.0, "at which sums end: the tail holds 6e-7")
     negligible: float = constant(16.0, "exponent at which two features do not overlap: 1e-7")
@@ -67,7 +67,7 @@ class DrawingRules:
 
     @property
     def far(self) -> float:
-        """Outside any array, and `cv2.remap` can tell 32 parts of it as integers."""
+        """Index outside any array, small enough for `cv2.remap` to count 32nd parts as integers."""
         return -32.0 * self.side
 
 

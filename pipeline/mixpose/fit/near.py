@@ -95,11 +95,11 @@ class Fit:
         """Return the fit that ends an ascent through blurs of the views."""
         return cls(ascent.states[0], blurs_by_view(views, levels), **fields)
 
-    def begins_at(self, other: Ascent, tolerance: float) -> bool:
+    def is_begun_by(self, other: Ascent, tolerance: float) -> bool:
         """Test whether another ascent ended where this fit's first did, and leads to the same."""
         assert self.first is not None
         away = twist_between(self.first.states[0], other.states[0])
-        # two ascents to one maximum differ by what both leave to be gained: 0.003 σ_ε
+        # two ascents to the same maximum differ by the gains that they left: 0.003 σ_ε
         same = 10 * tolerance * abs(float(other.values[0]))
         return float(away @ other.last.curvature[0] @ away) < same
 
@@ -211,7 +211,7 @@ def fit_near(
     ascent = ascent or descended(first, rules.sharp)
     fits = climbed if climbed is not None and blur == 1 else []
     for fit in fits:
-        if fit.begins_at(ascent, rules.sharp.tolerance):
+        if fit.is_begun_by(ascent, rules.sharp.tolerance):
             return fit
     if wide > 1:
         matches = associate(first, ascent.states[0], association, errors.narrowest)

@@ -1,4 +1,4 @@
-"""Judgement: which features a pose meets, what that is worth, and whether it is believed."""
+"""Judgement: noise, covariance and evidence of a pose, and the decision about a frame."""
 
 from mixpose.judgement.acceptance import (
     LEAST_BELIEF as LEAST_BELIEF,

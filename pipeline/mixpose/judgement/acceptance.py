@@ -143,7 +143,7 @@ def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 
 
 def ahead(pose: ScoredPose, other: ScoredPose) -> float:
-    """Return the log odds of one pose of a body against another."""
+    """Return the log odds of a pose of a body against another."""
     return pose.log_density - other.log_density
 
 

@@ -41,7 +41,7 @@ class DetectionModel:
     probability: float = constant(0.75, "P_D of a feature in view: one or two of eight are hidden")
     log_unseen: float = constant(-1.2, "per feature that faces a sensor out of its view: ln 0.3")
     log_blind: float = constant(
-        -5.0, "at least, for a sensor that misses all: 1 in 150 does, or shows what is new"
+        -5.0, "at least, for a sensor that misses all: 1 in 150 does, or shows something new"
     )
     by_count: bool = constant(True, "whether features that fix a pose may pay for its freedom")
     in_space: bool = constant(True, "whether clutter may be a point in space, and counts once")
@@ -196,7 +196,7 @@ def _in_space(
     shares = (near * matches.shares).max(axis=-2)
     # clutter is as dense in space as the camera with the least of it shows
     by_u, by_v = J[..., 0, :], J[..., 1, :]
-    crowd = matches.others[..., None] * roots**3
+    crowd = matches.space_crowd[..., None] * roots**3
     areas = np.vecdot(by_u, by_u) * np.vecdot(by_v, by_v) - np.vecdot(by_u, by_v) ** 2
     squared = (crowd**2 * areas**1.5).min(axis=-2, initial=1e300, where=near)
     if spreads is not None:  # the covariance of the place grows by that of the feature

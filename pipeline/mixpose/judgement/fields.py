@@ -1,8 +1,8 @@
 """Fields, patterns of error that residuals have in common, and how much of them a pose absorbs.
 
-A sensor has an offset (kind 1), and what turns, scales and shears its features (kind 2); a marker
-has an error of its place, alike in all sensors (kind 3).  With weights W, A = JᵀWJ and fields P, a
-field of unit size moves the pose by A⁻¹JᵀWP and leaves (1 − J A⁻¹JᵀW) P in its residuals.
+A sensor has an offset (kind 1), and fields that turn, scale and shear its features (kind 2); for a
+marker it is an error of its place, alike in all sensors (kind 3).  With weights W, A = JᵀWJ and
+fields P, one of unit size moves the pose by A⁻¹JᵀWP and leaves (1 − J A⁻¹JᵀW) P in its residuals.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ class Fields(NamedTuple):
 
 def fields_at(
     matches: Matches,
-    shares: Floats,  # (L, N) how much each feature counts
+    shares: Floats,  # (L, N) weights of features
     roots: Floats,  # (2 L N) of the weights of residuals
     chosen: Indices,  # (k,) directions that are free
-    anywhere: Floats,  # (6,) how uncertain the pose is where nothing is known
+    anywhere: Floats,  # (6,) standard deviations of an unknown pose
 ) -> Fields:
     """Compute the weighted residuals of the features met, and their fields."""
     r, rows = roots * matches.offsets.ravel(), roots[:, None] * matches.J.reshape(-1, 6)
@@ -122,9 +122,8 @@ def _fields_of_markers(matches: Matches, by_place: Floats) -> Floats:
     `by_place` are weighted Jacobians (R, 3); rows of other markers, which are zero, are left out.
     """
     # in units of the root mean square by which features in view move with the body
-    counts = (
-        3 * (matches.weights > 0).sum(axis=1) @ (matches.dimensions * matches.coordinate_weight)
-    )
+    in_view, weights = (matches.weights > 0).sum(axis=1), matches.coordinate_weight
+    counts = 3 * in_view @ (matches.dimensions * weights)
     moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
     return rows_by_marker(by_place, matches) / max(moved, 1e-6)
 

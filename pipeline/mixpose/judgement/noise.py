@@ -1,8 +1,8 @@
 """Detection noise, estimated from residuals, and the covariance of a pose that follows.
 
-Errors are independent from feature to feature (variance s_0²), fields that all features of a sensor
-have in common: offsets (s_1²), and what turns, scales and shears (s_2²), or of a marker, alike in
-all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, fields P_k and K_jk = P_jᵀWR P_k,
+Errors are independent for each feature (variance s_0²), or fields: of a sensor, offsets (s_1²) and
+fields that turn, scale and shear all of its features (s_2²); of a marker, alike in all sensors
+(s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, fields P_k and K_jk = P_jᵀWR P_k,
 
     rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
@@ -132,9 +132,9 @@ def noise_of(
     free: Mask,
     before: RememberedNoise,
     model: NoiseModel,
-    estimate: NoiseEstimate | None = None,  # from the fit, if it has one
+    estimate: NoiseEstimate | None = None,  # of the fit, if known
     known: Floats = np.full(6, np.inf),  # standard deviations of the pose before the frame
-    anywhere: Floats = np.full(6, np.inf),  # and of a pose of which nothing is known
+    anywhere: Floats = np.full(6, np.inf),  # and of an unknown pose
 ) -> tuple[Floats, Floats, Floats, RememberedNoise, float, float]:
     """Estimate the noise of a frame at one pose from its residuals and from those before it.
 
@@ -146,7 +146,7 @@ def noise_of(
     count, inner = len(chosen), (chosen[:, None], chosen)
     variances, rarity, scale, sums, degrees, ratio = _level(matches, before, count, model, estimate)
     wide = scale[:, None] + matches.extra
-    # what errs by more than noise counts less
+    # detections of extra variance count less
     is_off, noise = model.errors.are_off(matches, wide), np.sqrt(scale)
     counted = matches.shares * matches.coordinate_weight[:, None] * scale[:, None] / wide
     met = (shares := np.where(is_off, 0.0, counted)).sum(axis=1)

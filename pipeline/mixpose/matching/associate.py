@@ -52,7 +52,7 @@ class AssociationRules:
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
+    """Match features predicted at a pose (4, 4) with observations; `narrowest` blur in σ_ε."""
     match, views = objective.match(T_world_object[None]), objective.views
     sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
@@ -331,12 +331,12 @@ def _surroundings(
     smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     met = shares.sum(axis=1)
-    crowd, others = crowding(detections, lower, around, smallest, met)
+    crowd, space_crowd = crowding(detections, lower, around, smallest, met)
     for planes in clouds_among(objective.projection.sensors):
         points, low, high = (from_planes(array[planes]) for array in (detections, lower, around))
         least = rules.min_region * float(sigmas[planes[0]])
-        others[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]
-    crowd, others = crowd * sigmas**2, others * sigmas**3
+        space_crowd[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]
+    crowd, space_crowd = crowd * sigmas**2, space_crowd * sigmas**3
     count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
@@ -353,13 +353,13 @@ def _surroundings(
             near, far = (corner / observation.sigma for corner in observation.extent)
             count[k] = objective.tops[k, 0] / objective.energies[k, 0]
             crowd[k] = count[k] / np.maximum(far - near, rules.min_region).prod()
-            others[k] = crowd[k] / np.sqrt(np.maximum(far - near, rules.min_region).prod())
+            space_crowd[k] = crowd[k] / np.sqrt(np.maximum(far - near, rules.min_region).prod())
             finest[k] = 1.0
     finest = np.fmin(np.maximum(narrowest, finest), 1.0)
     return {
         "count": count,
         "crowd": crowd,
-        "others": others,
+        "space_crowd": space_crowd,
         "unmatched_nearby": unmatched,
         "finest": finest,
     }

@@ -45,7 +45,7 @@ class Matches:
     merged: Indices  # (..., L) pairs of features that share a detection
     count: Floats  # (..., L) number of detections
     crowd: Floats  # (..., L) their density around the prediction, per m-th power of σ_ε
-    others: Floats  # (..., L) density of points in space by unmatched detections, per σ_ε³
+    space_crowd: Floats  # (..., L) density of points in space by unmatched detections, per σ_ε³
     unmatched_nearby: Floats  # (..., L) unmatched detections near a body with missed features
     neighbour_distance: Floats  # (..., L, N) to the nearest other detection, σ_ε; NaN for none
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
@@ -198,11 +198,11 @@ class ErrorRules:
         "none of it 20 % where a body is off",
     )
     cuts: tuple[float, float, float] = constant(
-        (0.1, 0.3, 1.0), "σ_ε that a detection may be off by beyond what it shows"
+        (0.1, 0.3, 1.0), "σ_ε by which a detection may be off although it looks whole"
     )
     chances: tuple[float, float, float] = constant(
         (0.01, 0.0, 0.003),
-        "of each: of 13,400 spots before a hand 1.0, 0.5, 0.1 % are 0.14, 0.22, 2.8 px off",
+        "of these: of 13,400 spots before a hand 1.0, 0.5, 0.1 % are 0.14, 0.22, 2.8 px off",
     )
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 

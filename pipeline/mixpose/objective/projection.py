@@ -71,7 +71,7 @@ class Match(NamedTuple):
 class BodyProjection:
     """Projection of a body into sensors; `project_body` caches them.
 
-    Or of K bodies that `can_be_together`, at a pose of each (K, 4, 4): bodies with fewer features
+    Or of K bodies that `has_bare_points`, at a pose of each (K, 4, 4): bodies with fewer features
     than others are filled up with their first one, without weight.
     """
 
@@ -158,7 +158,7 @@ def project_body(sensors: tuple[Sensor, ...], *bodies: Body) -> BodyProjection:
     return BodyProjection(sensors, bodies)
 
 
-def can_be_together(body: Body) -> bool:
+def has_bare_points(body: Body) -> bool:
     """Test whether a body has bare points only: no normals, and no size of markers."""
     return body.normals is None and (body.node_radii is None or not body.node_radii.any())
 

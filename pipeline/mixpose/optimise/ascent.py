@@ -59,13 +59,13 @@ class Sum:
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """When to stop and how to damp; a step that meets one of the ends is the last."""
+    """Damping and ends of an ascent; a step that meets one of the ends is the last."""
 
     iterations: int = 30  # most evaluations of a state's model
     tolerance: float = 1e-12  # end: the step is expected to gain less than this share of the value
     damping: float = 1e-4  # first Levenberg-Marquardt damping, as a share of the diagonal
     # relative error of values, as from interpolation, which does not move the zero of the gradient:
-    # a step that gains less is good if the next one is expected to gain less than it
+    # a step that gains less than this is good if the next is expected to gain even less
     value_error: float = 0.0
     # end: less than this share of the value remains to be gained after the step, as gains shrink by
     # about the same factor from step to step

@@ -177,7 +177,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
         crowd=crowd,
-        others=others,
+        space_crowd=others,
         unmatched_nearby=nothing,
         neighbour_distance=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),

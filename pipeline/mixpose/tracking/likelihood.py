@@ -93,7 +93,7 @@ class MatchedLikelihood:
         """
         frame, _ = _as_moving(self.frame, fit)
         T = frame.oriented(fit.T_world_object)
-        seen = replace(matches_at(frame, T), crowd=beside.crowd, others=beside.others)
+        seen = replace(matches_at(frame, T), crowd=beside.crowd, space_crowd=beside.space_crowd)
         track = frame.track
         case = Case(frame.finest, T, track.residuals, track.rates, frame.prior(T), seen)
         (judged,) = judge_together([case], frame.free, frame.rules.judgement, start.left_out)
