@@ -33,7 +33,7 @@ class DrawingRules:
     rim: int = constant(3, "cells along a tile that splines reach beside it: one before, two after")
     reach: float = constant(
         4.25,
-        "from a detection to the end of its drawing: beyond it pulls by less than 1e-3 σ_ε",
+        "from a detection to the end of its drawing: farther ones pull by less than 1e-3 σ_ε",
     )
     paper_reach: float = constant(4.0, "from predicted samples to the end of their window")
     exact: float = constant(

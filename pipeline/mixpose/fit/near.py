@@ -285,7 +285,7 @@ def _to_the_noise(
         end = np.minimum(np.minimum(narrow, before), blurs)
         is_noise, is_pulled = _are_noise(matches, variances, blurs, errors, rules)
         ratios, counted = weighed / counted, weighed
-        # weights are those of the noise; at first features of a grid have equal heights
+        # weights have to be those of the noise; at first features of a grid have equal heights
         is_rough = best is None and bool(finest.are_grids.any())
         are_right = not is_rough and bool(ratios.min() > rules.narrower**2 * ratios.max())
         is_end = is_noise or bool((end > rules.narrower * blurs).all())
@@ -303,7 +303,7 @@ def _to_the_noise(
             likeliest, best = likelihood, fit
         if is_end:
             return best
-        if likeliest < least:  # the likelihood that it may reach
+        if likeliest < least:  # end if narrower blurs cannot reach `least` either
             *_, offsets = ahead or _moved(matches, free, end, variances)
             shifted = replace(matches, offsets=offsets)
             narrow = errors_seen(shifted, count, known, errors)[2]

@@ -44,7 +44,7 @@ class Shape(NamedTuple):
     reach: float  # σ_ε² at the body in the last frame, length²
     side: Floats  # (3, 3), rotation from body to world at the last view from another side
     alone: float  # log odds of the last frame by itself
-    spent: float = 0.0  # log odds lost by choosing the pose, in the frame with most, negative
+    spent: float = 0.0  # minus the log odds that choosing the pose cost, in the costliest frame
 
     def log_odds(self, radius: float, model: NoiseModel) -> float:
         """Return the larger log odds of the body: by the last frame alone, or by all frames."""

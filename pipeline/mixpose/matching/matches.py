@@ -27,8 +27,8 @@ from mixpose.records import Floats, Indices, Mask
 class Matches:
     """Matches of N features (nodes) of a body in L sensors, at one pose, or at K by a leading axis.
 
-    Features out of view have no weight, features that are not met no share.  A sensor of one
-    coordinate has 0 as its second.
+    Features out of view have no weight and no Jacobian, features not met no share and no offset.
+    A sensor of one coordinate has 0 as its second.
     """
 
     names: tuple[str, ...]  # of the sensors
