@@ -12,7 +12,7 @@ import pytest
 from matches import Seen, scored
 
 from mixpose.cli.findings import Stretches
-from mixpose.judgement import AcceptanceRules, NoiseModel, others_miss
+from mixpose.judgement import AcceptanceRules, NoiseModel, is_seen_elsewhere
 from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -171,7 +171,7 @@ def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> 
 
 
 def is_missed(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
-    return others_miss(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
+    return is_seen_elsewhere(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
 
 
 @pytest.fixture

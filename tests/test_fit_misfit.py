@@ -71,7 +71,7 @@ def deformed(size: float, seed: int = 3) -> list[Floats]:
 
 def test_a_body_that_fits_leaves_nothing_also_where_its_features_overlap() -> None:
     near = np.array([[100.0, 100.0], [105.0, 100.0], [150.0, 150.0]])
-    rest, heights = seen(BEAMS[0], near).left(near)
+    rest, heights = seen(BEAMS[0], near).residuals(near)
     np.testing.assert_allclose(rest / heights.mean(), 0.0, atol=1e-7)
     # of three equal features each has a third of the height
     np.testing.assert_allclose(heights, peak(VARIANCE, 2) / 3, rtol=1e-6)
@@ -80,7 +80,7 @@ def test_a_body_that_fits_leaves_nothing_also_where_its_features_overlap() -> No
 def test_features_that_overlap_have_heights_of_their_own() -> None:
     # twice as much at the first place as at the second: three equal features, two in one
     near = np.array([[100.0, 100.0], [105.0, 100.0]])
-    rest, heights = seen(BEAMS[0], near[[0, 0, 1]]).left(near)
+    rest, heights = seen(BEAMS[0], near[[0, 0, 1]]).residuals(near)
     np.testing.assert_allclose(rest / heights.mean(), 0.0, atol=1e-7)
     assert heights[0] / heights[1] == pytest.approx(2.0, rel=1e-6)
 
@@ -89,7 +89,7 @@ def test_gradients_that_are_left_are_in_units_of_the_height() -> None:
     # one of two is 0.3 widths off: r exp(-r²/2) is left of its gradient
     places = np.array([[50.0, 50.0], [150.0, 150.0]])
     off = places + np.array([[0.3 * np.sqrt(VARIANCE), 0.0], [0.0, 0.0]])
-    rest, heights = seen(BEAMS[0], off).left(places)
+    rest, heights = seen(BEAMS[0], off).residuals(places)
     assert rest[0, 0] / heights[1] == pytest.approx(0.3 * np.exp(-0.045), rel=1e-6)
     assert rest[1, 0] / heights[1] == pytest.approx(0.0, abs=1e-9)
 
@@ -98,7 +98,7 @@ def test_the_misfit_is_the_squares_left_per_coordinate_that_is_left() -> None:
     found = [seen(one, y, noise=0.01) for one, y in zip(BEAMS, deformed(1.0), strict=True)]
     squares = 0.0
     for one, y in zip(found, projected(), strict=True):
-        rest, heights = one.left(y)
+        rest, heights = one.residuals(y)
         squares += float((rest**2).sum()) / (one.noise() ** 2 + (heights.mean() / 512) ** 2)
     # two gradients at 6 features in 2 sensors, less a pose
     assert misfit(found, POINTS, 6) == pytest.approx(squares / (24 - 6))

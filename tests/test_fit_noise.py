@@ -122,13 +122,13 @@ def test_the_nearest_detection_but_its_own_is_seen_beside_each_feature(
     objective, _ = at_sigma([view_of("0", clean[0].sensor, points), clean[1]], EIGHT)
     found = matched(objective, TRUTH)
     missed = int(np.flatnonzero(found.detections[0] == -1)[0])
-    assert found.beside[0, missed] == pytest.approx(2.5, abs=0.2)
-    others = np.delete(found.beside, missed, axis=1)
+    assert found.neighbour_distance[0, missed] == pytest.approx(2.5, abs=0.2)
+    others = np.delete(found.neighbour_distance, missed, axis=1)
     spots, places = clean[1].observation.points, found.places[1]
     assert spots is not None
     for i, place in enumerate(places):
         away = np.linalg.norm(np.delete(spots, found.detections[1, i], axis=0) - place, axis=1)
-        assert found.beside[1, i] == pytest.approx(away.min() / found.sigmas[1])
+        assert found.neighbour_distance[1, i] == pytest.approx(away.min() / found.sigmas[1])
     assert others.min() > 3.0
 
 
@@ -139,7 +139,7 @@ def test_neighbours_that_pull_send_a_fit_on_to_narrower_blurs(
     body = Body("pairs", tuple(PointFeature(point) for point in pairs))
     views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=2), 0.9)
     objective, _ = at_sigma(views, body)
-    assert np.nanmin(matched(objective, TRUTH).beside) < 3.0
+    assert np.nanmin(matched(objective, TRUTH).neighbour_distance) < 3.0
     spread, samples = np.repeat([2.0, 0.01], 3), body.means[:, None]
     fit = fit_near(views, body, TRUTH, spread, EstimatorOptions(), samples)
     assert len(fit.blurs) > 1

@@ -19,9 +19,9 @@ from mixpose.judgement import (
     beliefs,
     convinces,
     decide,
+    has_two_agreeing,
     insert,
     nearest_alike,
-    two_agree,
 )
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate
 from mixpose.objective import View, matched_objective
@@ -307,4 +307,4 @@ def test_two_sensors_agree_where_both_meet_most_of_the_body_as_closely_as_chance
     shares = np.repeat([1.0, 0.0], [met, 8 - met])
     exact = Seen(J, "0", offsets=0.02), Seen(J, "1", offsets=off, shares=shares)
     pose = replace(scored(TRUTH, *exact), residual_ratio=ratio)
-    assert two_agree(pose, AcceptanceRules(), NoiseModel()) == expected
+    assert has_two_agreeing(pose, AcceptanceRules(), NoiseModel()) == expected

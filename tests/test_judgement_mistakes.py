@@ -19,7 +19,7 @@ from mixpose.judgement import (
     Mistake,
     NoiseModel,
     ScoredPose,
-    odds_of_each,
+    odds_of_mistakes,
     possible_mistakes,
 )
 from mixpose.judgement.mistakes import LENS, SIZE, evidence_of
@@ -154,7 +154,7 @@ def against(pose: ScoredPose) -> float:
     """Log odds that sensors stand otherwise and put the pose elsewhere, one in 5000 sessions."""
     found = possible_mistakes(pose, body(), ALL_FREE, NoiseModel(), SENSORS, {})
     some = [one for one in found if one.what == APART]
-    return float(logsumexp([-np.inf, *odds_of_each(some, [2e-4] * len(some))]))
+    return float(logsumexp([-np.inf, *odds_of_mistakes(some, [2e-4] * len(some))]))
 
 
 def test_sensors_that_see_the_body_at_two_poses_contradict_each_other_and_at_one_do_not() -> None:
@@ -178,13 +178,13 @@ def test_a_sensor_that_stands_otherwise_harms_no_pose_that_the_others_draw() -> 
 
 def test_a_likelier_mistake_that_leaves_the_pose_in_place_tells_against_others() -> None:
     harmful, harmless = Mistake("a", APART, 20.0, 0.0), Mistake("b", APART, 40.0, -np.inf)
-    (alone,) = odds_of_each([harmful], [2e-4])
+    (alone,) = odds_of_mistakes([harmful], [2e-4])
     assert alone == pytest.approx(20 + np.log(2e-4))
-    both = odds_of_each([harmful, harmless], [2e-4, 2e-4])
+    both = odds_of_mistakes([harmful, harmless], [2e-4, 2e-4])
     # e²⁰ against e⁴⁰, whatever sessions are like
     assert both == [pytest.approx(-20.0, abs=1e-6), -np.inf]
     # which says nothing of the size of the body, that puts one pose of a hundred elsewhere
-    of_size = odds_of_each([Mistake("a", SIZE, 40.0, np.log(0.01)), harmless], [2e-4, 2e-4])
+    of_size = odds_of_mistakes([Mistake("a", SIZE, 40.0, np.log(0.01)), harmless], [2e-4, 2e-4])
     assert of_size == [pytest.approx(np.log(0.01 / 0.99)), -np.inf]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtri
 
 from mixpose.judgement import NoiseModel, RememberedNoise, noise
-from mixpose.judgement.fields import Fields, of_each
+from mixpose.judgement.fields import Fields, rows_by_marker
 from mixpose.judgement.noise import noise_of
 from mixpose.matching import ErrorRules
 
@@ -201,14 +201,14 @@ def test_fields_that_no_residual_shows_may_be_large_where_something_lasts(
     size: float, moved: float
 ) -> None:
     fields = np.diag([2000.0] * 4 + [0.0])  # a pose takes the last
-    _, mean, second = noise._lasting({}, ("0",), fields, fields @ ([size] * 4 + [0.0]), MODEL)
+    _, mean, second = noise._biases({}, ("0",), fields, fields @ ([size] * 4 + [0.0]), MODEL)
     # z of 0.8 in four directions where 32 is expected leaves odds of 10^-6, of 80 all
     assert mean[:4] == pytest.approx(size if moved else 0.0, rel=0.01)
     assert second[4, 4] == pytest.approx(moved**2, rel=0.01)
 
 
 def test_before_anything_is_seen_few_calibrations_are_off() -> None:
-    _, mean, second = noise._lasting({}, ("0",), np.zeros((1, 3)), np.zeros(1), MODEL)
+    _, mean, second = noise._biases({}, ("0",), np.zeros((1, 3)), np.zeros(1), MODEL)
     np.testing.assert_allclose(mean, 0.0)
     np.testing.assert_allclose(second, np.eye(3) * MODEL.off * MODEL.bias**2)
 
@@ -271,7 +271,7 @@ def test_sums_over_markers_are_those_over_pairs_of_markers() -> None:
     exact = kinds.T @ gram**2 @ kinds
     exact[0] = exact[:, 0] = gram.diagonal() @ kinds
     left = fields - J @ inverse @ J.T @ fields
-    r, markers, taken = np.zeros(len(J)), of_each(by_place, seen), J.T @ P
+    r, markers, taken = np.zeros(len(J)), rows_by_marker(by_place, seen), J.T @ P
     at = Fields(r, J, fields, markers, kinds, A, inverse, taken, inverse @ taken, left)
     np.testing.assert_allclose(at.expected_squares(seen), exact, rtol=1e-9, atol=1e-9)
 

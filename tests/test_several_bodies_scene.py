@@ -365,9 +365,9 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5 * np.abs(b).max())
     # what they see at other poses is at hand afterwards, as each would see it
     fresh = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
-    for one, other, T in zip(joint.seen(each, np.array(poses)), fresh, poses, strict=True):
-        assert one.at_hand is not None
-        np.testing.assert_array_equal(one.at_hand[0], T)
+    for one, other, T in zip(joint.split(each, np.array(poses)), fresh, poses, strict=True):
+        assert one.known is not None
+        np.testing.assert_array_equal(one.known[0], T)
         at_hand = one.match(T[None])
         seen = other.match(T[None])
         np.testing.assert_allclose(at_hand.y, seen.y)

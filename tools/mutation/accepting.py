@@ -8,15 +8,15 @@ MUTANTS = (
     Mutant(
         "judgement-rivals-never-count",
         "judgement/acceptance.py",
-        "for each in (-best.log_evidence, *rivals)]",
-        "for each in (-best.log_evidence,)]",
+        "for log_odds in (-best.log_evidence, *rivals)]",
+        "for log_odds in (-best.log_evidence,)]",
         "of two poses that fit alike one is called sure",
     ),
     Mutant(
         "judgement-clutter-never-counts",
         "judgement/acceptance.py",
-        "for each in (-best.log_evidence, *rivals)]",
-        "for each in rivals]",
+        "for log_odds in (-best.log_evidence, *rivals)]",
+        "for log_odds in rivals]",
         "a pose that mere clutter explains as well is ok",
     ),
     Mutant(
@@ -29,8 +29,8 @@ MUTANTS = (
     Mutant(
         "judgement-the-likeliest-alternative-alone",
         "judgement/acceptance.py",
-        "float(np.logaddexp.reduce([one.log_odds for one in self.against]))",
-        "float(max([one.log_odds for one in self.against]))",
+        "float(np.logaddexp.reduce([other.log_odds for other in self.against]))",
+        "float(max([other.log_odds for other in self.against]))",
         "many poses of which each is unlikely leave a frame ok",
     ),
     Mutant(
@@ -93,15 +93,15 @@ MUTANTS = (
     Mutant(
         "judgement-one-of-two-poses-is-known-as-if-alone",
         "judgement/acceptance.py",
-        "(1 - belief) * own + belief * beside",
-        "own + 0.0 * beside",
+        "(1 - belief) * of_pose + belief * of_other",
+        "of_pose + 0.0 * of_other",
         "a pose that stands for one known less well is told as sure as by itself",
         ("test_judgement_acceptance.py",),
     ),
     Mutant(
         "judgement-bent-as-sure-as-rigid",
         "judgement/judge.py",
-        "np.maximum(chdtri(count, rest) / chdtri(count, outside), chances)",
+        "np.maximum(chdtri(count, tail) / chdtri(count, outside), chances)",
         "0.0 * chances",
         "of a body on skin, met closely by chance, a pose is told as sure as of a rigid one",
         ("test_tracking_bent.py",),
@@ -145,7 +145,7 @@ MUTANTS = (
     Mutant(
         "judgement-all-poses-believed-alike",
         "judgement/acceptance.py",
-        "math.exp(each - top) if",
+        "math.exp(log - top) if",
         "1.0 if",
         "evidence does not tell poses apart",
     ),

@@ -124,22 +124,22 @@ _OPTIMISE = (
     Mutant(
         "optimise-curvature-as-told",
         "optimise/ascent.py",
-        "for step, change in self._shown[k]:",
-        "for step, change in self._shown[k][:0]:",
+        "for step, change in self._changes[k]:",
+        "for step, change in self._changes[k][:0]:",
         "where offsets are as large as the blur, steps get ever smaller",
     ),
     Mutant(
         "optimise-as-flat-as-gradients-show",
         "optimise/ascent.py",
-        "share = min((1 - self._options.least_seen) * along / max(along - seen, _TINY), 1.0)",
+        "share = min((1 - self._options.least_seen) * along / max(along - shown, _TINY), 1.0)",
         "share = 1.0",
         "where a gradient hardly falls the next step leads anywhere",
     ),
     Mutant(
         "optimise-accepts-what-is-worse",
         "optimise/ascent.py",
-        "is_better = better[row] > values[k] or",
-        "is_better = better[row] < values[k] or",
+        "is_better = new_values[row] > values[k] or",
+        "is_better = new_values[row] < values[k] or",
         "the ascent goes down",
     ),
     Mutant(
@@ -159,8 +159,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-any-hessian",
         "optimise/ascent.py",
-        "dpotrf(one)[1] == 0 for one",
-        "True for one",
+        "dpotrf(matrix)[1] == 0 for matrix",
+        "True for matrix",
         "where the Hessian is not definite the step leads to a saddle or a minimum",
     ),
     Mutant(

@@ -57,8 +57,8 @@ _ATLAS = (
     Mutant(
         "density-look-up-without-the-spline",
         "density/atlas.py",
-        "beside += 0.25",
-        "beside *= 0.0",
+        "offsets += 0.25",
+        "offsets *= 0.0",
         "places of features are drawn to cells",
     ),
     Mutant(
@@ -95,8 +95,8 @@ _BLUR = (
     Mutant(
         "density-blocks-blur-once-more",
         "density/blur.py",
-        "left = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))",
-        "left = sigma",
+        "remaining = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))",
+        "remaining = sigma",
         "wide blurs of grey values are wider than said",
     ),
     Mutant(

@@ -17,8 +17,8 @@ _NEAR = (
     Mutant(
         "fit-blurs-whatever-the-uncertainty",
         "fit/near.py",
-        "(at.J**2 @ (uncertainties**2)[:, None, :, None])",
-        "(at.J**2 @ (0 * uncertainties)[:, None, :, None])",
+        "(match.J**2 @ (uncertainties**2)[:, None, :, None])",
+        "(match.J**2 @ (0 * uncertainties)[:, None, :, None])",
         "a start that is far off is looked for at the finest blur alone",
     ),
     Mutant(
@@ -38,8 +38,8 @@ _NEAR = (
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "here.value[0] >= rules.near * len(objective.views)",
-        "here.value[0] >= 0.0",
+        "start.value[0] >= rules.near * len(objective.views)",
+        "start.value[0] >= 0.0",
         "a start some widths off is never corrected",
     ),
     Mutant(
@@ -70,7 +70,7 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "return not (far or others), ",
+        "return not (far or is_pulled), ",
         "return True, ",
         "a cut spot bends the pose",
         ("test_fit_noise.py",),
@@ -194,8 +194,8 @@ _MISFIT = (
     Mutant(
         "fit-misfit-in-units-of-the-sensor",
         "fit/probable.py",
-        "return np.sqrt(self.variance) * here[:, 1:] - slopes, heights",
-        "return self.variance * here[:, 1:] - slopes, heights",
+        "return np.sqrt(self.variance) * sampled[:, 1:] - slopes, heights",
+        "return self.variance * sampled[:, 1:] - slopes, heights",
         "whether a body fits depends on the unit of its sensor",
     ),
     Mutant(
@@ -208,8 +208,8 @@ _MISFIT = (
     Mutant(
         "fit-own-peaks-left",
         "fit/probable.py",
-        "y = y + np.sqrt(sensor.variance) * rest / own[:, None]",
-        "y = y - np.sqrt(sensor.variance) * rest / own[:, None]",
+        "y = y + np.sqrt(sensor.variance) * slopes / tops[:, None]",
+        "y = y - np.sqrt(sensor.variance) * slopes / tops[:, None]",
         "freed features leave their peaks",
     ),
     Mutant(
@@ -222,14 +222,14 @@ _MISFIT = (
     Mutant(
         "fit-any-assignment-is-believed",
         "fit/probable.py",
-        "return T_best if ((others / least) ** (-0.5 * redundant)).sum() < 1 else None",
+        "return T_best if ((other_squares / least) ** (-0.5 * redundant)).sum() < 1 else None",
         "return T_best",
         "a pose is told although two places might be each other's",
     ),
     Mutant(
         "fit-lower-peaks-do-not-count",
         "fit/probable.py",
-        "return y if others < 0.5 * own.mean() < sensor.density(y)[:, 0].min() else None",
+        "return y if highest < 0.5 * tops.mean() < sensor.density(y)[:, 0].min() else None",
         "return y",
         "features without a peak of their own are freed",
     ),

@@ -22,7 +22,7 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "ratio = residual_ratio(own, known, model.by_chance, rules)",
+        "ratio = residual_ratio(in_frame, known, model.by_chance, rules)",
         "ratio = 0.0",
         "a frame of large residuals is as sure as those before it",
     ),
@@ -43,8 +43,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "_level(found, before, count, model, estimate)",
-        "_level(found, before, 0, model, None)",
+        "_level(matches, before, count, model, estimate)",
+        "_level(matches, before, 0, model, None)",
         "noise seems smaller than it is",
     ),
     Mutant(
@@ -71,7 +71,7 @@ _NOISE = (
     Mutant(
         "judgement-choosing-a-pose-costs-nothing",
         "judgement/shape.py",
-        "spent=min(before.spent, one.spent),",
+        "spent=min(before.spent, shape.spent),",
         "spent=0.0,",
         "any thing of four markers is the body",
     ),
@@ -81,36 +81,36 @@ _FIELDS = (
     Mutant(
         "judgement-pairs-of-markers-forgotten",
         "judgement/fields.py",
-        "max(float(pairs - np.vdot(both, both)), 0.0)",
+        "max(float(pairs - np.vdot(shared, shared)), 0.0)",
         "0.0",
         "markers that are off seem to be seen more surely than they are",
     ),
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "variances[0] * at.inverse + (drawn * (kinds @ variances)) @ drawn.T",
-        "variances[0] * at.inverse",
+        "variances[0] * fields.inverse + (shifts * (kinds @ variances)) @ shifts.T",
+        "variances[0] * fields.inverse",
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
         "judgement-what-lasts-is-forgotten",
         "judgement/noise.py",
-        "if names in before and before[names].shape == shown.shape:",
+        "if names in before and before[names].shape == sums.shape:",
         "if False:",
         "what is off by the same in every frame never shows",
     ),
     Mutant(
         "judgement-calibrations-are-exact",
         "judgement/noise.py",
-        "covariance[inner] += pulled @ pulled.T",
+        "covariance[inner] += shifted @ shifted.T",
         "covariance[inner] += 0",
         "a stated error of the focal length leaves the distance as sure as before",
     ),
     Mutant(
         "judgement-markers-off-are-noise",
         "judgement/noise.py",
-        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:]",
-        "at.pulls(rest, found) ** 2 @ at.kinds[:, 1:] * [1, 1, 0]",
+        "fields.pulls(unbiased, matches) ** 2 @ fields.kinds[:, 1:]",
+        "fields.pulls(unbiased, matches) ** 2 @ fields.kinds[:, 1:] * [1, 1, 0]",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
@@ -124,8 +124,8 @@ _FIELDS = (
     Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
         "judgement/fields.py",
-        "left = fields - J @ (drawn :=",
-        "left = fields - 0 * J @ (drawn :=",
+        "remaining = fields - J @ (shifts :=",
+        "remaining = fields - 0 * J @ (shifts :=",
         "offsets that a pose takes for its own are thought to be small",
     ),
     Mutant(
@@ -141,8 +141,8 @@ _CUT = (
     Mutant(
         "judgement-surfaces-hidden-corner-by-corner",
         "judgement/evidence.py",
-        "counts = np.where(own & hidden[..., None], 1 / several[..., None], counts)",
-        "counts = np.where(own & hidden[..., None], 1.0, counts)",
+        "weights = np.where(on_surface & is_hidden[..., None], 1 / in_view[..., None], weights)",
+        "weights = np.where(on_surface & is_hidden[..., None], 1.0, weights)",
         "a tag that is covered counts as four markers that are",
         ("test_judgement_evidence.py",),
     ),
@@ -208,8 +208,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-covered-features-missed-one-by-one",
         "judgement/evidence.py",
-        "most = 2 * detection.log_missed",
-        "most = 20 * detection.log_missed",
+        "floor = 2 * detection.log_missed",
+        "floor = 20 * detection.log_missed",
         "of a rig of many cameras a body with a covered marker is lost",
     ),
     Mutant(
@@ -230,7 +230,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-out-of-view-is-free",
         "judgement/evidence.py",
-        "unseen = found.unseen.sum(axis=-1) * detection.log_unseen",
+        "unseen = matches.unseen.sum(axis=-1) * detection.log_unseen",
         "unseen = 0.0",
         "a pose gains by moving features out of the picture",
     ),
@@ -251,7 +251,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "np.maximum(rarity - _costs(found, roots, spreads), 0.0)",
+        "np.maximum(rarity - _costs(matches, roots, spreads), 0.0)",
         "np.maximum(rarity, 0.0)",
         "a pose that meets features loosely is as good as one that meets them",
     ),
@@ -286,8 +286,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-points-in-space-anywhere-are-the-feature",
         "judgement/evidence.py",
-        "0.5 * (rarity + tight - np.expm1(both - tight))",
-        "0.5 * (rarity + tight)",
+        "0.5 * (rarity + alone - np.expm1(with_pull - alone))",
+        "0.5 * (rarity + alone)",
         "a false point beside a feature is as good as one at it",
     ),
     Mutant(
@@ -303,8 +303,8 @@ _JUDGE = (
     Mutant(
         "judgement-left-out-for-free",
         "judgement/judge.py",
-        "seen = replace(seen, shares=seen.shares * used[:, None])",
-        "seen = replace(seen, weights=seen.weights * used[:, None])",
+        "stacked = replace(stacked, shares=stacked.shares * is_used[:, None])",
+        "stacked = replace(stacked, weights=stacked.weights * is_used[:, None])",
         "leaving a sensor out makes a pose better",
         ("test_tracking_starts.py",),
     ),

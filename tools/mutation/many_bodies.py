@@ -77,7 +77,7 @@ MUTANTS = (
     Mutant(
         "tracking-twin-forgotten",
         "tracking/tracker.py",
-        "            other = -second.either",
+        "            other = -second.odds_over_best",
         "            other = None",
         "what stood beside the body is ok when the body goes",
         (_TWIN,),

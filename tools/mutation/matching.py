@@ -30,7 +30,7 @@ _ERRORS = (
     Mutant(
         "matching-errors-of-a-frame-forgotten",
         "matching/matches.py",
-        "np.maximum(variances, pooled(own, rules, 0.0))",
+        "np.maximum(variances, pooled(in_frame, rules, 0.0))",
         "variances.copy()",
         "a frame that is not like those before it is looked at too narrowly",
     ),
@@ -62,8 +62,8 @@ _MET = (
     Mutant(
         "matching-detection-met-twice",
         "matching/associate.py",
-        "(first[one[left]] == left) & (also[other[left]] == left)",
-        "first[one[left]] == left",
+        "(by_i[i] == remaining) & (by_j[j] == remaining)",
+        "by_i[i] == remaining",
         "one detection is taken for several features, hidden ones count as seen",
     ),
     Mutant(
@@ -104,15 +104,15 @@ _MET = (
     Mutant(
         "matching-crowd-of-the-whole-image",
         "matching/associate.py",
-        "return np.maximum(number / overall, inside / own), beside",
-        "return number / overall, beside",
+        "return np.maximum(number / overall, inside / in_box), in_space",
+        "return number / overall, in_space",
         "a crowd of false detections around the body counts as rare",
     ),
     Mutant(
         "matching-crowd-constant",
         "matching/associate.py",
-        "return np.maximum(number / overall, inside / own), beside",
-        "return 1e-6 + 0 * own, beside",
+        "return np.maximum(number / overall, inside / in_box), in_space",
+        "return 1e-6 + 0 * in_box, in_space",
         "clutter does not make a pose less sure",
     ),
     Mutant(
@@ -157,8 +157,8 @@ _RECORD = (
     Mutant(
         "matching-calibration-of-the-first-sensor",
         "matching/associate.py",
-        "own[k, :, : shifts.shape[1]] = shifts",
-        "own[0, :, : shifts.shape[1]] = shifts",
+        "column[k, :, : shifts.shape[1]] = shifts",
+        "column[0, :, : shifts.shape[1]] = shifts",
         "a calibration in doubt makes another sensor unsure",
     ),
     Mutant(
@@ -172,8 +172,8 @@ _RECORD = (
     Mutant(
         "matching-ranges-have-two-coordinates",
         "matching/matches.py",
-        "self.met * self.dimensions * self.each_part",
-        "self.met * 2 * self.each_part",
+        "self.met * self.dimensions * self.coordinate_weight",
+        "self.met * 2 * self.coordinate_weight",
         "ranges seem to fix poses that they leave open",
     ),
     Mutant(

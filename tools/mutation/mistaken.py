@@ -24,7 +24,7 @@ MUTANTS = (
     Mutant(
         "judgement-lenses-are-those-that-are-told",
         "judgement/mistakes.py",
-        "/ found.sigmas[:, None, None]",
+        "/ matches.sigmas[:, None, None]",
         "* 1e-9",
         "poses are ok whose cameras were given without their distortion",
         ("test_judgement_mistakes.py",),
@@ -48,7 +48,7 @@ MUTANTS = (
     Mutant(
         "judgement-mistakes-put-poses-off-that-do-not-give-way-to-them",
         "judgement/mistakes.py",
-        "is_sensor * there - moved",
+        "is_sensor * shift - moved",
         "-moved",
         "frames are in doubt for a camera that two others outvote",
         ("test_judgement_mistakes.py",),
@@ -56,7 +56,7 @@ MUTANTS = (
     Mutant(
         "judgement-any-number-of-mistakes-may-be-made",
         "judgement/mistakes.py",
-        "np.logaddexp(right.get(one.what, 0.0), harmless)",
+        "np.logaddexp(right.get(mistake.what, 0.0), harmless)",
         "0.0",
         "a camera that agrees is doubted as much as the one that is off",
         ("test_judgement_mistakes.py",),
@@ -64,8 +64,8 @@ MUTANTS = (
     Mutant(
         "judgement-a-turned-camera-is-as-told",
         "judgement/mistakes.py",
-        "math.log(p) + one.log_odds",
-        "math.log(p) - abs(one.log_odds)",
+        "math.log(p) + mistake.log_odds",
+        "math.log(p) - abs(mistake.log_odds)",
         "two cameras of which one was turned agree about a wrong pose",
         ("test_turned_camera.py",),
     ),

@@ -74,8 +74,8 @@ _KERNEL = (
     Mutant(
         "objective-gradient-of-the-other-sign",
         "objective/matched.py",
-        "(strength[..., None] * rest).sum(axis=0)",
-        "(-strength[..., None] * rest).sum(axis=0)",
+        "(strength[..., None] * product_gradient).sum(axis=0)",
+        "(-strength[..., None] * product_gradient).sum(axis=0)",
         "ascents go down",
     ),
     Mutant(
@@ -98,8 +98,8 @@ _MATCHED = (
     Mutant(
         "objective-out-of-the-picture-is-free",
         "objective/matched.py",
-        "(at.norm + self.tops * np.vecdot(hidden, hidden))",
-        "(at.norm + 0.0 * np.vecdot(hidden, hidden))",
+        "(match.norm + self.tops * np.vecdot(hidden, hidden))",
+        "(match.norm + 0.0 * np.vecdot(hidden, hidden))",
         "a pose gains by moving features that meet nothing out of the picture",
     ),
     Mutant(
@@ -168,7 +168,7 @@ _SAMPLED = (
     Mutant(
         "objective-gradient-without-the-other-sensors",
         "objective/paper.py",
-        '"s,sm,smk->k", others, g',
+        '"s,sm,smk->k", product, g',
         '"s,sm,smk->k", np.ones(count), g',
         "steps of formula (4) go by sensors one by one",
     ),

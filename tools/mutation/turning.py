@@ -44,7 +44,7 @@ MUTANTS = (
     Mutant(
         "judgement-likely-turns-as-if-nothing-moved",
         "judgement/nonlinear.py",
-        "fallen = 2 * (self._here - ends.values) *",
+        "fallen = 2 * (self._at_pose - ends.values) *",
         "fallen = 2 * (-ends.values) *",
         "what the pose itself is off by counts against all turns",
         (_NONLINEAR,),
@@ -52,8 +52,8 @@ MUTANTS = (
     Mutant(
         "judgement-turns-are-always-known",
         "judgement/nonlinear.py",
-        "(self._here - ends.values) * (np.vecdot(turns, turns) / known)",
-        "(self._here - ends.values)",
+        "(self._at_pose - ends.values) * (np.vecdot(turns, turns) / known)",
+        "(self._at_pose - ends.values)",
         "where noise is not known well, the ellipsoid grows for no reason or not at all",
         (_NONLINEAR,),
     ),

@@ -1,4 +1,4 @@
-"""Densities g_l of where features are: blur, normalisation, windows, tiles, levels of blur."""
+"""Densities g_l of features: blur, normalisation, windows, tiles, levels of blur."""
 
 from mixpose.density.atlas import Atlas as Atlas, remap as remap
 from mixpose.density.blur import DRAWING as DRAWING

@@ -1,16 +1,16 @@
-"""Densities of all sensors as images, drawn where they are looked up.
+"""Densities of all sensors as images, drawn only where they are looked up.
 
 A density is nearly empty, so small tiles of it are drawn, of all sensors into one array (an atlas)
-that `cv2.remap` looks up at once, values and gradients together.  Few places, as those of a pose
-that a fit begins from, have tiles of their own, in which they stay while it moves a little.  For
-many the plane of every sensor is divided into pages, tiles that are found by a table.
+that `cv2.remap` looks up at once, values and gradients together.  Few places, as at the start of a
+fit, have a tile each, in which they stay while the pose moves a little.  For many places the plane
+of every sensor is divided into pages, tiles with numbers in a table.
 
-Cells hold coefficients of quadratic B-splines, so that what is looked up bends smoothly from cell
-to cell.  At a place d cells beside the nearest one, such a spline is the mean of four bilinear
-look-ups, d² + 1/4 of a cell to either side along each axis.
+Cells hold coefficients of quadratic B-splines, so that values are smooth across cells.  At a place
+d cells beside the nearest one, such a spline is the mean of four bilinear look-ups, d² + 1/4 of a
+cell to either side along each axis.
 
 A sensor of one coordinate has 0 as its second, and its tiles have equal rows.  Cells are counted
-from sensor coordinates 0, so that a density is the same whatever is seen beside it.
+from sensor coordinates 0, so that a density does not depend on what else is seen.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from scipy.spatial import cKDTree
 from mixpose.density.blur import DRAWING, blurred, mass, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
-# tiles that are drawn at once: they have room for as many detections each
+# tiles that are drawn at once, each with room for as many detections
 _TOGETHER = math.isqrt(DRAWING.few_pairs)
-_BESIDE = 5  # pages along a box of no size
+_EXTRA_PAGES = 5  # along a side of a box, more than its size has
 
 
 def remap(values: Singles, u: Singles, v: Singles) -> Any:
@@ -38,7 +38,7 @@ def remap(values: Singles, u: Singles, v: Singles) -> Any:
         return cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     count, channels, width = u.size, values.shape[2:], min(max(u.size, 1), DRAWING.side)
     padding = -count % width if count else 1
-    maps = [np.pad(one.ravel(), (0, padding)).reshape(-1, width) for one in (u, v)]
+    maps = [np.pad(index.ravel(), (0, padding)).reshape(-1, width) for index in (u, v)]
     return remap(values, *maps).reshape(-1, *channels)[:count].reshape(*u.shape, *channels)
 
 
@@ -61,14 +61,14 @@ class Atlas:
         self.per_unit = scale.per_unit
         # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
         self.values: Singles = np.zeros((0, 0, 3), dtype=np.float32)
-        # with the blur that is left, the mass, and the corners (2, 2) in cells
+        # grids with the remaining blur, the mass, and the corners (2, 2) in cells
         self._grids: dict[int, tuple[GridPattern, float, float, Floats]] = {}
         q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], [0] * len(patterns)
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
-                small, left = reduced(pattern, scale.widths[k])
+                small, blur = reduced(pattern, scale.widths[k])
                 corners = np.array(small.extent) * scale.per_unit[k, 0, 0]
-                self._grids[k] = small, left, mass(small), corners
+                self._grids[k] = small, blur, mass(small), corners
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
@@ -76,16 +76,16 @@ class Atlas:
             share.append(weights / weights.sum())
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)
-        # cells along the part of a tile that is looked up
+        # cells along the part of a tile in which places may lie
         self.tile = max(math.ceil(steps_per_sigma), DRAWING.tile)
-        # places (L, H, n, 2) in cells, shifts from there to the array of their tiles, and that
+        # places (L, H, n, 2) in cells, shifts from there to the array of their tiles, and the array
         self._own: tuple[Floats, Floats, Singles] = np.zeros(0), np.zeros(0), self.values
         if self._grids:  # the larger the plane, the larger its pages
             self.tile = self.pages.page
         self._side, self._reach = self.tile + DRAWING.rim, 0.5 * self.tile + scale.reach
 
     def look_up(self, y: Floats) -> Floats:
-        """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
+        """Return densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
         if self._grids or index.size > 2 * DRAWING.own_tiles or self._are_more_than_pages(index):
             self.pages.find(index, self._drawn_pages)
@@ -93,17 +93,17 @@ class Atlas:
         else:
             self._to_own_tiles(index)
         maps = index.reshape(-1, 2).T
-        beside = maps - np.rint(maps)
-        beside *= beside
-        beside += 0.25
-        around = self._sides * beside[:, None]
+        offsets = maps - np.rint(maps)
+        offsets *= offsets
+        offsets += 0.25
+        around = self._sides * offsets[:, None]
         around += maps[:, None]
         u, v = around.astype(np.float32).reshape(2, 1, -1)  # rows would be shared among threads
         sampled = self._quarters @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._scale.units)
 
     def _to_own_tiles(self, index: Floats) -> None:
-        """Turn places in cells into those in tiles around them, in place."""
+        """Turn places in cells into those in tiles around them, and draw these; in place."""
         around, shifts, values = self._own
         if around.shape != index.shape or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
             around = np.rint(index)
@@ -117,23 +117,23 @@ class Atlas:
         self.values = values
 
     def _are_more_than_pages(self, index: Floats) -> bool:
-        """Whether there are more places than all pages of their planes, as at wide blurs."""
+        """Test whether there are more places than pages of the planes, as at wide blurs."""
         places, planes = index.size / 2, len(index)
-        return places > planes * _BESIDE**2 and places > planes * self._most_pages
+        return places > planes * _EXTRA_PAGES**2 and places > planes * self._most_pages
 
     @cached_property
     def _most_pages(self) -> float:
-        """Pages of a plane that holds all that is seen, about."""
+        """Approximate number of pages of a plane with all detections."""
         return _count(self._q.min(axis=0), self._q.max(axis=0), self.tile)
 
     @cached_property
     def pages(self) -> Pages:
-        """For many places, on planes that hold all that is seen."""
+        """Pages for many places, on planes that hold all detections and grids."""
         corners = [grid[-1] for grid in self._grids.values()]
         return Pages(self._q, corners, self.tile, self._scale.reach, len(self.per_unit))
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
-        """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
+        """Return numbers of tiles (K,), ascending, and of the detections (K,) that reach them."""
         if len(sensors) * len(self._q) <= DRAWING.few_pairs:
             inside = np.abs(self._q - middles[:, None]) < self._reach
             of_sensor = self._sensor == sensors[:, None]
@@ -144,7 +144,7 @@ class Atlas:
         tree = cKDTree(np.column_stack([self._q, apart * self._sensor]))
         away, nearest = tree.query(tiles, k=3, p=np.inf, distance_upper_bound=self._reach)
         near = np.isfinite(away)
-        if not near[:, -1].any():  # two at most, as where blurs are narrow
+        if not near[:, -1].any():  # at most two detections per tile, as for narrow blurs
             of, place = near.nonzero()
             return of, nearest[of, place]
         all_of_them = cKDTree(tiles)
@@ -153,7 +153,7 @@ class Atlas:
         return pairs["i"][order], pairs["j"][order]
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
+        """Draw tiles (rows, side, columns, 3 side) around places (P, 2), by pairs of `_near`.
 
         Those of a column are drawn at once; it is short: places are rounded to 6e-5 cells.
         """
@@ -161,13 +161,13 @@ class Atlas:
         columns = max(-(-count // most), 1)
         room = np.empty((min(count, most), side, columns, 3 * side), dtype=np.float32)
         for k in range(columns):
-            some = slice(k * most, min((k + 1) * most, count))
-            a, b = of.searchsorted([some.start, some.stop]).tolist()
-            tiles = room[: some.stop - some.start, :, k]
-            self._draw(tiles, sensors[some], middles[some], of[a:b] - some.start, which[a:b])
+            batch = slice(k * most, min((k + 1) * most, count))
+            a, b = of.searchsorted([batch.start, batch.stop]).tolist()
+            tiles = room[: batch.stop - batch.start, :, k]
+            self._draw(tiles, sensors[batch], middles[batch], of[a:b] - batch.start, which[a:b])
             for sensor in self._grids:
-                for i in np.flatnonzero(sensors[some] == sensor).tolist():
-                    tiles[i] = self._of_grid(sensor, middles[some][i])
+                for i in np.flatnonzero(sensors[batch] == sensor).tolist():
+                    tiles[i] = self._of_grid(sensor, middles[batch][i])
         return room
 
     def _draw(
@@ -175,8 +175,8 @@ class Atlas:
     ) -> None:
         """Draw tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
 
-        They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
-        along v and one along u, in three channels side by side.
+        They hold exact Gaussians, each a product of one along v and one along u, summed over the
+        detections that reach a tile, in three channels side by side.
         """
         count, side, scale = len(middles), self._side, self._scale
         place = np.arange(len(of)) - of.searchsorted(of)
@@ -200,7 +200,7 @@ class Atlas:
         np.matmul(rows, along_u.reshape(count, 2 * most, 3 * side), out=tiles)
 
     def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
-        """Those of pages around places (P, 2) in cells on which there is something, and they."""
+        """Draw pages around places (P, 2) in cells; return numbers and pages that are not empty."""
         of, which = self._near(sensors, middles)
         is_filled = np.isin(np.arange(len(sensors)), of)
         for k, (*_, (lower, upper)) in self._grids.items():
@@ -212,7 +212,7 @@ class Atlas:
         return filled, self._drawn(sensors[filled], middles[filled], of, which)[row, :, column]
 
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
-        """A tile (side, 3 side) of grey values or a profile."""
+        """Draw a tile (side, 3 side) of grey values or a profile."""
         pattern, sigma, total, _ = self._grids[sensor]
         side = self._side
         cells = middle + (np.arange(side) - 0.5 * (side - 1))[:, None]
@@ -224,19 +224,19 @@ class Atlas:
 
 
 class _Scale(NamedTuple):
-    """What cells are in units of L sensors, and densities in those of the array."""
+    """Units of cells in L sensors, and of densities in the array."""
 
-    per_unit: Floats  # (L, 1, 1, 2) as `Atlas` has it
-    widths: list[float]  # deviations that are drawn, in sensor units: look-ups blur by the rest
+    per_unit: Floats  # (L, 1, 1, 2) as `Atlas.per_unit`
+    widths: list[float]  # drawn deviations, in sensor units; look-ups add the remaining blur
     sigma: float  # the same in cells
-    reach: float  # cells around a detection to which it is drawn
+    reach: float  # cells around a detection within which it is drawn
     units: Floats  # (L, 1, 1, 3) of the channels: a lone detection's peak, per deviation
     is_flat: Mask | None  # (L,) sensors of one coordinate, where there are any
 
     @classmethod
     @lru_cache(maxsize=64)
     def of(cls, dimensions: tuple[int, ...], sigmas: tuple[float, ...], n: float) -> _Scale:
-        """For blurs of standard deviations sigmas, of n cells each."""
+        """Compute the units for blurs of standard deviations sigmas, of n cells each."""
         # look-ups blur by the variance of a quadratic B-spline
         drawn = math.sqrt(n**2 - 1 / 4)
         widths = [sigma * drawn / n for sigma in sigmas]
@@ -259,7 +259,7 @@ class Pages:
     def __init__(
         self, q: Floats, corners: Sequence[Floats], page: int, reach: float, sensors: int
     ) -> None:
-        """For detections (D, 2), corners (2, 2) of grids, in cells; with a rim of empty pages."""
+        """Divide planes with detections (D, 2) and grids of corners (2, 2), in cells, and a rim."""
         grids = np.concatenate([np.zeros((0, 2)), *corners])
         places = q if len(q) else grids
         lower, upper = places.min(axis=0), places.max(axis=0)
@@ -270,19 +270,19 @@ class Pages:
             lower, upper = np.minimum(lower, grids.min(0)), np.maximum(upper, grids.max(0))
             page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.held), 1.0))
         self.page = page  # cells along a page
-        # half a cell is left, lest rounding puts a place on a page of the rim
+        # half a cell of margin, lest rounding puts a place on a page of the rim
         self._origin = page * np.floor((lower - (reach + page + 0.5)) / page)
         self._shape = ((upper - lower + 2 * reach) / page).astype(np.intp) + 5  # along u and v
         self._count = int(self._shape.prod())
-        # (L * count,) number of each page, plane after plane and row by row; 0 where there is
-        # nothing, negative where nothing was looked up yet
+        # (L * count,) number of each page, plane after plane and row by row; 0 of empty ones,
+        # negative if not drawn yet
         self.table = np.full(sensors * self._count, -1, dtype=np.int32)
         self._first = self._count * np.arange(sensors)[:, None, None]
         side = page + DRAWING.rim
         columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1
-        # from a place in the plane to one in the array, by page; from nothing out of the array
+        # from a place in the plane to one in the array, by page; empty ones lead out of the array
         self._shifts = np.full((columns, 2), DRAWING.far)
 
     @property
@@ -296,7 +296,7 @@ class Pages:
     ) -> None:
         """Turn places (L, H, n, 2) in cells into those in `values`, in place.
 
-        Of pages, by sensors (P,) and middles (P, 2), `draw` gives those with something, and that.
+        `draw` returns numbers of non-empty pages, and these, by sensors (P,) and middles (P, 2).
         """
         page, width = self.page, self._shape[0]
         index -= self._origin
@@ -307,22 +307,22 @@ class Pages:
         if number.min(initial=0) < 0:
             pending, at_once = np.unique(squares[number < 0]), DRAWING.held // page**2
             for first in range(0, len(pending), at_once):
-                some = pending[first : first + at_once]
-                sensors, place = np.divmod(some, self._count)
+                batch = pending[first : first + at_once]
+                sensors, place = np.divmod(batch, self._count)
                 middles = page * (np.stack([place % width, place // width], axis=1) + 0.5)
                 filled, pages = draw(sensors, self._origin + middles)
-                self.table[some] = 0
-                self.table[some[filled]] = self._kept(pages, middles[filled])
+                self.table[batch] = 0
+                self.table[batch[filled]] = self._kept(pages, middles[filled])
             number = self.table[squares]
         index += self._shifts[number]
 
     def _kept(self, pages: Singles, middles: Floats) -> Indices:
-        """Numbers of pages (F, side, 3 side) around places (F, 2) that are put into the array."""
+        """Put pages (F, side, 3 side) around places (F, 2) into the array; return their numbers."""
         rows, side, columns, _ = self._room.shape
         numbers = np.arange(self._drawn, self._drawn + len(pages))
         self._drawn += len(pages)
         if self._drawn > rows * columns:
-            # so large that allocators keep it; memory that is not written to is free
+            # large, as memory that is not written to costs nothing
             most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
             room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
             room[:rows] = self._room
@@ -333,17 +333,17 @@ class Pages:
 
 
 def _middles_of(numbers: Indices, columns: int, side: int) -> Floats:
-    """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
+    """Return the middles (K, 2) in an array of tiles that lie there by numbers, row by row."""
     return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
 
 
 @lru_cache(maxsize=64)
 def _middles_of_drawn(count: int, side: int) -> Floats:
-    """The same of tiles that are drawn, column by column."""
+    """Return the middles of tiles that are drawn column by column."""
     columns, place = max(-(-count // _TOGETHER), 1), np.arange(count)
     return _middles_of(place % _TOGETHER * columns + place // _TOGETHER, columns, side)
 
 
 def _count(lower: Floats, upper: Floats, page: int) -> float:
-    """Pages of a box in cells, about, with those that reach beside it."""
-    return float(((upper - lower) / page + _BESIDE).prod())
+    """Return about how many pages a box in cells has, with those that reach beyond it."""
+    return float(((upper - lower) / page + _EXTRA_PAGES).prod())

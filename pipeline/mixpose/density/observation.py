@@ -1,7 +1,7 @@
-"""What one sensor observed, as densities at any blur, and inner products of Gaussian mixtures.
+"""Observations of one sensor as densities at any blur; inner products of Gaussian mixtures.
 
-Of a pattern g0 whose features have standard deviation σ after blurring these are g = g0 * ε, the
-paper's observation density, and C, g blurred once more by σ, whose samples are inner products
+A pattern g0, whose features have standard deviation σ once blurred, gives g = g0 * ε, the paper's
+observation density, and C, which is g blurred once more by σ: its samples are inner products
 ⟨g, N(p, σ²)⟩ with a predicted feature of the same width.
 """
 
@@ -32,13 +32,13 @@ class Window:
 
     @classmethod
     def around(cls, lower: Floats, upper: Floats, step: float) -> Window:
-        """The smallest grid that covers the box from `lower` to `upper`, both (m,)."""
+        """Return the smallest grid that covers the box from `lower` to `upper`, both (m,)."""
         count = np.maximum(np.ceil((upper - lower) / step - 1e-9).astype(int) + 1, 2)
         rows = int(count[1]) if len(count) == 2 else 1
         return cls(np.asarray(lower, dtype=np.float64), (rows, int(count[0])), float(step))
 
     def axis(self, k: int) -> Floats:
-        """Sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
+        """Return sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
         return np.asarray(self.origin[k] + self.step * np.arange(self.shape[1 - k]))
 
 
@@ -49,12 +49,12 @@ class Density:
     # (H, W) in 1/unit^m, or (H, W, 3) with its gradient; for ranges the last channel is empty
     values: Singles
     window: Window  # index = (y - origin) / step
-    sigma: float  # standard deviation, in sensor units, that one exact feature has in it
+    sigma: float  # standard deviation of an exact feature in it, sensor units
 
     def sample(self, y: Floats) -> Singles:
-        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
+        """Interpolate channels (..., 1 + m) at sensor coordinates (..., m); 0 outside and at NaN.
 
-        Without the last axis for a single channel.
+        A single channel has no last axis.
         """
         m = len(self.window.origin)
         index = (y.reshape(-1, m) - self.window.origin) / self.window.step
@@ -68,25 +68,25 @@ class Density:
 
 
 def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it as a whole, on a window."""
-    left, total = sigma, np.inf if is_empty(pattern) else mass(pattern)
+    """Blur a pattern g0 by `sigma`, in sensor units, normalise the whole, and draw a window."""
+    blur, total = sigma, np.inf if is_empty(pattern) else mass(pattern)
     if isinstance(pattern, GridPattern):
-        pattern, left = reduced(pattern, sigma)
+        pattern, blur = reduced(pattern, sigma)
     u, v = window.axis(0), window.axis(pattern.dimension - 1)
-    layers = blurred(pattern, left, u, v, total, gradient=gradient)
-    if gradient:  # three channels: of two cv2.remap of OpenCV 5 knows places to 1/32 of a cell only
+    layers = blurred(pattern, blur, u, v, total, gradient=gradient)
+    if gradient:  # three channels: with two, cv2.remap of OpenCV 5 rounds places to 1/32 of a cell
         layers += [np.zeros(window.shape, dtype=np.float32)] * (3 - len(layers))
     return Density(np.asarray(cv2.merge(layers), dtype=np.float32), window, sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A feature pattern with what is known about its blur, in sensor units."""
+    """A feature pattern with its blur, in sensor units."""
 
     pattern: Pattern  # g0 in sensor coordinates
     sigma: float  # σ_ε, the finest standard deviation of a feature
-    intrinsic: float = 0.0  # the same in the pattern already: σ_ε of simulated densities
-    passed_over: int = 0  # detections that are not in the pattern, as they were too many
+    intrinsic: float = 0.0  # blur that the pattern has already: σ_ε of simulated densities
+    passed_over: int = 0  # detections left out of the pattern, as there were too many
 
     def __post_init__(self) -> None:
         if not 0 < self.sigma < np.inf:
@@ -103,13 +103,13 @@ class Observation:
         return self.pattern.points if isinstance(self.pattern, PointPattern) else None
 
     def only(self, chosen: Mask) -> Observation:
-        """With some of its detections (M,)."""
+        """Return the observation with chosen detections (M,)."""
         assert isinstance(self.pattern, PointPattern)
         return replace(self, pattern=self.pattern.only(chosen))
 
     @cached_property
     def cell(self) -> float | None:
-        """Size of a cell whose value carries noise of its own; None for detections."""
+        """Size of a cell of grey values, each with independent noise; None for detections."""
         pattern = self.pattern
         return None if isinstance(pattern, PointPattern) else float(pattern.step**self.dimension)
 
@@ -120,7 +120,7 @@ class Observation:
 
     @property
     def found(self) -> int:
-        """Number of detections, with those that are not in the pattern."""
+        """Number of detections, including those left out of the pattern."""
         return self.pattern.size + self.passed_over
 
     @property
@@ -130,7 +130,7 @@ class Observation:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the sensor saw no feature at all."""
+        """Whether the sensor observed no feature at all."""
         return is_empty(self.pattern)
 
     @cached_property
@@ -139,7 +139,7 @@ class Observation:
         return self.pattern.extent
 
     def around(self, y: Floats, reach: float) -> Observation:
-        """Detections within a reach, in σ_ε, of places (n, m), if there are any."""
+        """Keep detections within a reach, in σ_ε, of places (n, m); all if there are none."""
         if self.points is None or not len(y):
             return self
         distances, _ = cKDTree(y).query(self.points, distance_upper_bound=reach * self.sigma)
@@ -149,9 +149,9 @@ class Observation:
     def density(
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False
     ) -> Density:
-        """Make g with features of standard deviation sigma, on a window over the box `within`.
+        """Draw g with features of standard deviation sigma, on a window over the box `within`.
 
-        Fine enough for the blur, and within the budget of cells.
+        The window is fine enough for the blur, within the budget of cells.
         """
         (near, far), margin = self.extent, DRAWING.cut * sigma
         lower = np.maximum(within[0], near - margin)
@@ -166,12 +166,12 @@ class Observation:
         return replace(render(grid, self.blur(sigma), window, gradient=gradient), sigma=sigma)
 
     def blur(self, sigma: float, *, matched: bool = False) -> float:
-        """Blur of the pattern that gives features a standard deviation, once or for C."""
+        """Return the blur that gives features in g, or if `matched` in C, a deviation of sigma."""
         variance = (2 if matched else 1) * sigma**2 - self.intrinsic**2
         return math.sqrt(max(variance, 0.0))
 
     def energy(self, sigma: float) -> float:
-        """⟨g, g⟩ at the given standard deviation of a feature, over the whole pattern."""
+        """Return ⟨g, g⟩ over the whole pattern, for features of standard deviation sigma."""
         return self._finest_energy if sigma == self.sigma else self._energy(sigma)
 
     @cached_property
@@ -193,18 +193,18 @@ class Observation:
 def matched_atlas(
     observations: Sequence[Observation], sigmas: Sequence[float], steps_per_sigma: float
 ) -> Atlas:
-    """C of several sensors, none of which is empty, with features of standard deviations sigmas."""
+    """Return C of several sensors, none of them empty, for features of these deviations."""
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
     return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)
 
 
 def peak(variance: Any, dimension: Any) -> Any:
-    """Value of an isotropic Gaussian density at its centre; of arrays, values of all."""
+    """Return the value of an isotropic Gaussian density at its centre, also of arrays."""
     return (2 * np.pi * variance) ** (-dimension / 2)
 
 
 def close_pairs(places: Floats, variances: Floats) -> Indices:
-    """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m), each blurred."""
+    """Return pairs i < j (P, 2) of n points that overlap in any of K blurred pictures (K, n, m)."""
     n = places.shape[1]
     _, i, j = pairs_by_picture(places, variances)
     numbers = np.sort(n * i + j)
@@ -213,23 +213,23 @@ def close_pairs(places: Floats, variances: Floats) -> Indices:
 
 
 def pairs_by_picture(places: Floats, variances: Floats) -> tuple[Indices, Indices, Indices]:
-    """The same by pictures: numbers (P,) of these, ascending, and of the points i < j."""
+    """Return overlapping pairs by picture: numbers (P,) of pictures, ascending, and i < j."""
     reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
-    each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
-    i, j = np.concatenate(each).T
-    return np.arange(len(each)).repeat([len(pairs) for pairs in each]), i, j
+    by_picture = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
+    i, j = np.concatenate(by_picture).T
+    return np.arange(len(by_picture)).repeat([len(pairs) for pairs in by_picture]), i, j
 
 
 @lru_cache
 def all_pairs(count: int) -> Indices:
-    """Pairs i < j (P, 2) of as many points."""
+    """Return all pairs i < j (P, 2) of as many points."""
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     pairs.flags.writeable = False
     return pairs
 
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
-    """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
+    """Return ⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m), weights (n,), v = 2σ²."""
     if len(points) ** 2 <= DRAWING.few_pairs:
         away = points[:, None] - points
         overlap = weights @ np.exp(np.vecdot(away, away) * (-0.5 / variance)) @ weights
@@ -242,8 +242,8 @@ def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
 
 
 def is_empty(pattern: Pattern) -> bool:
-    """Whether a pattern has no feature at all."""
+    """Test whether a pattern has no feature at all."""
     if isinstance(pattern, PointPattern):
         return not pattern.total > 0
-    # a profile below zero has no density, nor has one that single precision cannot normalise
+    # profiles below zero, or too small to be normalised in single precision, have no density
     return not pattern.values.max() > 1e-30

@@ -1,10 +1,10 @@
-"""A pose near a start: ascent of an objective through narrowing blurs.
+"""Fit a pose near a start: climb an objective through narrowing blurs.
 
     draw C of every sensor at a blur → climb Σ_l ω_l S_l → narrow the blur → ... → σ_ε → ... → noise
 
 Observation and prediction are widened alike: no blur moves the optimum, wider ones only reach
-farther.  Where most features are near a detection at the start already, the fit begins at σ_ε;
-where all are met as closely as the detections' noise lets them, it ends there.
+farther.  If most features are near a detection at the start already, the fit begins at σ_ε; if all
+are met as closely as the noise of detections allows, it ends there.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ class EstimatorOptions:
     free: tuple[str, ...] = TWIST_NAMES  # world directions that are estimated
     samples: int = 1000  # R per feature, where q is integrated by sampling
     seed: int = 0
-    fuse: bool = True  # whether frames of single ranges take the pose before them as a prior
-    # how long a frame is searched where no prediction convinces; None: live for cameras and streams
+    fuse: bool = True  # whether the previous pose is a prior in frames of single ranges
+    # how long to search if no prediction is convincing; None: live for cameras and streams
     search: SearchName | None = None
-    confidence: float | None = None  # from which a pose is ok; None: as the rules have it
-    mirrors: bool = False  # whether some show the body
+    confidence: float | None = None  # from which a pose is ok; None: that of the rules
+    mirrors: bool = False  # whether mirrors may show the body
 
 
 def free_mask(options: EstimatorOptions) -> Mask:
-    """Which of the six directions are estimated, not to be written to."""
+    """Return a mask of the directions (6,) that are estimated; shared and read-only."""
     return _mask(tuple(options.free))
 
 
@@ -78,28 +78,28 @@ def _mask(free: tuple[str, ...]) -> Mask:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an ascent ended."""
+    """The end of an ascent."""
 
     T_world_object: Floats  # (4, 4)
-    blurs: tuple[Mapping[str, float], ...] = ()  # by view, of each objective that was climbed
+    blurs: tuple[Mapping[str, float], ...] = ()  # by view, of all objectives that were climbed
     freed: bool = False  # whether the body did not fit, and the pose was fitted to freed features
-    motion: Motion | None = None  # of the body, where sensors see it at moments of their own
-    matches: Matches | None = None  # at the pose, at σ_ε, where detections were looked at
-    noise: NoiseEstimate | None = None  # as these show it
-    first: Ascent | None = None  # at σ_ε, from which it went on to narrower blurs
+    motion: Motion | None = None  # of the body, if sensors see it at different moments
+    matches: Matches | None = None  # at the pose, at σ_ε, if detections were matched
+    noise: NoiseEstimate | None = None  # by these matches
+    first: Ascent | None = None  # at σ_ε, before narrower blurs
 
     @classmethod
     def of(
-        cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]], **rest: Any
+        cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]], **fields: Any
     ) -> Fit:
-        """Where an ascent through blurs of the views ended."""
-        return cls(ascent.states[0], blurs_by_view(views, levels), **rest)
+        """Return the fit that ends an ascent through blurs of the views."""
+        return cls(ascent.states[0], blurs_by_view(views, levels), **fields)
 
-    def begins_at(self, other: Ascent, tolerance: float) -> bool:
-        """Whether another ascent ended where this fit's first did, so that it leads to the same."""
+    def is_begun_by(self, other: Ascent, tolerance: float) -> bool:
+        """Test whether another ascent ended where this fit's first did, and leads to the same."""
         assert self.first is not None
         away = twist_between(self.first.states[0], other.states[0])
-        # what two ascents leave to be gained at one place: 0.003 σ_ε
+        # two ascents to the same maximum differ by the gains that they left: 0.003 σ_ε
         same = 10 * tolerance * abs(float(other.values[0]))
         return float(away @ other.last.curvature[0] @ away) < same
 
@@ -107,7 +107,7 @@ class Fit:
 def blurs_by_view(
     views: Sequence[View], levels: Sequence[Sequence[float]]
 ) -> tuple[Mapping[str, float], ...]:
-    """Blurs of levels, by the names of views."""
+    """Return the blurs of levels by names of views."""
     names = [view.name for view in views]
     return tuple([dict(zip(names, level)) for level in levels])
 
@@ -119,16 +119,16 @@ def widest_blurs(
     uncertainties: Floats,  # (H, 6), their standard deviations
     rules: FitRules = FitRules(),
 ) -> Floats:
-    """Standard deviations (H, L) of a feature: by how much it may be off, root mean square.
+    """Return blurs (H, L) that cover the root mean square error of predicted features.
 
-    None is below σ_ε, nor much wider than what a view sees.
+    They are at least σ_ε and not much wider than the extent of a view's observation.
     """
-    at = project_body(tuple(view.sensor for view in views), body).project(poses)
+    match = project_body(tuple(view.sensor for view in views), body).project(poses)
     # (L, H, n), of all coordinates
-    variances = (at.J**2 @ (uncertainties**2)[:, None, :, None])[..., 0].sum(axis=3)
+    variances = (match.J**2 @ (uncertainties**2)[:, None, :, None])[..., 0].sum(axis=3)
     dimensions = np.array([[view.sensor.dimension] for view in views])
-    counts = np.maximum(at.seen.sum(axis=2), 1)
-    spreads = np.sqrt((variances * at.seen).sum(axis=2) / counts / dimensions)
+    counts = np.maximum(match.seen.sum(axis=2), 1)
+    spreads = np.sqrt((variances * match.seen).sum(axis=2) / counts / dimensions)
     finest = np.array([[view.observation.sigma] for view in views])
     extents = [[np.subtract(*view.observation.extent[::-1]).max()] for view in views]
     widest = np.minimum(spreads, np.maximum(rules.widest * np.array(extents), finest))
@@ -142,7 +142,7 @@ def blur_schedule(
     uncertainty: Floats,
     rules: FitRules = FitRules(),
 ) -> list[list[float]]:
-    """Standard deviations of a feature per level and view, from coarse to σ_ε.
+    """Return blurs per level and view, from coarse to σ_ε.
 
     The coarsest are `widest_blurs` at a start (4, 4) with standard deviations (6,).
     """
@@ -152,7 +152,7 @@ def blur_schedule(
 
 
 def narrowing(wider: float, rules: FitRules = FitRules()) -> list[float]:
-    """Powers of a blur that is so much wider than σ_ε, from 1 to 0: the levels in between."""
+    """Return powers, from 1 to 0, of a blur so much `wider` than σ_ε: the levels of a schedule."""
     count = int(np.ceil(np.log(wider) / np.log(rules.ratio)))
     return [k / max(count, 1) for k in range(count, -1, -1)]
 
@@ -165,20 +165,20 @@ def fit_near(
     options: EstimatorOptions,
     samples: Floats,  # (N, R, 3) of the body, for the objectives that integrate by sampling
     *,
-    finest: MatchedObjective | None = None,  # at σ_ε, where it is at hand
-    begun: Ascent | None = None,  # from the start, on that, where it is at hand
-    climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
-    blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
-    least: float = -math.inf,  # log likelihood at σ_ε; with less it ends there
-    noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
-    fields: float = 1.0,  # share of it that is errors of calibration, in no sensor's own noise
-    beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
-    wide: float = 1.0,  # in σ_ε, where they are off by more: it ends there
+    finest: MatchedObjective | None = None,  # at σ_ε, if known
+    begun: Ascent | None = None,  # from the start at σ_ε, if known
+    climbed: list[Fit] | None = None,  # fits with the same views and noise; this one is added
+    blur: float = 1.0,  # in σ_ε, as close as the start is: coarser levels are left out
+    least: float = -math.inf,  # log likelihood at σ_ε below which the fit ends there
+    noise: Floats = np.zeros((2, 1)),  # (2, L) squares, σ_ε², and degrees of earlier frames
+    fields: float = 1.0,  # share of the noise by calibration, in no sensor's own noise
+    extra_sigma: float = 0.0,  # standard deviation of other errors of features, in σ_ε
+    wide: float = 1.0,  # blur in σ_ε at which the fit ends, if features are off by more than σ_ε
     errors: ErrorRules = ErrorRules(),
     association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
-    """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
+    """Climb the objective from coarse blurs to the noise, or reuse a fit that begins alike."""
     free, sigmas = free_mask(options), [view.observation.sigma for view in views]
     blur = blur if wide <= 1 else wide
     levels, begins = list[list[float]](), [blur * sigma for sigma in sigmas]
@@ -193,15 +193,15 @@ def fit_near(
             if level[0] <= begins[0]:
                 break
             levels.append(level)
-            at = sampled(level, states[0])
-            states = ascend(at, states, perturb, free, rules.coarse).states
+            objective = sampled(level, states[0])
+            states = ascend(objective, states, perturb, free, rules.coarse).states
         end = last or sampled(sigmas, states[0])
         return ascend(end, states, perturb, free, newton)
 
     if options.objective != "matched":
         return Fit.of(descended(None, rules.fine), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
-    if finest.are_grids.all():  # whose noise is that of cells
+    if finest.are_grids.all():  # noise is that of cells
         fit = Fit.of(descended(finest, rules.fine), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
@@ -209,16 +209,16 @@ def fit_near(
     first = finest if blur == 1 else matched_objective(views, body, begins)
     ascent = begun or _at_once(first, T_start, free, rules, blur < 1)
     ascent = ascent or descended(first, rules.sharp)
-    known = climbed if climbed is not None and blur == 1 else []
-    for fit in known:
-        if fit.begins_at(ascent, rules.sharp.tolerance):
+    fits = climbed if climbed is not None and blur == 1 else []
+    for fit in fits:
+        if fit.is_begun_by(ascent, rules.sharp.tolerance):
             return fit
     if wide > 1:
         matches = associate(first, ascent.states[0], association, errors.narrowest)
         return Fit.of(ascent, views, [*levels, begins], matches=matches)
-    rest = finest, free, least, noise, fields, beside, errors, association, rules
-    known.append(_to_the_noise(ascent, [*levels, begins], blur, first, *rest))
-    return known[-1]
+    arguments = finest, free, least, noise, fields, extra_sigma, errors, association, rules
+    fits.append(_to_the_noise(ascent, [*levels, begins], blur, first, *arguments))
+    return fits[-1]
 
 
 def fit_together(
@@ -229,25 +229,25 @@ def fit_together(
 ) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
 
-    They come back with what is seen at the end; None for a body that has to descend to σ_ε.
+    Returns objectives with their match at the end; None for a body that has to descend to σ_ε.
     """
     joint, states = together(objectives), np.array(starts)
-    here = joint.linearise(states)
-    ends = ascend(joint, states, perturb, free, replace(rules.sharp, together=True), here)
-    is_near = here.value >= rules.near * np.array([len(one.views) for one in objectives])
+    start = joint.linearise(states)
+    ends = ascend(joint, states, perturb, free, replace(rules.sharp, together=True), start)
+    is_near = start.value >= rules.near * np.array([len(o.views) for o in objectives])
     return [
         (objective, ends.of(slice(k, k + 1))) if is_near[k] else None
-        for k, objective in enumerate(joint.seen(objectives, ends.states))
+        for k, objective in enumerate(joint.split(objectives, ends.states))
     ]
 
 
 def _at_once(
     objective: MatchedObjective, T_start: Floats, free: Mask, rules: FitRules, anywhere: bool
 ) -> Ascent | None:
-    """The ascent from a start that is near, by its value per sensor, or anywhere."""
-    here = objective.linearise(T_start[None])
-    is_near = anywhere or here.value[0] >= rules.near * len(objective.views)
-    return ascend(objective, T_start[None], perturb, free, rules.sharp, here) if is_near else None
+    """Climb from a start, if it is near by its value per sensor, or if it may be `anywhere`."""
+    start = objective.linearise(T_start[None])
+    is_near = anywhere or start.value[0] >= rules.near * len(objective.views)
+    return ascend(objective, T_start[None], perturb, free, rules.sharp, start) if is_near else None
 
 
 def _to_the_noise(
@@ -260,12 +260,12 @@ def _to_the_noise(
     least: float,
     known: Floats,
     fields: float,
-    beside: float,
+    extra_sigma: float,
     errors: ErrorRules,
     association: AssociationRules,
     rules: FitRules,
 ) -> Fit:
-    """The ascent from a blur in σ_ε on, while offsets that are no noise, or weights, move the pose.
+    """Continue an ascent from a blur in σ_ε while outliers, or weights by noise, move the pose.
 
     Near its maximum a sensor's value falls by r²/4σ², and its log-likelihood by r²/2s².
     """
@@ -274,27 +274,27 @@ def _to_the_noise(
     likeliest, best, counted = -np.inf, None, np.ones(len(sigmas))
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
-        if beside:
-            wide = replace(matches, finest=np.clip(matches.finest, errors.blur * beside, 1.0))
-        seen = _, variances, narrow, before = errors_seen(wide, count, known, errors)
-        noise = None if beside else seen
+        if extra_sigma:
+            wide = replace(matches, finest=np.clip(matches.finest, errors.blur * extra_sigma, 1.0))
+        estimate = _, variances, narrow, before = errors_seen(wide, count, known, errors)
+        noise = None if extra_sigma else estimate
         fit = Fit.of(ascent, finest.views, levels, matches=matches, noise=noise, first=first)
-        # offsets of a bent pose hide how small noise is
+        # offsets at a pose bent by outliers hide how small the noise is
         variances = np.minimum(variances, (before / errors.blur) ** 2)
         weighed = errors.counted(variances, fields)
         end = np.minimum(np.minimum(narrow, before), blurs)
-        is_noise, others = _are_noise(matches, variances, blurs, errors, rules)
-        unlike, counted = weighed / counted, weighed
-        # weights by noise; and at first all features of a grid are taken for equally high
+        is_noise, is_pulled = _are_noise(matches, variances, blurs, errors, rules)
+        ratios, counted = weighed / counted, weighed
+        # weights have to be those of the noise; at first features of a grid have equal heights
         is_rough = best is None and bool(finest.are_grids.any())
-        are_right = not is_rough and bool(unlike.min() > rules.narrower**2 * unlike.max())
+        are_right = not is_rough and bool(ratios.min() > rules.narrower**2 * ratios.max())
         is_end = is_noise or bool((end > rules.narrower * blurs).all())
         is_end = is_end and (are_right or best is not None)
-        straight, is_clear, ahead = np.inf, are_right and not others, None
+        straight, is_clear, ahead = np.inf, are_right and not is_pulled, None
         if not is_end and (best is None or is_clear):
             moved, shift, _ = ahead = _moved(matches, free, end, variances)
             is_end = best is None and moved < rules.moved**2
-            # as narrow as features are off by then at once, if nothing else pulls them
+            # the next blur is as narrow as features are off by then, if no other detection pulls
             straight = shift if is_clear else np.inf
         narrower = np.maximum(end, np.minimum(blurs / rules.ratio, straight))
         is_only = best is None and is_end
@@ -303,11 +303,11 @@ def _to_the_noise(
             likeliest, best = likelihood, fit
         if is_end:
             return best
-        if likeliest < least:  # how likely may it become?
+        if likeliest < least:  # end if narrower blurs cannot reach `least` either
             *_, offsets = ahead or _moved(matches, free, end, variances)
-            there = replace(matches, offsets=offsets)
-            narrow = errors_seen(there, count, known, errors)[2]
-            if log_likelihood(narrow, there, count, errors) < least:
+            shifted = replace(matches, offsets=offsets)
+            narrow = errors_seen(shifted, count, known, errors)[2]
+            if log_likelihood(narrow, shifted, count, errors) < least:
                 return best
         likeliest = -np.inf if is_rough else likeliest
         if not is_noise:
@@ -321,24 +321,23 @@ def _to_the_noise(
 def _are_noise(
     matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules, rules: FitRules
 ) -> tuple[bool, bool]:
-    """Whether all offsets are as noise (L,) makes them and nothing else pulls at blurs (L,).
+    """Test whether offsets are noise (L,) and nothing else pulls at blurs (L,); and whether it
+    does.
 
-    And whether any other detection does: a pose moves by no more deviations than pulls together are
-    of the noise.
+    A pose moves by at most as many of its deviations as all pulls together are of the noise.
     """
     far = np.count_nonzero(errors.are_off(matches, variances[:, None] + matches.extra)) > 0
-    beside = matches.beside * matches.beside  # NaN of features that are not in view
-    pulls = beside * np.exp(beside / (-2 * blurs * blurs)[:, None])
-    together = np.nansum(pulls, axis=1) + _pulls_of_missed(matches, blurs)
-    others = bool((together >= rules.moved**2 * variances).any())
-    return not (far or others), others
+    squared = np.square(matches.neighbour_distance)  # NaN of features that are not in view
+    pulls = squared * np.exp(squared / (-2 * blurs * blurs)[:, None])
+    pull = np.nansum(pulls, axis=1) + _pulls_of_missed(matches, blurs)
+    is_pulled = bool((pull >= rules.moved**2 * variances).any())
+    return not (far or is_pulled), is_pulled
 
 
 def _pulls_of_missed(matches: Matches, blurs: Floats) -> Floats:
-    """Squared pulls (L,), in σ_ε², of features that are missed on others beside them at blurs (L,).
+    """Return squared pulls (L,), σ_ε², between missed features that overlap at blurs (L,).
 
-    The prediction is normalised: where two of its features overlap and no detection is, it gains by
-    moving them apart.
+    The prediction is normalised, so that moving two features apart gains where no detection is.
     """
     pulls = np.zeros(len(blurs))
     for k in np.flatnonzero(matches.missed > 1.5):
@@ -350,7 +349,7 @@ def _pulls_of_missed(matches: Matches, blurs: Floats) -> Floats:
 
 
 def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:
-    """Views of what was detected around the features in view: a fine grid holds no more."""
+    """Return views of the detections around features in view: a fine grid holds no more."""
     near = zip(views, matches.places, matches.weights > 0, matches.dimensions, strict=True)
     return [
         replace(view, observation=view.observation.around(y[seen, :m], reach))
@@ -361,9 +360,9 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
 def _moved(
     matches: Matches, free: Mask, narrower: Floats, variances: Floats
 ) -> tuple[float, float, Floats]:
-    """About how far narrower blurs (L,) move the pose, in squared standard deviations.
+    """Estimate how far narrower blurs (L,) move the pose, in squared standard deviations.
 
-    And by how much any feature that is met, in σ_ε; and the offsets (L, N, m) that this leaves.
+    Also returns the largest shift of a feature met, in σ_ε, and the remaining offsets (L, N, m).
     """
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])

@@ -1,4 +1,4 @@
-"""Judgement: which features a pose meets, what that is worth, and whether it is believed."""
+"""Judgement: noise, covariance and evidence of a pose, and the decision about a frame."""
 
 from mixpose.judgement.acceptance import (
     LEAST_BELIEF as LEAST_BELIEF,
@@ -15,10 +15,10 @@ from mixpose.judgement.acceptance import (
     is_open as is_open,
     is_possible as is_possible,
     is_sure as is_sure,
-    met_by_one as met_by_one,
+    unconfirming_sensors as unconfirming_sensors,
     nearest_alike as nearest_alike,
-    others_miss as others_miss,
-    two_agree as two_agree,
+    is_seen_elsewhere as is_seen_elsewhere,
+    has_two_agreeing as has_two_agreeing,
 )
 from mixpose.judgement.evidence import (
     DetectionModel as DetectionModel,
@@ -50,7 +50,7 @@ from mixpose.judgement.nonlinear import (
 from mixpose.judgement.mistakes import (
     APART as APART,
     Mistake as Mistake,
-    odds_of_each as odds_of_each,
+    odds_of_mistakes as odds_of_mistakes,
     possible_mistakes as possible_mistakes,
 )
 from mixpose.judgement.shape import Shape as Shape, shape_shown as shape_shown

@@ -1,4 +1,4 @@
-"""From judged poses to a status: what is possible, sure, the same, and what contradicts itself."""
+"""Decide about a frame from judged poses: which are possible, sure, the same, or contradicted."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import twist_between
 
 LEAST_BELIEF = 1e-12
-"""In a pose: what is less likely is as good as what nobody thought of."""
+"""Belief in a pose below which it is no more likely than poses that were not thought of."""
 
 
 @dataclass(frozen=True)
 class AcceptanceRules:
-    """When a pose is believed."""
+    """Thresholds from which a pose is believed."""
 
-    confidence: float = constant(0.999, "that a pose is right, to be ok: one of 1000 may err")
+    confidence: float = constant(0.999, "from which a pose is ok: one of 1000 may err")
     mistaken: float = constant(
-        2e-4, "of sessions, each: a body mirrored or of another size, a sensor elsewhere"
+        2e-4, "of sessions, by each mistake: a body mirrored or of another size, a sensor elsewhere"
     )
     widest_turn_deg: float = constant(
-        15.0, "95 % bound on a turn that is known; of one pose's peak"
+        15.0, "95 % bound on a turn that is known, and on that between two poses of one peak"
     )
-    convincing: float = constant(0.75, "share of the body to look nowhere else: a slip meets less")
+    convincing: float = constant(0.75, "share of the body to need no search: a slip meets less")
     agreeing: float = constant(0.5, "share of the body that a sensor that agrees must meet")
     disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
     changed: float = constant(10.0, "times the residuals that chance makes: frames have up to 7")
-    open: float = constant(300.0, "sum of variances by those if all in view were met, and whole")
+    open: float = constant(300.0, "sum of variances over that if all in view were met and whole")
 
     @property
     def log_doubt(self) -> float:
-        """Log odds against a pose that is just ok."""
+        """Log odds against a pose that is just sure enough to be ok."""
         return -float(logit(self.confidence))
 
 
 class Alternative(NamedTuple):
-    """Something else that a frame may show."""
+    """An alternative to a pose: something else that the frame may show."""
 
     what: str  # in words; empty for mere clutter, and for other poses of the body
-    log_odds: float = 0.0  # against the pose in question; even where nobody knows
+    log_odds: float = 0.0  # against the pose; even odds where they are unknown
 
 
 _NOTHING = Alternative("", -math.inf)
@@ -60,91 +60,91 @@ TURNS = "what is met leaves it open how the body is turned"
 
 
 class Second(NamedTuple):
-    """What else in a frame looks like the body."""
+    """A second pose of a frame that looks like the body."""
 
-    pose: ScoredPose | None  # None where there is nothing
-    there: float  # log odds that it is there
-    either: float  # that it is the body, and not the best pose
-    told: bool = False  # whether one of them is seen to be an image in a mirror, or another thing
+    pose: ScoredPose | None  # None where there is no second one
+    log_odds: float  # that it is there
+    odds_over_best: float  # log odds that it is the body, and not the best pose
+    is_explained: bool = False  # whether one of them is seen to be a mirror image or another thing
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The decision about a frame: ok where nothing else is likely."""
+    """The decision about a frame: ok if no alternative to the best pose is likely."""
 
     best: ScoredPose | None  # None where the frame is lost
-    kept: list[tuple[ScoredPose, float]]  # poses worth telling with their beliefs, best first
-    # less likely ones that further frames may make likely, of single ranges
+    kept: list[tuple[ScoredPose, float]]  # poses to be reported, with beliefs, best first
+    # of single ranges, less likely poses that further frames may make likely
     faint: tuple[tuple[ScoredPose, float], ...] = ()
-    against: tuple[Alternative, ...] = ()  # the best of them
-    most: float = -math.inf  # log odds against it up to which it is ok
-    # detections that sensors had left where the body was sought a second time
+    against: tuple[Alternative, ...] = ()  # the best pose
+    most: float = -math.inf  # log odds against the best pose up to which it is ok
+    # by sensor: unclaimed detections among which the body was searched a second time
     tried: Mapping[str, int] = field(default_factory=dict)
-    second: Second | None = None  # None where nobody asked
-    # log odds of mistakes in the session, by name; None where it was not asked for them
+    second: Second | None = None  # None where it was not searched
+    # log odds of mistakes in the session, by name; None where they were not computed
     mistaken: Mapping[str, float] | None = None
-    shape: Shape | None = None  # what frames told of it, while none was ok
+    shape: Shape | None = None  # evidence of the body's shape so far, while no frame was ok
 
     @cached_property
     def confidence(self) -> float:
-        """Probability that the best pose is right, by all alternatives."""
+        """Probability that the best pose is right and none of the alternatives."""
         return 0.0 if self.best is None else float(expit(-self._log_odds))
 
     @cached_property
     def _log_odds(self) -> float:
-        return float(np.logaddexp.reduce([one.log_odds for one in self.against]))
+        return float(np.logaddexp.reduce([other.log_odds for other in self.against]))
 
     @property
     def status(self) -> Status:
-        """What is told of the frame."""
+        """The status that is reported."""
         if self.best is None:
             return "lost"
         return "ok" if self._log_odds <= self.most else "ambiguous"
 
     @property
     def doubt(self) -> str:
-        """Why the frame is ambiguous, other than for its rivals: the likeliest in words."""
-        named = [one for one in self.against if one.what and one.log_odds > self.most]
-        told = named if self.status == "ambiguous" else []
-        return max(told, key=lambda one: one.log_odds, default=_NOTHING).what
+        """The likeliest cause of ambiguity other than rivals, in words; empty for none."""
+        named = [other for other in self.against if other.what and other.log_odds > self.most]
+        reported = named if self.status == "ambiguous" else []
+        return max(reported, key=lambda other: other.log_odds, default=_NOTHING).what
 
     def doubted(self, more: Iterable[Alternative]) -> Verdict:
-        """The same, with more alternatives."""
+        """Return this verdict with more alternatives."""
         return replace(self, against=(*self.against, *more))
 
     def without(self, *what: str) -> Verdict:
-        """The same, but for some alternatives."""
-        return replace(self, against=tuple([one for one in self.against if one.what not in what]))
+        """Return this verdict without the alternatives of these names."""
+        return replace(self, against=tuple([a for a in self.against if a.what not in what]))
 
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:
-    """Whether what is met fixes a pose in its free directions (6,)."""
+    """Test whether the coordinates met are enough to fix the free directions (6,) of a pose."""
     return bool(pose.measurements >= np.count_nonzero(free))
 
 
 def is_possible(pose: ScoredPose, free: Mask) -> bool:
-    """Whether a pose is worth telling: if one feature that it misses would make it even."""
+    """Test whether a pose is worth reporting: one more feature met would make its odds even."""
     return is_fixed(pose, free) and pose.log_evidence > pose.log_missed
 
 
 def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether a pose is believed, if no rival casts doubt on it."""
+    """Test whether a pose is believed, as long as it has no rival."""
     return is_fixed(pose, free) and pose.log_evidence > -rules.log_doubt
 
 
 def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether a sure pose, near its prediction, meets so much that it could not be elsewhere.
+    """Test whether a pose is sure and meets so much of the body that no search is needed.
 
-    Beside two sensors that agree, others may be covered, blind or out of step.
+    If two sensors agree, others do not count: they may be covered, blind or out of step.
     """
     agreeing = [share for share in pose.matches.coverage.tolist() if share >= rules.agreeing]
     share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else pose.coverage
     return is_sure(pose, free, rules) and share > rules.convincing
 
 
-def ahead(one: ScoredPose, other: ScoredPose) -> float:
-    """Log odds of one pose of a body against another."""
-    return one.log_density - other.log_density
+def ahead(pose: ScoredPose, other: ScoredPose) -> float:
+    """Return the log odds of a pose of a body against another."""
+    return pose.log_density - other.log_density
 
 
 def decide(
@@ -155,34 +155,34 @@ def decide(
 ) -> Verdict:
     """Decide about a frame from all its poses, the most evident first.
 
-    Against the best there is clutter, then the others, by log odds of them: what is not possible by
-    itself still casts doubt.
+    Alternatives to the best pose are clutter and all other poses, also those too unlikely to be
+    reported.  `ahead_of` gives the log odds of a pose against another.
     """
-    told = [one for one in ranked if is_possible(one, free)]
-    if not told:
+    possible = [pose for pose in ranked if is_possible(pose, free)]
+    if not possible:
         return Verdict(None, [])
-    best, odds = told[0], _odds_against(told[0], ranked, ahead_of)
-    likeliest = max(told, key=lambda one: odds[ranked.index(one)])
+    best, odds = possible[0], _odds_against(possible[0], ranked, ahead_of)
+    likeliest = max(possible, key=lambda pose: odds[ranked.index(pose)])
     if likeliest is not best:
         best, odds = likeliest, _odds_against(likeliest, ranked, ahead_of)
     weights = beliefs(odds)
-    rivals = [each for one, each in zip(ranked, odds, strict=True) if one is not best]
-    against = [Alternative("", each) for each in (-best.log_evidence, *rivals)]
+    rivals = [log_odds for pose, log_odds in zip(ranked, odds, strict=True) if pose is not best]
+    against = [Alternative("", log_odds) for log_odds in (-best.log_evidence, *rivals)]
     if not is_turn_known(best, rules):
         against.append(Alternative(TURNS))
     kept = [
-        (one, weight)
-        for one, weight in zip(ranked, weights, strict=True)
-        if one is best or (weight >= 1 - rules.confidence and is_fixed(one, free))
+        (pose, weight)
+        for pose, weight in zip(ranked, weights, strict=True)
+        if pose is best or (weight >= 1 - rules.confidence and is_fixed(pose, free))
     ]
-    kept.sort(key=lambda each: each[0] is not best)
-    # a pose that is less likely needs more than three frames that err as seldom as one that is ok
+    kept.sort(key=lambda entry: entry[0] is not best)
+    # to become ok, a pose less likely than this needs more than three frames that are as sure as ok
     least = max((1 - rules.confidence) ** 3, LEAST_BELIEF)
     faint = [
-        (one, weight)
-        for one, weight in zip(ranked, weights, strict=True)
-        if one.spread is not None and least <= weight < 1 - rules.confidence
-        if one is not best and is_fixed(one, free)
+        (pose, weight)
+        for pose, weight in zip(ranked, weights, strict=True)
+        if pose.spread is not None and least <= weight < 1 - rules.confidence
+        if pose is not best and is_fixed(pose, free)
     ]
     return Verdict(best, kept, tuple(faint), tuple(against), rules.log_doubt)
 
@@ -192,17 +192,17 @@ def _odds_against(
     ranked: Sequence[ScoredPose],
     ahead_of: Callable[[ScoredPose, ScoredPose], float],
 ) -> list[float]:
-    """Log odds of each pose against one of them."""
-    return [0.0 if one is best else ahead_of(one, best) for one in ranked]
+    """Return the log odds of each pose against the best."""
+    return [0.0 if pose is best else ahead_of(pose, best) for pose in ranked]
 
 
 def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
-    """Whether no wide sector of turns is left open, as by ranges, or about a line of features."""
+    """Test whether no wide sector of turns is open, as by ranges or about a line of features."""
     turns = pose.covariance[3:, 3:]
     if pose.spread is not None:
         turns = np.diag(pose.spread[3:] ** 2)
     widest = math.radians(rules.widest_turn_deg) / 1.96
-    # no axis has more than all together
+    # the largest variance of an axis is at most the sum of all
     largest = float(np.trace(turns))
     if widest**2 <= largest < math.inf:
         largest = float(np.linalg.eigvalsh(turns)[-1])
@@ -210,18 +210,18 @@ def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
 
 
 def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseModel) -> bool:
-    """Whether what would fix some direction is hidden or cut.
+    """Test whether a direction is open because the features that would fix it are hidden or cut.
 
-    The sum of variances is compared with that if all features in view were met, and whole, by all
-    sensors, by this noise and by what is usual.
+    The sum of variances is compared with that if all sensors met all features in view by whole
+    spots, with the noise of this frame and with the usual noise.
     """
     used, seen = pose.used, pose.matches
     is_less = pose.left_out or np.count_nonzero(used.shares < used.weights)
     if not (is_less or np.count_nonzero(used.extra)):
         return False
-    if np.count_nonzero(used.merged):  # one of two that share a detection may be hidden instead
-        by = used.detections
-        is_shared = (by >= 0) & ((by[..., None] == by[:, None]).sum(axis=2) > 1)
+    if np.count_nonzero(used.merged):  # one of the two may be hidden
+        met_by = used.detections
+        is_shared = (met_by >= 0) & ((met_by[..., None] == met_by[:, None]).sum(axis=2) > 1)
         used = replace(used, shares=np.where(is_shared, 0.0, used.shares))
     inner = np.ix_(free, free)
     whole = replace(seen, shares=seen.weights, extra=np.zeros(seen.extra.shape))
@@ -237,49 +237,49 @@ def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseMo
 def insert(
     ranked: list[ScoredPose], new: ScoredPose, body: Body, free: Mask, rules: AcceptanceRules
 ) -> None:
-    """Keep a list of distinct poses, the most evident first; each covers those it stands for."""
+    """Insert a pose into a list of distinct ones, most evident first, or merge it with its like."""
     limit = float(chdtri(np.count_nonzero(free), 1 - rules.confidence))
     for k, old in enumerate(ranked):
         T_new = nearest_alike(new.T_world_object, body, old.T_world_object)
         away = np.where(free, twist_between(old.T_world_object, T_new), 0.0)
         if _are_one(old, new, away, free, limit, rules):
-            # of two as good the later says more
+            # of two that are as good the later is preferred
             is_better = _worth(new, rules, 0.01) > _worth(old, rules)
-            told, other = (new, old) if is_better else (old, new)
-            belief = beliefs([told.log_density, other.log_density])[1]
+            better, other = (new, old) if is_better else (old, new)
+            belief = beliefs([better.log_density, other.log_density])[1]
             if belief > 1 - rules.confidence:
-                told = _with_moments_of(told, other, belief, max(belief, 1 / limit), away)
-            ranked[k] = told
+                better = _with_moments_of(better, other, belief, max(belief, 1 / limit), away)
+            ranked[k] = better
             break
     else:
         ranked.append(new)
-    ranked.sort(key=lambda one: -one.log_density)
+    ranked.sort(key=lambda pose: -pose.log_density)
 
 
 def _with_moments_of(
-    told: ScoredPose, other: ScoredPose, belief: float, apart: float, away: Floats
+    pose: ScoredPose, other: ScoredPose, belief: float, apart: float, away: Floats
 ) -> ScoredPose:
-    """A pose with the covariance about it of both, where the other, a twist (6,) away, may be it.
+    """Return a pose with the covariance, about itself, of a mixture with another one.
 
-    The other may be it by a `belief`, and its distance counts by `apart`.
+    `belief` is the share of the other, and `apart` the weight of the twist (6,) between them.
     """
     covariance, persistent = (
-        (1 - belief) * own + belief * beside
-        for own, beside in (
-            (told.covariance, other.covariance),
-            (told.persistent, other.persistent),
+        (1 - belief) * of_pose + belief * of_other
+        for of_pose, of_other in (
+            (pose.covariance, other.covariance),
+            (pose.persistent, other.persistent),
         )
     )
     covariance += apart * away[:, None] * away
-    spread = None if told.spread is None else np.sqrt(covariance.diagonal())
-    return replace(told, covariance=covariance, persistent=persistent, spread=spread)
+    spread = None if pose.spread is None else np.sqrt(covariance.diagonal())
+    return replace(pose, covariance=covariance, persistent=persistent, spread=spread)
 
 
 def _worth(pose: ScoredPose, rules: AcceptanceRules, more: float = 0.0) -> tuple[bool, float]:
-    """Which of two poses on one peak stands for both: what is likelier clutter for no other.
+    """Return the key by which the larger of two poses on one peak stands for both.
 
-    That residuals are larger than those before them is as rare as that a sure pose is wrong, though
-    more spots are off for smaller ones.
+    Residuals larger than before are as rare as a sure pose that is wrong, even if the smaller ones
+    of the other pose have more spots that are off.
     """
     doubt = rules.log_doubt * int(pose.residual_ratio > 1)
     return pose.log_evidence > 0, pose.log_density + doubt + more
@@ -288,68 +288,68 @@ def _worth(pose: ScoredPose, rules: AcceptanceRules, more: float = 0.0) -> tuple
 def _are_one(
     a: ScoredPose, b: ScoredPose, away: Floats, free: Mask, limit: float, rules: AcceptanceRules
 ) -> bool:
-    """Whether two poses, a twist (6,) apart, are on one peak of which one is not the top."""
+    """Test whether two poses, a twist (6,) apart, are on one peak of the likelihood."""
     both = (a.covariance + b.covariance + a.bent)[free][:, free]
     inside = bool(away[free] @ inverted(both) @ away[free] < limit)
-    # those of a likelihood may be drawn to different priors; tilts of a flat body are two
+    # poses of single ranges may have different priors; two tilts of a flat body are not one pose
     turned = math.hypot(*away[3:].tolist())
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 
-def met_by_one(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
-    """Sensors that should see a body and that its pose is not of, as one alone meets most of it.
+def unconfirming_sensors(judged: ScoredPose, rules: AcceptanceRules) -> list[str]:
+    """Return the other sensors with the body in view, if a single sensor meets most of it.
 
-    None where two do.
+    The list is empty if several sensors do, or none.
     """
-    seen, of, others = judged.matches, list[str](), list[str]()
-    given = zip(seen.names, seen.coverage.tolist(), seen.expected.tolist(), strict=True)
-    for name, coverage, expected in given:
+    seen, meeting, others = judged.matches, list[str](), list[str]()
+    rows = zip(seen.names, seen.coverage.tolist(), seen.expected.tolist(), strict=True)
+    for name, coverage, expected in rows:
         if coverage >= rules.agreeing and name not in judged.left_out:
-            of.append(name)
+            meeting.append(name)
         elif expected > 0:
             others.append(name)
-    return others if len(of) == 1 else []
+    return others if len(meeting) == 1 else []
 
 
-def others_miss(
+def is_seen_elsewhere(
     judged: ScoredPose, before: Floats, agreed: bool, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
-    """Whether one sensor alone meets most of the body, and another sees as much elsewhere.
+    """Test whether a single sensor meets most of the body while another sees as much elsewhere.
 
-    `before` are squares and degrees of freedom (2,) of residuals of the frames before; where two
-    sensors `agreed` in one of them, others may miss the body now.
+    `before` has squares and degrees of freedom (2,) of the residuals of earlier frames, in one of
+    which two sensors may have `agreed`: then detections elsewhere count only about the body.
     """
     used = judged.matches  # of sensors that are left out as well
     if len(used.images) < 2 or (used.dimensions != 2).any():
         return False
     coverage, nearby, missed, count, met = (
-        used.summed(each) / used.images
-        for each in (used.coverage, used.unmatched_nearby, used.missed, used.count, used.met)
+        used.summed(values) / used.images
+        for values in (used.coverage, used.unmatched_nearby, used.missed, used.count, used.met)
     )
     *_, second, first = sorted(range(len(coverage)), key=coverage.tolist().__getitem__)
     if not coverage[second] < rules.agreeing <= coverage[first]:
         return False
-    # beside the body, or, where no two ever agreed, anywhere
-    beside, needed = nearby, missed
+    # detections of no feature, about the body or, if no two sensors ever agreed, anywhere
+    unmatched, needed = nearby, missed
     if not agreed:
-        beside, needed = count - met, np.full(len(met), met[first])
-    sees = (needed > 0) & (beside >= rules.agreeing * needed)
+        unmatched, needed = count - met, np.full(len(met), met[first])
+    sees = (needed > 0) & (unmatched >= rules.agreeing * needed)
     sees[first] = False
-    # what each meets is of the body, against detections anywhere near
+    # odds that what a sensor meets is the body, against detections anywhere near
     variance = _variance(before, model, model.errors.typical)
     v = min(variance, model.usual**2) + used.extra
     odds = np.log(model.errors.met**2 / (2 * v)) - used.squared / (2 * v)
-    odds = used.summed(np.vecdot(used.shares, odds) * used.each_part)
+    odds = used.summed(np.vecdot(used.shares, odds) * used.coordinate_weight)
     return bool((odds[sees] < -rules.log_doubt).any())
 
 
-def two_agree(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> bool:
-    """Whether two sensors meet most of the body where one pose has it, no farther off than chance.
+def has_two_agreeing(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> bool:
+    """Test whether two sensors meet most of the body at a pose, no farther off than chance.
 
-    One that is off by more than noise as the most exact of them has it sees it elsewhere.
+    A sensor that is off by more than the noise of the most exact one sees the body elsewhere.
     """
     used = judged.used
-    squares, degrees = (used.summed(each) for each in (used.squares, used.measurements))
+    squares, degrees = (used.summed(values) for values in (used.squares, used.measurements))
     variances = squares / np.maximum(degrees, 1e-12)
     meet = used.covered >= rules.agreeing
     least = max(float(variances[meet].min(initial=np.inf)), model.usual**2)
@@ -358,21 +358,21 @@ def two_agree(judged: ScoredPose, rules: AcceptanceRules, model: NoiseModel) -> 
 
 
 def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
-    """Of the noise so far (2,), squares and degrees of freedom, or what is typical before that."""
+    """Return the variance of squares and degrees of freedom (2,), or the typical one of too few."""
     is_known = before[1] >= model.known
     return max(float(before[0] / before[1]), LEAST_VARIANCE) if is_known else typical**2
 
 
 def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: NoiseModel) -> bool:
-    """Whether features are met far beyond the noise so far (2,), squares and degrees of freedom.
+    """Test whether residuals are far beyond the noise so far (2,), squares and degrees of freedom.
 
-    Where that is not known, half as far beyond what is typical: half of σ_ε; right geometry has
-    0.2.  What errs by more than noise counts less, and a few far off not at all.
+    As long as the noise is unknown the limit is half of σ_ε, from half of the typical error; right
+    geometry has 0.2.  Detections with extra variance count less, a few that are far off do not.
     """
     variance = _variance(before, model, model.errors.typical / 2)
     wide, met = variance + used.extra, used.shares > 0
     far = model.errors.are_off(used, wide)
-    # where most of a sensor are far off it is out of step, or turned
+    # a sensor with most features far off is out of step or turned: these do count
     far &= 2 * np.count_nonzero(far, axis=1, keepdims=True) <= met.sum(axis=1, keepdims=True)
     used = replace(used, shares=np.where(far, 0.0, used.shares * variance / wide))
     degrees, squares = sum(used.measurements.tolist()) - 6, sum(used.squares.tolist())
@@ -380,9 +380,9 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
-    """Of those that look like poses (..., 4, 4), the ones turned least against a reference.
+    """Return the look-alikes of poses (..., 4, 4) that are turned least against a reference.
 
-    Or against the world.
+    Without a reference, against the world.
     """
     if len(body.symmetries) == 1:
         return T_world_object
@@ -391,13 +391,13 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     # the angle grows as the trace of the difference falls
     traces = body.symmetries[:, :3, :3] * turned.swapaxes(-1, -2)[..., None, :, :]
     nearest = traces.sum(axis=(-2, -1)).argmax(axis=-1)
-    # the very same, where it is that: what was worked out for it holds
+    # the same array, if nothing is turned: results cached for it are valid
     is_same = not np.count_nonzero(nearest - body.identity)
     return T_world_object if is_same else T_world_object @ body.symmetries[nearest]
 
 
 def beliefs(logs: Sequence[float]) -> list[float]:
-    """Share of each among rivals, by their log odds against anything; even where none has any."""
+    """Return the shares of rivals of these log odds; equal shares if all are −∞."""
     top = max(logs, default=0.0)
-    odds = [math.exp(each - top) if top > -math.inf else 1.0 for each in logs]
-    return [each / sum(odds) for each in odds]
+    odds = [math.exp(log - top) if top > -math.inf else 1.0 for log in logs]
+    return [share / sum(odds) for share in odds]

@@ -1,8 +1,8 @@
-"""How many detections belong to nothing, as the frames before tell it.
+"""Odds from the number of false detections, given the numbers in earlier frames.
 
-Of the M detections of a frame the body leaves M − n to clutter, which without it has all of them.
-Their number is Poisson's, of a rate with the Gamma distribution (c + ½, T) of which T frames have
-shown c; or, where a frame shows what is new, of the rate M at which it shows them itself.
+Of the M detections of a frame M − n are false where a pose meets n of them, and all M without the
+body.  Their number is Poisson distributed, with a rate of the Gamma distribution (c + ½, T) after c
+in T frames; or, where something new came into view, with the rate M that the frame itself shows.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from mixpose.matching import Matches
 
 @dataclass(frozen=True)
 class ClutterRates:
-    """What sensors saw beside the body in the frames before, all of which are sure of it."""
+    """False detections in earlier frames, all of which are sure of the body's pose."""
 
-    # by sensor: detections that belonged to nothing, and frames
+    # by sensor: the number of false detections, and of frames
     seen: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def followed(self, used: Matches, memory: float) -> ClutterRates:
-        """With what is left of one more frame; of those before it `memory` is kept."""
+        """Return the counts with those of one more frame; earlier ones fade by `memory`."""
         seen = dict(self.seen)
         for name, count, met in zip(used.names, used.count.tolist(), used.met.tolist()):
-            left, frames = seen.get(name, (0.0, 0.0))
-            seen[name] = memory * left + max(count - met, 0.0), memory * frames + 1
+            false, frames = seen.get(name, (0.0, 0.0))
+            seen[name] = memory * false + max(count - met, 0.0), memory * frames + 1
         return ClutterRates(seen)
 
     def log_odds(self, used: Matches, log_new: float) -> float:
-        """By how much likelier the number of detections is with the body than of clutter alone.
+        """Return the log odds, by the number of detections, of the body against clutter alone.
 
-        Beyond what clutter of the rate that the frame itself shows makes of it, which counts where
-        something is new: `log_new` is the log of how often that is.
+        `log_new` is the log probability that something new came into view, so that the rate is that
+        of the frame itself.
         """
         with_body, alone = 0.0, 0.0
-        images = used.images[used.owner]  # a cloud has three, which show the same
+        images = used.images[used.owner]  # a cloud has three, all of the same points
         rows = zip(used.names, used.count.tolist(), used.met.tolist(), images.tolist())
         for name, count, met, shown in rows:
             if name in self.seen and count > 0:
@@ -50,9 +50,9 @@ class ClutterRates:
         return float(odds[0] - odds[1])
 
     def _log_ratio(self, name: str, number: float, rate: float) -> float:
-        """Of the chances of a number of false detections: of what was seen, to that of a rate."""
-        left, frames = self.seen[name]
-        shape = left + 0.5
-        told = math.lgamma(number + shape) - math.lgamma(shape)
-        told += shape * math.log(frames / (frames + 1))
-        return told - number * math.log((frames + 1) * rate) + rate
+        """Return the log ratio of the probabilities of a number by earlier frames and by a rate."""
+        false, frames = self.seen[name]
+        shape = false + 0.5
+        log_chance = math.lgamma(number + shape) - math.lgamma(shape)
+        log_chance += shape * math.log(frames / (frames + 1))
+        return log_chance - number * math.log((frames + 1) * rate) + rate

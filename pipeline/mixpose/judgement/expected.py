@@ -1,4 +1,4 @@
-"""The covariance that a frame is expected to give, of sensors and a body alone."""
+"""The covariance to expect from one frame, given only sensors and a body."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def expected_covariance(
     T_world_object: Floats,
     free: Mask,
 ) -> tuple[Floats, list[int]]:
-    """Covariance that one frame gives when every feature in view is found with error σ_ε.
+    """Return the covariance of a pose if every feature in view is detected with an error of σ_ε.
 
-    As `invert_information` has it, in the axes of `mixpose.rigid`; and the number of features
-    that each sensor sees.
+    It is that of `invert_information`, in the axes of `mixpose.rigid`.  Also returned is the number
+    of features in view of each sensor.
     """
     images, deviations, first = as_images(sensors, sigmas)
-    at = project_body(images, body).project(T_world_object[None])
-    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(deviations)[:, None]
+    match = project_body(images, body).project(T_world_object[None])
+    J, weights = match.J[:, 0], match.weights[:, 0] / np.square(deviations)[:, None]
     information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
-    counts = np.rint(at.weights[first, 0].sum(axis=1)).astype(int).tolist()
+    counts = np.rint(match.weights[first, 0].sum(axis=1)).astype(int).tolist()
     return invert_information(information, free), counts

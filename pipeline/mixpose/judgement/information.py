@@ -1,4 +1,4 @@
-"""What met features tell of a pose, and the covariance that is its inverse."""
+"""Information about a pose from the features met, and the covariance that is its inverse."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from scipy.linalg.lapack import dposv
 from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
 
-_SMALLEST = 1e-14  # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+_SMALLEST = 1e-14  # eigenvalue of a matrix of diagonal 1 that float64 tells from zero
 
 
 def inverted(information: Floats) -> Floats:
-    """The inverse of an information matrix (k, k).
+    """Return the inverse of an information matrix (k, k).
 
-    Directions that the data leave open get the variance that their information says: large, and
-    at most what float64 can invert.
+    Variances of directions that the data leave open are large, bounded by what float64 can invert.
     """
     if not information.size:
         return information
@@ -33,24 +32,24 @@ def inverted(information: Floats) -> Floats:
 
 @lru_cache(maxsize=16)
 def unit(size: int) -> Floats:
-    """The unit matrix, not to be written to."""
+    """Return the unit matrix, shared and read-only."""
     unit = np.eye(size)
     unit.flags.writeable = False
     return unit
 
 
-def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (..., 6, 6) over the met features, for noise (..., L) in σ_ε².
+def information_of(matches: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
+    """Return Σ_l Σ_i J_iᵀ J_i / s_l² (..., 6, 6) over the features met, for noise (..., L) in σ_ε².
 
-    What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
+    With `spreads`, covariances (..., N, 3, 3) of features in the world, it is smaller.
     """
-    *poses, sensors, n, m, _ = found.J.shape
-    weights = found.shares * found.each_part[:, None] / (variances[..., None] + found.extra)
-    rows = np.sqrt(weights)[..., None, None] * found.J
+    *poses, sensors, n, m, _ = matches.J.shape
+    weights = matches.shares * matches.coordinate_weight[:, None]
+    rows = np.sqrt(weights / (variances[..., None] + matches.extra))[..., None, None] * matches.J
     if spreads is None:
         rows = rows.reshape(*poses, sensors * n * m, 6)
         return np.asarray(rows.swapaxes(-2, -1) @ rows)
-    # of each feature the coordinates of all sensors err together
+    # the error of a feature is common to the coordinates of all sensors
     rows = rows.swapaxes(-4, -3).reshape(*poses, n, sensors * m, 6)
     by_place = rows[..., :3]
     errors = np.eye(sensors * m) + by_place @ spreads @ by_place.swapaxes(-2, -1)
@@ -59,10 +58,10 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
 
 
 def invert_information(information: Floats, free: Mask) -> Floats:
-    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
+    """Return the covariance (6, 6) of free directions; infinite in those without information."""
     inner, covariance = np.ix_(free, free), np.zeros((6, 6))
     covariance[inner] = inverted(information[inner])
-    # so much larger than if all other directions were known
+    # by how much a variance is larger than if all other directions were known
     inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
     unknown = inflation > 1e9
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
@@ -71,9 +70,9 @@ def invert_information(information: Floats, free: Mask) -> Floats:
 
 
 def log_determinants(information: Floats, least: Floats) -> Floats:
-    """Logarithms (K,) of determinants of matrices (K, k, k) of at least diag `least` (K, k).
+    """Return the log determinants (K,) of matrices (K, k, k) that are at least diag `least` (K, k).
 
-    Where data are so exact that this is rounded away, what they leave open is still that.
+    The bound holds even where it is rounded away beside very exact data.
     """
     signs, logs = np.linalg.slogdet(information)
     for i in np.flatnonzero(~(signs > 0)).tolist():

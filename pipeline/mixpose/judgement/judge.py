@@ -1,4 +1,4 @@
-"""What a pose is worth: matches, noise, covariance, and how sure it is that the body is there."""
+"""Judge a pose: its matches, noise and covariance, and the evidence that the body is there."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from mixpose.records import Floats, Indices, Mask, SensorReport
 
 
 class Case(NamedTuple):
-    """A pose to be judged, and what is known before its frame."""
+    """A pose to be judged, with what is known before its frame."""
 
     objective: MatchedObjective
     T_world_object: Floats  # (4, 4)
     before: RememberedNoise = RememberedNoise()
     clutter: ClutterRates = ClutterRates()
     prior: Prior | None = None
-    # as the fit has them
+    # from the fit, if it has them
     matches: Matches | None = None
     noise: NoiseEstimate | None = None
 
     @property
     def body(self) -> Body:
-        """The object whose pose it is."""
+        """The body whose pose it is."""
         return self.objective.projection.body
 
 
@@ -48,47 +48,47 @@ class JudgementRules:
     noise: NoiseModel = NoiseModel()
 
 
-# deviations of what a frame leaves open, in those of where nothing is known: a turn is any, and a
-# place is farther away than anybody looks
+# standard deviations of directions that a frame leaves open, over those of the flat prior: the body
+# is turned in any way and farther away than any place that is searched
 _FARTHEST = np.repeat([100.0, 1 / math.sqrt(3)], 3)
 MEETS_NOTHING = "it meets nothing of the body"
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """A pose, and how well it explains the frame."""
+    """A pose with how well it explains the frame."""
 
     T_world_object: Floats  # (4, 4)
-    matches: Matches  # against each sensor that saw something
+    matches: Matches  # in all sensors that saw something
     covariance: Floats  # (6, 6) zero in directions that are not estimated
-    log_evidence: float  # logarithm of the odds for this pose against mere clutter
-    noise: RememberedNoise = RememberedNoise()  # of this frame and those before it, for the next
-    log_missed: float = DetectionModel().log_missed  # what a feature costs that is not met
+    log_evidence: float  # log odds of the pose against mere clutter
+    noise: RememberedNoise = RememberedNoise()  # of frames up to this one, for the next
+    log_missed: float = DetectionModel().log_missed  # log odds of a feature that is missed
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
-    persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of it, what lasts
-    # (L,) of the noise, of those used
-    variances: Floats = field(default_factory=lambda: np.ones(1))
+    # (6, 6) part of the covariance by fields that last from frame to frame
+    persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    variances: Floats = field(default_factory=lambda: np.ones(1))  # (L,) of noise, of `used`
     residual_ratio: float = 0.0  # of its residuals to the largest that chance makes
-    # (6, 6) where features are off by all that the body's spreads allow
+    # (6, 6) covariance if features are off by as much as the body's spreads allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
-    # log odds that there may be a pose elsewhere as well, of single ranges; None: not asked
+    spread: Floats | None = None  # (6,) standard deviations, where as large as its motion
+    # log odds that a better pose of single ranges was not looked at; None: not computed
     elsewhere: float | None = None
-    by_count: float = 0.0  # by how much its evidence is larger as it pays by count, not by volume
+    by_count: float = 0.0  # log evidence by count, less that by volume
     proposer: str = ""  # where the pose came from
-    blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted
-    T_moved: Floats | None = None  # (4, 4) the pose by whose prior it was judged, if not its own
+    blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, at which it was fitted
+    T_moved: Floats | None = None  # (4, 4) the pose whose prior it has, if not its own
 
     @cached_property
     def used(self) -> Matches:
-        """The matches of the sensors that took part."""
+        """The matches of the sensors that are not left out."""
         return taken_part(self.matches, self.left_out)
 
     @property
     def log_density(self) -> float:
-        """Logarithm of its probability among poses of the body, but for what they have in common.
+        """Log probability among poses of the body, up to a common constant.
 
-        Whichever they pay by against clutter, among themselves all pay by volume.
+        Against clutter a pose may pay by count; among themselves all pay by volume.
         """
         return self.log_evidence - self.by_count
 
@@ -104,7 +104,7 @@ class ScoredPose:
 
     @property
     def gained(self) -> float:
-        """Log evidence per coordinate that is met."""
+        """Log evidence per coordinate met."""
         return self.log_evidence / max(self.measurements, 1.0)
 
     @cached_property
@@ -121,19 +121,19 @@ class ScoredPose:
     def reports(
         self, residuals: Mapping[str, Mapping[str, float | None]]
     ) -> dict[str, SensorReport]:
-        """How each sensor took part, with residuals of features by sensor."""
-        found = self.matches
-        idle = [name for name, met in zip(found.names, found.met.tolist()) if not met]
-        out = dict.fromkeys(idle, MEETS_NOTHING) | dict(self.left_out)
-        rows = zip(found.explained.tolist(), found.rms)
+        """Report how each sensor took part; `residuals` are by sensor and feature."""
+        matches = self.matches
+        idle = [name for name, met in zip(matches.names, matches.met.tolist()) if not met]
+        why = dict.fromkeys(idle, MEETS_NOTHING) | dict(self.left_out)
+        rows = zip(matches.explained.tolist(), matches.rms)
         return {
-            name: SensorReport(name not in out, *row, out.get(name), residuals.get(name, {}))
-            for name, row in zip(found.names, rows)
+            name: SensorReport(name not in why, *row, why.get(name), residuals.get(name, {}))
+            for name, row in zip(matches.names, rows)
         }
 
 
 def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
-    """The matches of the sensors that are not left out."""
+    """Return the matches of the sensors that are not left out."""
     kept = [name not in left_out for name in matches.names]
     return matches if all(kept) else matches.of_sensors(kept)
 
@@ -151,7 +151,7 @@ def judge(
     matches: Matches | None = None,
     noise: NoiseEstimate | None = None,
 ) -> ScoredPose:
-    """Judge a pose, estimated in free directions (6,); arguments as in `Case`."""
+    """Judge a pose that was estimated in free directions (6,); arguments as in `Case`."""
     return judge_together(
         [Case(objective, T_world_object, before, clutter, prior, matches, noise)],
         free,
@@ -166,36 +166,36 @@ def judge_together(
     rules: JudgementRules = JudgementRules(),
     left_out: Mapping[str, str] | None = None,
 ) -> list[ScoredPose]:
-    """Judge K poses that the same sensors see and take part in; those left out meet nothing."""
-    left_out, whole, noises, counted = left_out or {}, [], [], []
+    """Judge K poses in the same sensors; sensors that are left out count as meeting nothing."""
+    left_out, all_matches, noises, clutter_odds = left_out or {}, [], [], []
     association = rules.association, rules.noise.errors.narrowest
     for case in cases:
-        at = case.objective, case.T_world_object
-        whole.append(case.matches or associate(*at, *association))
+        posed = case.objective, case.T_world_object
+        all_matches.append(case.matches or associate(*posed, *association))
         anywhere = flat_prior(case.body, free, rules.detection)[1]
-        known = case.prior[1] if case.prior else anywhere
-        part = taken_part(whole[-1], left_out)
-        given = case.before, rules.noise, case.noise, known, _FARTHEST * anywhere
-        noises.append(noise_of(part, free, *given))
-        counted.append(case.clutter.log_odds(part, rules.detection.log_blind))
+        uncertainty = case.prior[1] if case.prior else anywhere
+        used = taken_part(all_matches[-1], left_out)
+        known_before = case.before, rules.noise, case.noise, uncertainty, _FARTHEST * anywhere
+        noises.append(noise_of(used, free, *known_before))
+        clutter_odds.append(case.clutter.log_odds(used, rules.detection.log_blind))
     # one pose needs no axis of poses
-    variances, seen = noises[0][0], whole[0]
+    variances, stacked = noises[0][0], all_matches[0]
     if len(cases) > 1:
-        variances, seen = np.array([noise[0] for noise in noises]), Matches.stacked(whole)
+        variances, stacked = np.array([noise[0] for noise in noises]), Matches.stacked(all_matches)
     if left_out:
-        used = np.array([name not in left_out for name in whole[0].names])
-        measured, variances = variances, np.ones((*variances.shape[:-1], len(used)))
-        variances[..., used] = measured
-        seen = replace(seen, shares=seen.shares * used[:, None])
-    odds, bent, chances = _evidence(cases, seen, variances, free, rules.detection)
-    evidence, densities = odds + counted + [noise[-1] for noise in noises]
+        is_used = np.array([name not in left_out for name in all_matches[0].names])
+        measured, variances = variances, np.ones((*variances.shape[:-1], len(is_used)))
+        variances[..., is_used] = measured
+        stacked = replace(stacked, shares=stacked.shares * is_used[:, None])
+    log_odds, bent, chances = _evidence(cases, stacked, variances, free, rules.detection)
+    evidence, densities = log_odds + clutter_odds + [noise[-1] for noise in noises]
     shares = chances
     if chances.any():
         shares = _share_of_bent(chances, int(free.sum()), 1 - rules.noise.by_chance)
     return [
         ScoredPose(
             case.T_world_object,
-            whole[k],
+            all_matches[k],
             (1 - shares[k]) * covariance + shares[k] * bent[k],
             float(evidence[k]),
             noise=remembered.bent_once(chances[k], rules.noise.bias_memory)
@@ -205,66 +205,66 @@ def judge_together(
             left_out=left_out,
             persistent=persistent,
             residual_ratio=ratio,
-            variances=own,
+            variances=own_variances,
             bent=bent[k],
             by_count=float(evidence[k] - densities[k]) if evidence[k] > -np.inf else 0.0,
         )
-        for k, (case, (own, covariance, persistent, remembered, ratio, _)) in enumerate(
+        for k, (case, (own_variances, covariance, persistent, remembered, ratio, _)) in enumerate(
             zip(cases, noises, strict=True)
         )
     ]
 
 
 def _evidence(
-    cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
+    cases: Sequence[Case], matches: Matches, variances: Floats, free: Mask, model: DetectionModel
 ) -> tuple[Floats, Floats, Floats]:
-    """Log odds (2, K) as in `log_evidence`; of bodies that give way also covariances (K, 6, 6).
+    """Return log odds (2, K) as `log_evidence`, and covariances (K, 6, 6) and chances (K,) if bent.
 
-    These are of where they are bent, with the chances (K,) that they are.
+    The latter are zero of bodies without spreads.
     """
     bodies = [case.body for case in cases]
-    priors = [case.prior or flat_prior(case.body, free, detection) for case in cases]
+    priors = [case.prior or flat_prior(case.body, free, model) for case in cases]
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
     bent, chances = np.zeros((len(cases), 6, 6)), np.zeros(len(cases))
-    given = seen, variances, free, priors, sizes, detection
-    surfaces = _surfaces_of(bodies, (*sizes.shape, seen.shares.shape[-1]))
-    evidence = log_evidence(*given, information_of(seen, variances), None, surfaces)
+    arguments = matches, variances, free, priors, sizes, model
+    surfaces = _surfaces_of(bodies, (*sizes.shape, matches.shares.shape[-1]))
+    evidence = log_evidence(*arguments, information_of(matches, variances), None, surfaces)
     if soft := [k for k, body in enumerate(bodies) if body.spread]:
-        spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
+        spreads = np.zeros((*sizes.shape, matches.shares.shape[-1], 3, 3))
         by_pose = spreads.reshape(len(cases), *spreads.shape[-3:])
-        for own, body, case in zip(by_pose, bodies, cases, strict=True):
-            turned = body.node_spreads(case.T_world_object)
-            own[: len(turned)] = turned
-        information = information_of(seen, variances, spreads)
-        bent_odds = log_evidence(*given, information, spreads, surfaces)
+        for spreads_of_pose, body, case in zip(by_pose, bodies, cases, strict=True):
+            by_node = body.node_spreads(case.T_world_object)
+            spreads_of_pose[: len(by_node)] = by_node
+        information = information_of(matches, variances, spreads)
+        bent_odds = log_evidence(*arguments, information, spreads, surfaces)
         inner = np.ix_(free, free)
         for k in soft:
             bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
-            # as often the one and the other as in frames before
-            rigid, bend = cases[k].before.log_bent
-            likely = np.array([rigid + evidence[:, k], bend + bent_odds[:, k]])
-            evidence[:, k] = np.logaddexp(*likely)
-            if np.isfinite(likely).all():
-                chances[k] = expit(likely[1, 1] - likely[0, 1])
+            # rigid and bent are as probable as in the frames before
+            rigid_prior, bent_prior = cases[k].before.log_bent
+            log_joint = np.array([rigid_prior + evidence[:, k], bent_prior + bent_odds[:, k]])
+            evidence[:, k] = np.logaddexp(*log_joint)
+            if np.isfinite(log_joint).all():
+                chances[k] = expit(log_joint[1, 1] - log_joint[0, 1])
     return evidence, bent, chances
 
 
 def _share_of_bent(chances: Floats, count: int, outside: float) -> Floats:
-    """Of covariances of bent bodies (K,), so that ellipsoids of that share hold all but some poses.
+    """Return the share (K,) of the covariance of the bent body in that of the pose.
 
-    Of a body that is bent by a chance p, 1 - outside / p of its poses where it is bent are to be
-    inside; at least p of it, as of a mixture.
+    For a body that is bent by a chance p, 1 - outside / p of the bent poses have to be inside the
+    ellipsoid; the share is at least p, as in a mixture.
     """
-    rest = np.minimum(outside / np.maximum(chances, 1e-300), 1.0)
-    return np.asarray(np.maximum(chdtri(count, rest) / chdtri(count, outside), chances))
+    tail = np.minimum(outside / np.maximum(chances, 1e-300), 1.0)
+    return np.asarray(np.maximum(chdtri(count, tail) / chdtri(count, outside), chances))
 
 
 def _surfaces_of(bodies: Sequence[Body], shape: tuple[int, ...]) -> Indices | None:
-    """Surfaces (K, N) of bodies side by side, -1 of none; None where no body has any."""
+    """Return the surface of each feature (K, N), -1 for none; None if no body has surfaces."""
     if all(body.surfaces is None for body in bodies):
         return None
-    surfaces = np.full(shape, -1)
-    for own, body in zip(surfaces.reshape(len(bodies), -1), bodies, strict=True):
+    stacked = np.full(shape, -1)
+    for of_body, body in zip(stacked.reshape(len(bodies), -1), bodies, strict=True):
         if body.surfaces is not None:
-            own[: len(body.surfaces)] = body.surfaces
-    return surfaces
+            of_body[: len(body.surfaces)] = body.surfaces
+    return stacked

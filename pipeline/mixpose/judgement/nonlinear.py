@@ -1,7 +1,7 @@
-"""Ellipsoids that hold the pose where what a sensor sees is not linear in how it is turned.
+"""Covariances whose ellipsoids hold the pose although images are not linear in its turns.
 
-A covariance is the curvature of the likelihood at the pose.  Of wide turns that is not all: the
-origin goes along an arc, and the likelihood may fall more slowly than at the pose, as of a flat
+A covariance is the curvature of the likelihood at the pose, which is not enough for wide turns: the
+origin goes along an arc, and away from the pose the likelihood may fall more slowly, as of a flat
 body that nearly faces its one camera, where turns to either side look almost alike.
 """
 
@@ -23,11 +23,11 @@ from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, twist_between
 
 _LEAST_TURN = 0.01  # rad: the origin leaves its tangent by 5e-5 of its lever
-_WIDEST_TURN = 1.0  # rad: what is turned by more is another pose
+_WIDEST_TURN = 1.0  # rad: a wider turn is another pose
 _HELD = float(chdtri(6, 1e-3))  # squared deviations of the ellipsoid of 99.9 %
 _RAYS = 12
-# as far as that ellipsoid, and up to twice, between which the likelihood is as good as normal: up
-# to eight times finds no more of boards, triangles and bars at 4 to 40 times their size
+# on each ray, from the edge of that ellipsoid to twice as far: going eight times as far finds no
+# more of boards, triangles and bars at 4 to 40 times their size
 _REACHES = np.array([1.0, 1.4, 2.0])
 _STEPS = 3
 
@@ -35,16 +35,16 @@ _STEPS = 3
 def with_likely_turns(
     covariance: Floats,  # (6, 6)
     T_world_object: Floats,  # (4, 4)
-    seen: Matches,  # there, by the sensors that took part
+    seen: Matches,  # at the pose, of the sensors that took part
     variances: Floats,  # (L,) of their noise, σ_ε²
     projection: BodyProjection,  # of these sensors
     free: Mask,
 ) -> Floats:
-    """A covariance (6, 6) whose ellipsoid of 99.9 % holds all turns that are as likely as its edge.
+    """Return a covariance (6, 6) whose ellipsoid of 99.9 % holds all turns as likely as its edge.
 
-    Turns are tried in the plane of the two that are least known, on rays, with all else as is
-    likeliest then.  Where a twist x at the edge of what is likely is m > h squared deviations away,
-    h at the ellipsoid's edge, the covariance grows by (1/h − 1/m) x xᵀ, which puts it there.
+    Turns are tried on rays in the plane of the two that are least known, with the other directions
+    at their likeliest.  If a twist x as likely as the edge is m > h squared deviations away, h at
+    the edge, the covariance grows by (1/h − 1/m) x xᵀ, which puts x on the edge.
     """
     if not _is_wide(covariance):
         return covariance
@@ -69,7 +69,7 @@ def with_likely_turns(
 
 
 def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -> Floats:
-    """A covariance (6, 6), wider where a turn may be so wide that the origin goes along an arc.
+    """Return a covariance (6, 6), enlarged if turns are so wide that the origin goes along an arc.
 
     By a turn ω about the middle of the features (N, 3) the origin, l away, goes by ω × l, but for
     ω × (ω × l)/2 towards the axis and ω³ l/6 back.  At the 3.3 σ of 99.9 % these are 5.4 σ² l and
@@ -92,13 +92,13 @@ def with_wide_turn(covariance: Floats, T_world_object: Floats, points: Floats) -
 
 
 def _is_wide(covariance: Floats) -> bool:
-    """Whether turns are so unsure that they are not linear; not where nobody knows them."""
+    """Test whether turns are so uncertain that images are not linear in them, yet not unknown."""
     return bool(_LEAST_TURN**2 < np.trace(covariance[3:, 3:]) < math.inf)
 
 
 @dataclass(frozen=True)
 class _Turns:
-    """The likelihood about a pose: a term of steps along axes, the first two of which turn it."""
+    """The likelihood near a pose, a term of steps along axes, the first two of which turn it."""
 
     T_world_object: Floats
     seen: Matches
@@ -117,7 +117,7 @@ class _Turns:
         projection: BodyProjection,
         free: Mask,
     ) -> _Turns | None:
-        """By the turns that are least known; None where none is unsure enough to matter."""
+        """Choose axes by the turns that are least known; None if no turn is wide enough."""
         inner = np.ix_(free, free)
         scale = np.sqrt(np.maximum(covariance[inner].diagonal(), 1e-300))
         values, vectors = np.linalg.eigh(covariance[inner] / np.outer(scale, scale))
@@ -134,30 +134,30 @@ class _Turns:
         return cls(T_world_object, seen, roots, projection, axes, curvature)
 
     def fallen(self, turns: Floats) -> tuple[Floats, Floats]:
-        """By how much −2 ln p falls (K,) at turns (K, 2), in deviations, and the poses (K, 4, 4).
+        """Return the increase (K,) of −2 ln p at turns (K, 2), in deviations, and poses (K, 4, 4).
 
-        Of noise as the covariance has it, which is not known as well as the curvature has it.
+        It is scaled to the noise of the covariance, which is wider than that of the curvature.
         """
         rest = np.arange(self.axes.shape[1]) > 1
         begun = perturb(self.T_world_object, turns @ self.axes[:, :2].T)
         ends = stepped(self, begun, lambda T, steps: perturb(T, steps @ self.axes.T), rest, _STEPS)
         wide = np.linalg.norm(turns @ self.axes[3:, :2].T, axis=1) > _WIDEST_TURN
-        # turns so wide may be such that nothing tells: they have no curvature either
+        # wide turns may be without curvature
         known = np.where(wide, np.inf, np.vecdot(turns @ self.curvature, turns))
-        fallen = 2 * (self._here - ends.values) * (np.vecdot(turns, turns) / known)
+        fallen = 2 * (self._at_pose - ends.values) * (np.vecdot(turns, turns) / known)
         return np.where(wide, np.inf, fallen), ends.states
 
     @cached_property
-    def _here(self) -> float:
-        """The value of ln p at the pose."""
+    def _at_pose(self) -> float:
+        """Value of ln p at the pose."""
         return -0.5 * float(np.sum((self.roots * self.seen.offsets.ravel()) ** 2))
 
     def linearise(self, states: Floats) -> Quadratic:
-        """Models of ln p at poses (K, 4, 4), by offsets from what the pose itself meets."""
-        at, seen = self.projection.project(states), self.seen
+        """Return models of ln p at poses (K, 4, 4), by the detections that the pose meets."""
+        match, seen = self.projection.project(states), self.seen
         sigmas = seen.sigmas[:, None, None]
-        r = (seen.places - at.y.swapaxes(0, 1)) / sigmas + seen.offsets
-        J = (at.J.swapaxes(0, 1) / sigmas[..., None]).reshape(len(states), -1, 6)
+        r = (seen.places - match.y.swapaxes(0, 1)) / sigmas + seen.offsets
+        J = (match.J.swapaxes(0, 1) / sigmas[..., None]).reshape(len(states), -1, 6)
         return squares_of(
             self.roots * r.reshape(len(states), -1), self.roots[:, None] * (J @ self.axes)
         )

@@ -1,4 +1,4 @@
-"""Matching: which feature is met by which detection, and how large their errors are."""
+"""Matching: the detections that meet features, and the size of their errors."""
 
 from mixpose.matching.associate import (
     AssociationRules as AssociationRules,

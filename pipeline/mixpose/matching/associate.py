@@ -1,7 +1,7 @@
-"""Which features of a predicted mixture the sensors have something at, and how far off.
+"""Associate the features of a predicted mixture with what sensors observed, with offsets.
 
-For detections, the nearest ones, each taken once; for grey values and profiles, the pull of what is
-left of the density once the neighbours' share of it is taken off.
+Features are met by the nearest detections, each of which is taken once; in grey values and profiles
+by the pull of the density that remains without the share of neighbouring features.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from mixpose.sensors import by_calibration, clouds_among, from_planes
 
 @dataclass(frozen=True)
 class AssociationRules:
-    """When a feature counts as met."""
+    """Thresholds of matches, and of the surroundings of a body."""
 
     min_share: float = constant(0.3, "of a feature's peak: within 2.2 σ_ε; false ones pass beyond")
     min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
     crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
     merged: bool = constant(True, "whether two features may share a detection: blobs that touch")
-    middle: float = constant(0.2, "σ_ε: of two that share one, which one of them may outshine")
+    middle: float = constant(0.2, "σ_ε: of a spot of two features, one of which may be brighter")
     alike: float = constant(
         0.01,
-        "of a feature's energy: those nearer than a seventh of C's deviation are not told apart",
+        "of a feature's energy: features within a seventh of C's deviation are not resolved",
     )
     both: float = constant(
-        0.6, "that a spot is of two features within its radius: P_D² / (1 - (1 - P_D)²)"
+        0.6, "probability that a spot is of two features in its radius: P_D² / (1 - (1 - P_D)²)"
     )
     slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
@@ -52,7 +52,7 @@ class AssociationRules:
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
+    """Match features predicted at a pose (4, 4) with observations; `narrowest` blur in σ_ε."""
     match, views = objective.match(T_world_object[None]), objective.views
     sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
@@ -61,38 +61,38 @@ def associate(
     detections, looks = _observed(tuple([view.observation for view in views]))
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = objective.variances.repeat(y.shape[1], axis=1)
-    if body.spread:  # variances along an axis by which features may be off
+    if body.spread:  # the reach grows by the variance of features along an axis
         spreads = body.node_spreads(T_world_object)
-        reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
-    # shares, offsets in sensor units, detections, and partners of features in merged pairs
+        reach = reach + [in_image(spreads, J_l[:, :m]) for J_l, m in zip(J, dimensions.tolist())]
+    # shares, offsets in sensor units, numbers of detections, and partners in merged pairs
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
-    shares, offsets, by, partner = met
+    shares, offsets, met_by, partner = met
     is_open = seen & (product > 0)[:, None]
     clouds = clouds_among(objective.projection.sensors)
-    others = _to_nearest(
+    neighbours = _to_nearest(
         y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
     grids = np.flatnonzero(objective.are_grids & is_open.any(axis=1)).tolist()
-    J = J.copy() if grids else J  # what was projected is used again
+    J = J.copy() if grids else J  # the projection is cached
     for k in grids:
-        of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
-        mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
-        shares[k, of], offsets[k, of, :m], J[k, of, :m] = _residuals(
-            *mixture, match.sampled[k, 0, of, : 1 + m], J[k, of, :m], amplitude, rules
+        in_view, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
+        mixture = y[k, in_view, :m], weights[k, in_view], float(objective.variances[k, 0])
+        shares[k, in_view], offsets[k, in_view, :m], J[k, in_view, :m] = _residuals(
+            *mixture, match.sampled[k, 0, in_view, : 1 + m], J[k, in_view, :m], amplitude, rules
         )
     J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    # what two features share is long for that
-    own = looks[np.arange(len(views))[:, None], np.where(partner < 0, by, -1)]
-    extra = own[..., 0] + rules.both * _beside(y, seen & (shares == 0), own[..., 1]) / (
+    # a detection of two features is long because of that, not cut
+    look = looks[np.arange(len(views))[:, None], np.where(partner < 0, met_by, -1)]
+    extra = look[..., 0] + rules.both * _to_missed(y, seen & (shares == 0), look[..., 1]) / (
         4 * (sigmas * sigmas)[:, None]
     )
     return Matches(
         extra=np.where(partner >= 0, rules.middle**2, extra),
-        radii=own[..., 1],
-        cut=own[..., 2:],
+        radii=look[..., 1],
+        cut=look[..., 2:],
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,
@@ -101,11 +101,11 @@ def associate(
         places=y,
         offsets=offsets / sigmas[:, None, None],
         J=J,
-        detections=by,
+        detections=met_by,
         explained=np.minimum(explained, 1.0),
         unseen=(match.faced[:, 0] & ~seen) @ body.nodes.weights,
         merged=merged,
-        beside=np.where(seen, np.sqrt(others) / sigmas[:, None], np.nan),
+        neighbour_distance=np.where(seen, np.sqrt(neighbours) / sigmas[:, None], np.nan),
         owners=owners_of(len(views), clouds),
         **_surroundings(objective, y, seen, shares, detections, rules, narrowest),
         by_calibration=_by_calibration(objective, T_world_object),
@@ -113,7 +113,7 @@ def associate(
 
 
 def owners_of(count: int, clouds: Sequence[Sequence[int]]) -> Indices | None:
-    """`Matches.owners` of so many images: those of a cloud are one sensor's."""
+    """Return `Matches.owners` of so many images: those of a cloud belong to one sensor."""
     if not clouds:
         return None
     owners = np.arange(count)
@@ -122,37 +122,37 @@ def owners_of(count: int, clouds: Sequence[Sequence[int]]) -> Indices | None:
     return owners
 
 
-@lru_cache(maxsize=8)  # of one frame, some poses of which are matched
+@lru_cache(maxsize=8)  # several poses of a frame are matched
 def _observed(observations: tuple[Observation, ...]) -> tuple[Floats, Floats]:
-    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has.
+    """Stack detections (L, M, 2) of L sensors, NaN beyond those of a sensor, and their looks.
 
-    And their looks (L, M + 1, 4), the last of none: the variance by which each errs more than
-    others, σ_ε²; its radius, sensor units, 0 where nobody knows; `Matches.cut`.
+    Looks (L, M + 1, 4) are the extra variance, σ_ε², the radius in sensor units, 0 if unknown, and
+    `Matches.cut`; the last row is that of no detection.
     """
-    patterns = [one.pattern for one in observations]
+    patterns = [observation.pattern for observation in observations]
     points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
     detections = np.full((len(points), max(map(len, points)) or 1, 2), np.nan)
     looks = np.zeros((len(points), detections.shape[1] + 1, 4))
     looks[..., 2:] = np.nan
-    for side, look, own, one in zip(detections, looks, points, observations):
-        side[: len(own)] = 0.0
-        side[: len(own), : own.shape[1]] = own
-        pattern, sigma = one.pattern, one.sigma
+    for stacked, look, places, observation in zip(detections, looks, points, observations):
+        stacked[: len(places)] = 0.0
+        stacked[: len(places), : places.shape[1]] = places
+        pattern, sigma = observation.pattern, observation.sigma
         if not isinstance(pattern, PointPattern) or (pattern.is_uniform and not pattern.has_radii):
             continue
-        look[: len(own), 0], look[: len(own), 1] = pattern.deviations / sigma, pattern.radii
+        look[: len(places), 0], look[: len(places), 1] = pattern.deviations / sigma, pattern.radii
         if pattern.cut is not None:
-            look[: len(own), 2:] = pattern.cut / [1.0, sigma]
+            look[: len(places), 2:] = pattern.cut / [1.0, sigma]
     looks[..., [0, 3]] *= looks[..., [0, 3]]
     detections.flags.writeable = looks.flags.writeable = False
     return detections, looks
 
 
-def _beside(y: Floats, missed: Mask, radii: Floats) -> Floats:
-    """Squared distances (L, n) from features at y (L, n, 2) to missed ones within their spots.
+def _to_missed(y: Floats, missed: Mask, radii: Floats) -> Floats:
+    """Return squared distances (L, n) from features at y (L, n, 2) to missed ones in their spots.
 
-    The farthest, and 0 without any.  Such a spot shows both as likely as not: the two of them look
-    whole, and it is at their middle.
+    The farthest counts; 0 for none.  Such a spot may well be of both features, which together look
+    whole, so that it lies at their middle.
     """
     farthest = np.zeros(radii.shape)
     for k in np.flatnonzero(missed.any(axis=1) & radii.any(axis=1)).tolist():
@@ -174,23 +174,22 @@ def _to_nearest(
     met: tuple[Floats, Floats, Indices, Indices],
     clouds: Sequence[Sequence[int]] = (),
 ) -> Floats:
-    """Write what the nearest detections meet, each taken once or by a pair of features.
+    """Match features with the nearest detections, each taken once or by a pair of features.
 
-    Images of one of the `clouds` are met together, by distances in space.
-
-    Returns squared distances (L, n) to the nearest detections but these.
+    Writes to `met`, and returns squared distances (L, n) to the nearest other detections.  Images
+    of one of the `clouds` are matched together, by distances in space.
     """
     shares, offsets, by, _ = met
     which, squared = _neighbours(y, detections, reach, clouds)
     k, i, at = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
     order = squared[k, i, at].argsort(kind="stable")
     pairs = k, i, j = np.array([k, i, which[k, i, at]])[:, order]
-    own = _in_turn(k * by.shape[1] + i, k * detections.shape[1] + j)
-    k, i, j = pairs[:, own]
+    accepted = _in_turn(k * by.shape[1] + i, k * detections.shape[1] + j)
+    k, i, j = pairs[:, accepted]
     shares[k, i], offsets[k, i], by[k, i] = weights[k, i], detections[k, j] - y[k, i], j
-    if merged and len(own) < len(order):
-        # only a feature near a detection that is taken can share it
-        in_clouds = {k for planes in clouds for k in planes}  # where points do not run together
+    if merged and len(accepted) < len(order):
+        # only features near a detection that is taken can share it
+        in_clouds = {k for planes in clouds for k in planes}  # whose points do not merge
         for k in set(np.unique(pairs[0][by[*pairs[:2]] < 0]).tolist()) - in_clouds:
             _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
     squared[which == by[..., None]] = np.nan
@@ -200,9 +199,9 @@ def _to_nearest(
 def _neighbours(
     y: Floats, detections: Floats, reach: Floats, clouds: Sequence[Sequence[int]]
 ) -> tuple[Indices, Floats]:
-    """The detections (L, n, K) that are nearest to features, and their squared distances.
+    """Return the detections (L, n, K) nearest to features, and their squared distances.
 
-    Two at least, and all within reach; NaN is the distance of those that there are not.
+    K is at least 2 and covers all within reach; the distance of missing ones is NaN.
     """
     most = detections.shape[1]
     if clouds or y.shape[1] * most <= DRAWING.few_pairs:
@@ -211,31 +210,32 @@ def _neighbours(
         for planes in clouds:  # each coordinate is in two of them
             squared[planes] = squared[planes].sum(axis=0) / 2
         return np.broadcast_to(np.arange(most), squared.shape), squared
-    trees = [cKDTree(own[own[:, 0] == own[:, 0]]) for own in detections]
+    trees = [cKDTree(places[places[:, 0] == places[:, 0]]) for places in detections]
     count, limit = 2, math.sqrt(float(reach.max(initial=0.0)))
     while True:
-        each = [tree.query(own, k=count) for tree, own in zip(trees, y)]
-        distances, which = (np.array(part) for part in zip(*each))
+        queries = [tree.query(places, k=count) for tree, places in zip(trees, y)]
+        distances, which = (np.array(part) for part in zip(*queries))
         if count >= most or float(distances[..., -1].min(initial=np.inf)) > limit:
             break
         count *= 2
     return which, np.where(np.isfinite(distances), distances * distances, np.nan)
 
 
-def _in_turn(one: Indices, other: Indices) -> Indices:
-    """Which pairs (P,) come to be, of those before which neither of the two was taken."""
-    taken, left = [], np.arange(len(one))
-    if len({*one.tolist()}) == len(one) == len({*other.tolist()}):
-        return left  # as a rule each has one
-    while len(left):
-        first, also = np.zeros(one.max() + 1, np.intp), np.zeros(other.max() + 1, np.intp)
-        first[one[left][::-1]] = also[other[left][::-1]] = left[::-1]
-        some = left[(first[one[left]] == left) & (also[other[left]] == left)]
-        taken.append(some)
-        first[:], also[:] = 0, 0
-        first[one[some]] = also[other[some]] = 1
-        left = left[(first[one[left]] | also[other[left]]) == 0]
-    return np.sort(np.concatenate(taken)) if taken else left
+def _in_turn(features: Indices, detections: Indices) -> Indices:
+    """Accept pairs (P,) in their order, unless one of the two was taken before; return numbers."""
+    taken, remaining = [], np.arange(len(features))
+    if len({*features.tolist()}) == len(features) == len({*detections.tolist()}):
+        return remaining  # as a rule no pair competes with another
+    while len(remaining):
+        i, j = features[remaining], detections[remaining]
+        by_i, by_j = np.zeros(features.max() + 1, np.intp), np.zeros(detections.max() + 1, np.intp)
+        by_i[i[::-1]] = by_j[j[::-1]] = remaining[::-1]
+        accepted = remaining[(by_i[i] == remaining) & (by_j[j] == remaining)]
+        taken.append(accepted)
+        by_i[:], by_j[:] = 0, 0
+        by_i[features[accepted]] = by_j[detections[accepted]] = 1
+        remaining = remaining[(by_i[i] | by_j[j]) == 0]
+    return np.sort(np.concatenate(taken)) if taken else remaining
 
 
 def _run_together(
@@ -247,7 +247,7 @@ def _run_together(
 ) -> None:
     """Let two features share a detection that lies nearer to their middle than to either.
 
-    Images that overlap are detected as one.  The two count as one feature in their middle.
+    Images that overlap are detected as a single spot, and the two count as one feature there.
     """
     shares, offsets, detections, partner = met
     single = shares > 0
@@ -273,19 +273,18 @@ def _residuals(
     amplitude: float,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Floats]:
-    """Shares, offsets and Jacobians (n, m, 6) of features (n, m) that a grid of values is seen at.
+    """Return shares, offsets and Jacobians (n, m, 6) of features (n, m) in a grid of values.
 
-    C is the predicted mixture blurred alike, each feature with an amplitude of its own.  What is
-    left of the gradient without all others is the pull on a feature.  Pulls of features that
-    overlap answer to the places of all (F, 1 for a feature by itself) and err
-    together (S), once heights are fitted.  So offsets and Jacobians are S^(−½) δ and S^(−½) F J,
-    whose errors are independent and alike.
+    C is modelled as the predicted mixture with an amplitude per feature.  The pull on a feature is
+    the gradient without that of all others.  Once heights are fitted, pulls of features that
+    overlap depend on the places of all (F, 1 for a single feature) and have correlated errors (S).
+    Offsets and Jacobians are S^(−½) δ and S^(−½) F J, with independent and equal errors.
     """
     (n, m), top, away = y.shape, peak(variance, y.shape[1]), y[:, None] - y[None]
     overlaps = np.exp(-0.5 * (away * away).sum(axis=-1) / variance)
     bells = weights * overlaps * top
-    rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
-    amplitudes = amplitude + np.linalg.solve(bells + rules.alike * top * np.diag(weights), rest)
+    excess = sampled[:, 0] - amplitude * bells.sum(axis=1)
+    amplitudes = amplitude + np.linalg.solve(bells + rules.alike * top * np.diag(weights), excess)
     height = amplitudes * weights * top
     steep = (overlaps[..., None] * away).swapaxes(1, 2).reshape(n * m, n) / np.sqrt(variance)
     outer = np.eye(m) - away[..., :, None] * away[..., None, :] / variance
@@ -293,7 +292,7 @@ def _residuals(
     by_height = np.linalg.solve(overlaps + rules.alike * np.eye(n), steep.T)
     F = alone - steep @ by_height
     S = F - rules.alike * by_height.T @ by_height
-    # what the better half of the features looks like by itself
+    # the median height of the better half of the features
     full = float(np.median(np.sort(height)[n // 2 :]))
     if full <= 0:
         return np.zeros(n), np.zeros(y.shape), J
@@ -303,7 +302,7 @@ def _residuals(
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(height, rules.min_share * full)[:, None]
     values, axes = np.linalg.eigh(S)
-    # what is as small tells nothing of places
+    # directions of smaller variance tell nothing of places
     apart = (axes / np.sqrt(np.where(values > rules.alike, values, np.inf))) @ axes.T
     offsets, rows = (apart @ offsets.ravel()).reshape(n, m), apart @ F @ J.reshape(n * m, -1)
     return (
@@ -322,9 +321,9 @@ def _surroundings(
     rules: AssociationRules,
     narrowest: float,
 ) -> dict[str, Floats]:
-    """What `Matches` says (L,) of detections around features in view at places y (L, n, 2)."""
+    """Return the fields of `Matches` (L,) about detections around features at y (L, n, 2)."""
     observations = [view.observation for view in objective.views]
-    sigmas = np.array([one.sigma for one in observations])
+    sigmas = np.array([observation.sigma for observation in observations])
     is_flat = objective.projection.dimensions == 1
     in_view = np.where(seen[..., None], y, np.nan)
     lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
@@ -332,35 +331,35 @@ def _surroundings(
     smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     met = shares.sum(axis=1)
-    crowd, others = crowding(detections, lower, around, smallest, met)
+    crowd, space_crowd = crowding(detections, lower, around, smallest, met)
     for planes in clouds_among(objective.projection.sensors):
-        points, low, high = (from_planes(one[planes]) for one in (detections, lower, around))
+        points, low, high = (from_planes(array[planes]) for array in (detections, lower, around))
         least = rules.min_region * float(sigmas[planes[0]])
-        others[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]
-    crowd, others = crowd * sigmas**2, others * sigmas**3
+        space_crowd[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]
+    crowd, space_crowd = crowd * sigmas**2, space_crowd * sigmas**3
     count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
     if np.count_nonzero(missing):
         half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
         near = np.abs(detections - middle[:, None]) <= half[:, None]
-        beside = np.count_nonzero(near.all(axis=2), axis=1) - met
-        unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
+        unmatched_inside = np.count_nonzero(near.all(axis=2), axis=1) - met
+        unmatched = np.where(missing & ~is_flat, np.maximum(unmatched_inside, 0.0), 0.0)
     finest = np.zeros(len(sigmas))
-    if seen.size > DRAWING.own_tiles:  # on pages
+    if seen.size > DRAWING.own_tiles:  # densities are drawn on pages
         finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
-    for k, one in enumerate(observations):
-        if one.cell is not None:  # as many equal features as would give the energy of grey values
-            near, far = (corner / one.sigma for corner in one.extent)
+    for k, observation in enumerate(observations):
+        if observation.cell is not None:  # as many equal features as have this energy of a grid
+            near, far = (corner / observation.sigma for corner in observation.extent)
             count[k] = objective.tops[k, 0] / objective.energies[k, 0]
             crowd[k] = count[k] / np.maximum(far - near, rules.min_region).prod()
-            others[k] = crowd[k] / np.sqrt(np.maximum(far - near, rules.min_region).prod())
+            space_crowd[k] = crowd[k] / np.sqrt(np.maximum(far - near, rules.min_region).prod())
             finest[k] = 1.0
     finest = np.fmin(np.maximum(narrowest, finest), 1.0)
     return {
         "count": count,
         "crowd": crowd,
-        "others": others,
+        "space_crowd": space_crowd,
         "unmatched_nearby": unmatched,
         "finest": finest,
     }
@@ -374,30 +373,30 @@ def crowding(
     met: Floats,
     deep: float = 1.5,
 ) -> tuple[Floats, Floats]:
-    """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,).
+    """Return densities (...,) of detections (..., M, m), NaN for missing ones, in two units.
 
-    Of all, or in boxes (..., m) where they are denser; a side counts as `smallest` at least.  Then
-    per unit to the power `deep` m, without those in the boxes that meet (...,) the body: so dense
-    are points in space that images show, which are as deep as they are wide.
+    Of all, or in boxes (..., m) if denser there; sides are at least `smallest`.  The first is per
+    unit^m; the second per unit^(`deep` m), without the detections in boxes that meet (...,) the
+    body: the density of points in space if they are as deep as wide.
     """
     number = (points[..., 0] == points[..., 0]).sum(axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)
     sides = np.fmax(upper - lower, smallest)
     away = np.abs(points - ((lower + upper) / 2)[..., None, :])
     inside = (away <= sides[..., None, :] / 2).all(axis=-1).sum(axis=-1)
-    overall, own = np.fmax(extent, smallest).prod(axis=-1), sides.prod(axis=-1)
-    beside = np.maximum(number / overall**deep, (inside - met) / own**deep)
-    return np.maximum(number / overall, inside / own), beside
+    overall, in_box = np.fmax(extent, smallest).prod(axis=-1), sides.prod(axis=-1)
+    in_space = np.maximum(number / overall**deep, (inside - met) / in_box**deep)
+    return np.maximum(number / overall, inside / in_box), in_space
 
 
 def _by_calibration(objective: MatchedObjective, T_world_object: Floats) -> Floats | None:
-    """By how much calibrations that are off move features (L, N, 2, Q), σ_ε."""
+    """Return shifts of features (L, N, 2, Q), σ_ε, by Q calibration errors of one deviation."""
     columns, views = [], objective.views
     for k, view in enumerate(views):
         if view.doubts:
             points = transform(T_world_object, objective.projection.body.nodes.points)
             shifts = by_calibration(view.doubts, points)
-            own = np.zeros((len(views), len(points), 2, shifts.shape[2]))
-            own[k, :, : shifts.shape[1]] = shifts / view.observation.sigma
-            columns.append(own)
+            column = np.zeros((len(views), len(points), 2, shifts.shape[2]))
+            column[k, :, : shifts.shape[1]] = shifts / view.observation.sigma
+            columns.append(column)
     return np.concatenate(columns, axis=-1) if columns else None

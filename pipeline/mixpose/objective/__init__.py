@@ -19,7 +19,7 @@ from mixpose.objective.projection import (
     BodyProjection as BodyProjection,
     Match as Match,
     View as View,
-    can_be_together as can_be_together,
+    has_bare_points as has_bare_points,
     in_image as in_image,
     pose_jacobian as pose_jacobian,
     project_body as project_body,

@@ -1,4 +1,4 @@
-"""The matched objective: from predicted features and drawn densities to one number.
+"""The matched objective: one number from predicted features and densities.
 
 For sensor l let g be the observed density and h the predicted one, a mixture of the projected
 features p_i(β) with the observation's own blur σ.  The share of g that h explains once its
@@ -11,8 +11,8 @@ amplitude a = c / n that fits h to g best,
 
 Curvatures are never negative.  Where predicted features lie apart it is that of mean-shift,
 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has ∇C = C (y_i − p_i) / v, so
-that the step is that of least squares to the detections around the features, with weights C_i: it
-gets there at once from any distance, and a feature that meets none does not hold the others back.
+that the step is that of least squares to the detections around the features, with weights C_i: one
+step suffices from any distance, and a feature without a detection does not hold the others back.
 Where features overlap it is Gauss-Newton's of the residual g − a h,
 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
@@ -44,16 +44,16 @@ STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
 def value_error(steps_per_sigma: float) -> float:
-    """Relative error of values, squares of heights: √3/216 n⁻³ of two third derivatives each."""
+    """Return the relative error of values: √3/216 n⁻³ of two third derivatives, of squares."""
     return 4 * 0.011 / steps_per_sigma**3
 
 
 def overlaps(
     y: Floats, weights: Floats, variances: Floats, tops: Floats
 ) -> tuple[Floats, Indices, Floats, Floats]:
-    """⟨h, h⟩ of features y (L, H, n, 2) of weights (L, H, n), and their overlaps, as `Match` has.
+    """Return ⟨h, h⟩, and `pairs`, `bells` and `away` of `Match`, of features y (L, H, n, 2).
 
-    `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
+    They have weights (L, H, n); `variances` and `tops` (L, 1) are v and N(0; 0, v).
     """
     norm, n = tops * np.vecdot(weights, weights), y.shape[2]
     if n * n <= DRAWING.few_pairs:
@@ -76,60 +76,60 @@ def overlaps(
 
 
 def norms(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Floats:
-    """⟨h, h⟩ (L, H) as `overlaps` has them, where pairs of one picture are few beside all pairs."""
+    """Return ⟨h, h⟩ (L, H) of `overlaps` alone, faster where few pairs of all overlap in a pose."""
     L, H, n = weights.shape
     if L * H == 1 or n * n <= DRAWING.few_pairs:
         return overlaps(y, weights, variances, tops)[0]
-    of_all, variance = weights.reshape(-1), variances.repeat(H)
+    flat_weights, variance = weights.reshape(-1), variances.repeat(H)
     picture, i, j = pairs_by_picture(y.reshape(-1, n, 2), variance)
     i, j = n * picture + i, n * picture + j
     away = y.reshape(-1, 2).take(i, axis=0) - y.reshape(-1, 2).take(j, axis=0)
     bells = np.exp(np.vecdot(away, away) * (-0.5 / variance)[picture])
-    both = np.bincount(picture, of_all[i] * of_all[j] * bells, L * H).reshape(L, H)
-    return np.asarray(np.maximum(tops * (np.vecdot(weights, weights) + 2 * both), _NONE))
+    crossed = np.bincount(picture, flat_weights[i] * flat_weights[j] * bells, L * H).reshape(L, H)
+    return np.asarray(np.maximum(tops * (np.vecdot(weights, weights) + 2 * crossed), _NONE))
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
-    """Second-order models of Σ_l s_l c_l² / n_l at H poses.
+    """Return second-order models of Σ_l s_l c_l² / n_l at H poses.
 
     `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
     L, H, n = match.weights.shape
     weighed = match.sampled * match.weights[..., None]
     pull = weighed[..., 1:].reshape(L, H, 1, 2 * n)
-    rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
+    product_gradient = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
     product = np.vecdot(match.sampled[..., 0], match.weights)
     amplitude = product / match.norm
     strength = 2 * scales * amplitude
     value = 0.5 * np.vecdot(strength.T, product.T)
-    gradient = (strength[..., None] * rest).sum(axis=0)
+    gradient = (strength[..., None] * product_gradient).sum(axis=0)
     drawn = (strength / variances)[..., None] * weighed[..., 0]
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
     if not len(match.pairs):
         return Quadratic(value, gradient, curvature)
     near = np.flatnonzero(match.bells.any(axis=(0, 2)))
-    some = match if len(near) == H else match.of(near)
-    J_i, J_j = (some.J.take(one, axis=2) for one in some.pairs.T)
-    scaled = (some.bells / variances[..., None])[..., None]
-    apart = scaled * some.away
+    overlapping = match if len(near) == H else match.of(near)
+    J_i, J_j = (overlapping.J.take(column, axis=2) for column in overlapping.pairs.T)
+    scaled = (overlapping.bells / variances[..., None])[..., None]
+    apart = scaled * overlapping.away
     # ⟨h, ∂h⟩ (L, h, 6) and ⟨∂h, ∂hᵀ⟩ (L, h, 6, 6): of each feature with itself, and of pairs
-    rows = L, len(near), 2 * len(some.pairs)
+    rows = L, len(near), 2 * len(overlapping.pairs)
     half = (apart.reshape(*rows, 1).swapaxes(2, 3) @ (J_j - J_i).reshape(*rows, 6))[:, :, 0]
-    along_j = some.away[..., None, :] @ J_j
-    own = some.J * some.weights[..., None, None]
-    gram = _gram(own, own) * (tops / variances)[..., None, None]
+    along_j = overlapping.away[..., None, :] @ J_j
+    weighted_J = overlapping.J * overlapping.weights[..., None, None]
+    gram = _gram(weighted_J, weighted_J) * (tops / variances)[..., None, None]
     bent = (apart / variances[..., None, None])[..., None] * along_j
     cross = _gram(J_i, scaled[..., None] * J_j - bent)
     gram += cross + cross.swapaxes(2, 3)
     level = (strength * amplitude)[:, near, None]
     gradient[near] -= (level * half).sum(axis=0)
-    outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
+    outer = half[..., :, None] * half[..., None, :] / overlapping.norm[..., None, None]
     curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
     return Quadratic(value, gradient, curvature)
 
 
 def _gram(A: Floats, B: Floats) -> Floats:
-    """Σ_p A_pᵀ B_p (L, H, 6, 6) of A and B (L, H, P, 2, 6)."""
+    """Return Σ_p A_pᵀ B_p (L, H, 6, 6) of A and B (L, H, P, 2, 6)."""
     L, H, P = A.shape[:3]
     return A.reshape(L, H, 2 * P, 6).swapaxes(2, 3) @ B.reshape(L, H, 2 * P, 6)
 
@@ -147,78 +147,78 @@ class MatchedObjective:
     atlas: Atlas  # C of all sensors
     variances: Floats  # (L, 1) v = 2σ², of the product of two features, in squared sensor units
     tops: Floats  # (L, 1) N(0; 0, v)
-    energies: Floats  # (L, 1) ⟨g, g⟩; (L, K) of several bodies, each with its part of what is seen
+    energies: Floats  # (L, 1) ⟨g, g⟩; (L, K) of several bodies, by the detections of each
     weights: Floats  # (L, 1) ω_l; (L, K)
-    # where several bodies were looked up at once: the body's pose, and what it has there
-    at_hand: tuple[Floats, Match] | None = None
-    # what was looked up last, if anything: a pose is asked whether it is near, and climbed from
-    looked_up: list[Match] = field(default_factory=list, repr=False)
+    # a pose and its match, if it was looked up together with those of other bodies
+    known: tuple[Floats, Match] | None = None
+    # the last match, if any: a pose is first tested for being near, and then climbed from
+    last: list[Match] = field(default_factory=list, repr=False)
 
     def value(self, T_world_object: Floats) -> Floats:
-        """Values (...,) at poses (..., 4, 4)."""
+        """Return values (...,) at poses (..., 4, 4)."""
         poses = T_world_object.reshape(-1, 4, 4)
         return np.asarray(self.shares(poses).sum(axis=0).reshape(T_world_object.shape[:-2]))
 
     def shares(self, poses: Floats, *, whole: bool = False) -> Floats:
-        """ω_l S_l (L, H) at poses (H, 4, 4).
+        """Return ω_l S_l (L, H) at poses (H, 4, 4).
 
-        With `whole`, features out of view count as predicted and not met.  Else a pose gains by
-        moving features that meet nothing out of the picture.
+        With `whole`, features out of view count as predicted and not met: otherwise a pose gains by
+        moving missed features out of the image.
         """
-        parts, rest = [np.zeros((len(self.views), 0))], (self.variances, self.tops)
-        for some in self._blocks(poses):
-            if len(some) == 1:  # what may be climbed from next
-                at = self.match(some)
+        parts, v_and_tops = [np.zeros((len(self.views), 0))], (self.variances, self.tops)
+        for block in self._blocks(poses):
+            if len(block) == 1:  # it may be climbed from next
+                match = self.match(block)
             else:
-                at = self.projection.project(some)
-                norm = norms(at.y, at.weights, *rest)
-                at = at._replace(sampled=self.atlas.look_up(at.y), norm=norm)
-            product = np.vecdot(at.sampled[..., 0], at.weights)
-            own = self.weights / self.energies * product**2 / at.norm
+                match = self.projection.project(block)
+                norm = norms(match.y, match.weights, *v_and_tops)
+                match = match._replace(sampled=self.atlas.look_up(match.y), norm=norm)
+            product = np.vecdot(match.sampled[..., 0], match.weights)
+            terms = self.weights / self.energies * product**2 / match.norm
             if whole:
-                hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
-                own = own * (at.norm / (at.norm + self.tops * np.vecdot(hidden, hidden)))
-            parts.append(own)
+                hidden = np.where(match.seen, 0.0, self.projection.body.nodes.weights)
+                terms = terms * (match.norm / (match.norm + self.tops * np.vecdot(hidden, hidden)))
+            parts.append(terms)
         return np.concatenate(parts, axis=1)
 
     @cached_property
     def are_grids(self) -> Mask:
-        """Of which sensors (L,) the density is a grid of values, no detections."""
+        """Mask (L,) of sensors whose density is a grid of values instead of detections."""
         return np.array([view.observation.cell is not None for view in self.views])
 
     def in_nats(self, precisions: Floats) -> MatchedObjective:
-        """The same in nats, with offsets of features of σ²/s² (L,), over their variances.
+        """Return the objective in nats, for noise of precisions σ²/s² (L,) in units of the blur.
 
-        Of n features that are met, one that is off by r takes r²/(2 n σ²) from a share S_l.
+        One of n features met that is off by r takes r²/(2 n σ²) from a share S_l.
         """
         weights = self.weights * len(self.projection.body.features)
         return replace(self, weights=weights * precisions[:, None])
 
     def match(self, poses: Floats) -> Match:
-        """What is predicted at poses (H, 4, 4), and what is there."""
-        if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0]):
-            return self.at_hand[1]
-        at, known = self.projection.project(poses), self.looked_up
-        if not (known and known[0].y is at.y):
-            sampled = self.atlas.look_up(at.y)
-            lap = overlaps(at.y, at.weights, self.variances, self.tops)
-            known[:] = [Match(*at[:5], sampled, *lap)]
-        return known[0]
+        """Project the body at poses (H, 4, 4) and look up the densities there."""
+        if self.known and len(poses) == 1 and np.array_equal(poses[0], self.known[0]):
+            return self.known[1]
+        match, last = self.projection.project(poses), self.last
+        if not (last and last[0].y is match.y):
+            sampled = self.atlas.look_up(match.y)
+            overlap = overlaps(match.y, match.weights, self.variances, self.tops)
+            last[:] = [Match(*match[:5], sampled, *overlap)]
+        return last[0]
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Second-order models at poses (H, 4, 4)."""
-        rest = self.variances, self.tops, self.weights / self.energies
-        parts = [slopes(self.match(some), *rest) for some in self._blocks(poses)]
+        """Return second-order models at poses (H, 4, 4)."""
+        arguments = self.variances, self.tops, self.weights / self.energies
+        parts = [slopes(self.match(block), *arguments) for block in self._blocks(poses)]
         if len(parts) == 1:
             return parts[0]
         return Quadratic(*map(np.concatenate, zip(*(part[:3] for part in parts))))
 
-    def seen(self, objectives: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
-        """The objectives that were put `together`, with what each sees at its pose (K, 4, 4)."""
+    def split(self, parts: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
+        """Return the objectives put `together`, with the match of each at its pose (K, 4, 4)."""
         match = self.match(poses)
         return [
-            replace(one, at_hand=(T, match.of(slice(k, k + 1), len(body.nodes.points))))
-            for k, (one, T, body) in enumerate(zip(objectives, poses, self.projection.bodies))
+            replace(objective, known=(T, match.of(slice(k, k + 1), len(body.nodes.points))))
+            for k, (objective, T, body) in enumerate(zip(parts, poses, self.projection.bodies))
         ]
 
     def _blocks(self, poses: Floats) -> list[Floats]:
@@ -228,12 +228,12 @@ class MatchedObjective:
 
 
 class SharedDensities:
-    """C of all sensors at σ_ε, drawn once for several bodies; of views that are not empty."""
+    """C of all sensors at σ_ε, drawn once for several bodies; views are not empty."""
 
     def __init__(self, views: Sequence[View]) -> None:
-        seen = [view.observation for view in views]
-        self.atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
-        self.totals = [one.weight for one in seen]  # of all that was drawn, per sensor
+        observations = [view.observation for view in views]
+        self.atlas = matched_atlas(observations, [o.sigma for o in observations], STEPS_PER_SIGMA)
+        self.totals = [o.weight for o in observations]  # of all detections, by sensor
 
 
 def matched_objective(
@@ -246,21 +246,21 @@ def matched_objective(
 ) -> MatchedObjective:
     """Build the matched objective of views that are not empty.
 
-    With features of standard deviations `sigmas`, by view and in sensor units, and as many cells of
-    C per standard deviation; None: fine for grey values at σ_ε.  On densities that are `shared`, at
-    σ_ε, views hold the body's own detections, and others only where they are out of its reach.
+    Features have standard deviations `sigmas`, by view in sensor units, each of `steps_per_sigma`
+    cells of C; None: fine for grey values at σ_ε.  If densities at σ_ε are `shared` with other
+    bodies, views hold the detections of this body, and others that are out of its reach.
     """
     observations = [view.observation for view in views]
     pairs = list(zip(observations, sigmas, strict=True))
     if steps_per_sigma is None:
-        at_last = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
-        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
+        is_finest = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
+        steps_per_sigma = FINE_STEPS if is_finest else STEPS_PER_SIGMA
     projection = project_body(tuple([view.sensor for view in views]), body)
     energies = np.array([[o.energy(sigma)] for o, sigma in pairs])
     variances = np.array([[2 * sigma * sigma] for sigma in sigmas])
     tops = peak(variances, projection.dimensions[:, None])
-    # ω_l: as many equal features as would give this energy, per feature of the body, so
-    # that clutter in one sensor does not take the weight from its true features
+    # ω_l: the number of equal features with this energy, per feature of the body, so that clutter
+    # in a sensor does not take weight from its true features
     weights = tops / energies / len(body.features)
     if shared is None:
         atlas = matched_atlas(observations, sigmas, steps_per_sigma)
@@ -272,12 +272,12 @@ def matched_objective(
 
 
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
-    """The objectives of several bodies, of bare points, on the same densities and blurs."""
-    bodies = [one.projection.body for one in objectives]
+    """Join the objectives of several bodies, of bare points, on the same densities and blurs."""
+    bodies = [objective.projection.body for objective in objectives]
     projection = project_body(objectives[0].projection.sensors, *bodies)
     return replace(
         objectives[0],
         projection=projection,
-        energies=np.concatenate([one.energies for one in objectives], axis=1),
-        weights=np.concatenate([one.weights for one in objectives], axis=1),
+        energies=np.concatenate([objective.energies for objective in objectives], axis=1),
+        weights=np.concatenate([objective.weights for objective in objectives], axis=1),
     )

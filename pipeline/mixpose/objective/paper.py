@@ -1,8 +1,8 @@
-"""The paper's objectives, sampled: formula (4) and the product it warns of; objectives by name.
+"""The paper's objectives by sampling, formula (4) and the product it warns of; objectives by name.
 
-Densities are looked up with `cv2.remap`, batched over poses.  A feature that a sensor cannot see
-has density 0 there.  Curvatures are those of mean-shift: every sample pulls with the weight of
-its density, as if its feature were a Gaussian of the level's σ.
+Densities are looked up with `cv2.remap`, batched over poses; that of a feature which a sensor
+cannot see is 0.  Curvatures are those of mean-shift: every sample pulls with the weight of its
+density, as if its feature were a Gaussian of the level's σ.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ OBJECTIVES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
 
 @dataclass(frozen=True)
 class SampledTerm:
-    """A sensor with its density g_l (with gradient) at one level of blur."""
+    """A sensor with its density g_l, with gradient, at one level of blur."""
 
     sensor: Sensor
     density: Density
@@ -40,7 +40,7 @@ class SampledTerm:
 class PaperObjective:
     """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)): all sensors see the same Z.
 
-    Of samples z_ir (N, R, 3), displaced in the world by offsets (R, 3), as by gravity.
+    The samples z_ir (N, R, 3) are displaced in the world by offsets (R, 3), as by gravity.
     """
 
     def __init__(
@@ -52,64 +52,64 @@ class PaperObjective:
         self.offsets = np.broadcast_to(offsets, samples.shape).reshape(-1, 3)
 
     def value(self, T_world_object: Floats) -> Floats:
-        """Values (...,) at poses (..., 4, 4)."""
-        if T_world_object.ndim == 2:  # no time for more
+        """Return values (...,) at poses (..., 4, 4)."""
+        if T_world_object.ndim == 2:  # the fast path
             return self._values(T_world_object[None]).reshape(())
         poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
         values = [self._values(poses[k : k + at_once]) for k in range(0, len(poses), at_once)]
         return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
+        """Return values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
         return Quadratic(*map(np.array, zip(*map(self._model, poses), strict=True)))
 
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
-        """Value, gradient and mean-shift curvature at one pose (4, 4)."""
+        """Return value, gradient and mean-shift curvature at one pose (4, 4)."""
         if not self.terms:  # no sensor has the body in view
             return 0.0, np.zeros(6), np.zeros((6, 6))
         points = transform(T_world_object, self.points) + self.offsets
         arms, count = self.points @ T_world_object[:3, :3].T, len(points)
-        at = [(term.density, *term.sensor.linearise(points)) for term in self.terms]
-        drawn = [density.sample(y).astype(np.float64) for density, y, _, _ in at]
+        projected = [(term.density, *term.sensor.linearise(points)) for term in self.terms]
+        drawn = [density.sample(y).astype(np.float64) for density, y, _, _ in projected]
         parts = self._parts([g[None, :, 0] for g in drawn])
         gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for k, ((density, _, by_world, _), g) in enumerate(zip(at, drawn, strict=True)):
+        for k, ((density, _, by_world, _), g) in enumerate(zip(projected, drawn, strict=True)):
             J = pose_jacobian(by_world, arms)
-            rest = (part[0] for j, part in enumerate(parts) if j != k)
-            others = math.prod(rest, start=np.ones(count))
-            gradient += np.einsum("s,sm,smk->k", others, g[:, 1:], J) / count
-            pull = others * g[:, 0] / (count * density.sigma**2)
+            other_factors = (part[0] for j, part in enumerate(parts) if j != k)
+            product = math.prod(other_factors, start=np.ones(count))
+            gradient += np.einsum("s,sm,smk->k", product, g[:, 1:], J) / count
+            pull = product * g[:, 0] / (count * density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
-        return float((others * g[:, 0]).mean()), gradient, curvature
+        return float((product * g[:, 0]).mean()), gradient, curvature
 
     def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
-        """What is multiplied over sensors, (k, S) or (k, 1) each, of densities (k, S)."""
+        """Return the factors of all sensors, (k, S) or (k, 1) each, from densities (k, S)."""
         return densities
 
     def _values(self, poses: Floats) -> Floats:
-        """Values (k,) at poses (k, 4, 4)."""
+        """Return values (k,) at poses (k, 4, 4)."""
         if not self.terms:
             return np.zeros(len(poses))
-        product, *others = self._parts(self._densities(poses))
-        for part in others:
+        product, *factors = self._parts(self._densities(poses))
+        for part in factors:
             product *= part
         return _means(product)
 
     def _densities(self, poses: Floats) -> list[Singles]:
-        """g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
+        """Look up g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
         if self._maps is not None:
             maps = self._maps.at(poses).swapaxes(0, 1)
-            return [remap(g.values, *maps[2 * k : 2 * k + 2]) for k, g in enumerate(self._alone)]
+            return [remap(g.values, *maps[2 * k : 2 * k + 2]) for k, g in enumerate(self._plain)]
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
             points = transform(poses, self.points) + self.offsets
             return [
                 g.sample(term.sensor.project(points)[0])
-                for term, g in zip(self.terms, self._alone, strict=True)
+                for term, g in zip(self.terms, self._plain, strict=True)
             ]
 
     @cached_property
-    def _alone(self) -> list[Density]:
-        """The densities without gradients, which values do not need."""
+    def _plain(self) -> list[Density]:
+        """Densities without gradients."""
         return [
             replace(density, values=np.ascontiguousarray(np.atleast_3d(density.values)[..., 0]))
             for density in (term.density for term in self.terms)
@@ -117,32 +117,32 @@ class PaperObjective:
 
     @cached_property
     def _maps(self) -> _AffineMaps | None:
-        """Where no sensor has perspective."""
+        """Fast maps if no sensor has perspective, else None."""
         is_affine = all(isinstance(term.sensor, AffineSensor) for term in self.terms)
         return _AffineMaps(self.terms, self.points, self.offsets) if is_affine else None
 
 
 class IndependentObjective(PaperObjective):
-    """Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)): sensors as if they saw different objects."""
+    """Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)): as if sensors saw different objects."""
 
     def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
         return [_means(g)[:, None] for g in densities]
 
 
 def _means(g: Floats | Singles) -> Floats:
-    """Means (k,) over the samples (k, S) of k poses, summed in double precision."""
+    """Return means (k,) over the samples (k, S) of k poses, summed in double precision."""
     if len(g) == 1:  # in a third of the time
         return np.array([cv2.sumElems(g)[0] / g.size])
     return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F).ravel() / g.shape[1])
 
 
 class _AffineMaps:
-    """Where samples (S, 3) of a body lie in the arrays of densities, for `cv2.remap`.
+    """Places of a body's samples (S, 3) in the arrays of densities, for `cv2.remap`.
 
-    One evaluation of a sampled objective is to cost hardly more than its look-ups.  So where no
-    sensor has perspective, samples are kept in single precision, and one matrix product for all of
-    them ends in array indices: they err by less than 1/1000 in arrays of up to 4000 a side, as
-    samples are relative to their centre.
+    An evaluation of a sampled objective should cost hardly more than its look-ups.  So if no sensor
+    has perspective, samples are kept in single precision, and one matrix product gives the array
+    indices of all: they err by less than 1/1000 in arrays of up to 4000 a side, as samples are
+    relative to their centre.
     """
 
     def __init__(self, terms: Sequence[SampledTerm], points: Floats, offsets: Floats) -> None:
@@ -166,9 +166,9 @@ class _AffineMaps:
             by_pose[3, 3, :, 4:] = P[:, :3]
         self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
         lower, upper = np.clip(np.concatenate(limits, axis=1), DRAWING.far, -DRAWING.far)
-        self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
-        # numbers within ±1 if the centre lies so that all samples are seen
-        reach = sum(float(np.linalg.norm(one, axis=1).max()) for one in (parts[0], offsets))
+        self._limits = [limit[:, None].astype(np.float32) for limit in (lower, upper)]
+        # numbers that are within ±1 if the centre lies so that all samples are in view
+        reach = sum(float(np.linalg.norm(x, axis=1).max()) for x in (parts[0], offsets))
         half = (upper - lower) / 2 - reach * np.linalg.norm(P[:, :3], axis=1)
         middle[15] -= (lower + upper) / 2
         self._width = by_pose[0, 0].size
@@ -176,10 +176,9 @@ class _AffineMaps:
         self._by_pose = np.hstack([by_pose.reshape(16, -1), is_seen])
 
     def at(self, poses: Floats) -> Singles:
-        """Indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
+        """Return indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
 
-        `DRAWING.far`, outside any array, for samples that a sensor does not see or that are not
-        finite.
+        They are `DRAWING.far`, outside any array, for samples that are not seen or not finite.
         """
         rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
@@ -192,7 +191,7 @@ class _AffineMaps:
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
-    """Box (lower, upper) with a margin around visible points (n, m), within the sensor."""
+    """Return the box (lower, upper) around visible points (n, m), with a margin, in the sensor."""
     lower, upper = y.min(axis=0) - margin, y.max(axis=0) + margin
     return np.maximum(lower, sensor.lower), np.minimum(upper, sensor.upper)
 
@@ -200,7 +199,7 @@ def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats
 def sampled_terms(
     views: Sequence[View], samples: Floats, sigmas: Sequence[float], near: Floats
 ) -> list[SampledTerm]:
-    """Densities g_l around the samples (N, R, 3) at a pose (4, 4), of sensors that see any.
+    """Draw densities g_l around samples (N, R, 3) at a pose (4, 4), of sensors that see any.
 
     `sigmas` are the standard deviations of a feature at this level, per view, in sensor units.
     """
@@ -221,8 +220,8 @@ def build_objective(
     body: Body,
     samples: Floats,  # (N, R, 3) of the body; the matched objective does not use them
     sigmas: Sequence[float],  # of a feature at this level, per view, in sensor units
-    near: Floats,  # (4, 4) pose around whose projection sampled densities are made
-    seed: int = 0,  # that samples are drawn by
+    near: Floats,  # (4, 4) pose around whose projection densities are drawn
+    seed: int = 0,  # of the samples
 ) -> MatchedObjective | PaperObjective:
     """Build an objective of the pose at one level of blur."""
     if name == "matched":

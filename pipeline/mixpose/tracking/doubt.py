@@ -26,14 +26,14 @@ from mixpose.judgement import (
     Shape,
     Verdict,
     decide,
+    has_two_agreeing,
     is_far_off,
     is_open,
+    is_seen_elsewhere,
     is_sure,
-    odds_of_each,
-    others_miss,
+    odds_of_mistakes,
     possible_mistakes,
     shape_shown,
-    two_agree,
 )
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
@@ -144,7 +144,7 @@ def _alternatives(
     of_image = 0.5 if data.options.mirrors else rules.mistaken
     likely = [of_image if mistake.name == MIRRORED else rules.mistaken for mistake in mistakes]
     reasons = [mistake.what for mistake in mistakes]
-    yield from map(Alternative, reasons, odds_of_each(mistakes, likely))
+    yield from map(Alternative, reasons, odds_of_mistakes(mistakes, likely))
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
     if is_open(best, data.free, rules, noise):
@@ -215,9 +215,9 @@ def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, rules = data.track, (data.rules.acceptance, data.rules.judgement.noise)
     before = track.mistaken.get(CONTRADICTION, 0.0)
-    if others_miss(judged, _noise_before(data, judged), track.sensors_agreed, *rules):
+    if is_seen_elsewhere(judged, _noise_before(data, judged), track.sensors_agreed, *rules):
         before = _even_odds(data)
-    elif before and two_agree(judged, *rules):
+    elif before and has_two_agreeing(judged, *rules):
         before = 0.0
     return Mistake(CONTRADICTION, APART, before, 0.0 if before else -math.inf)
 

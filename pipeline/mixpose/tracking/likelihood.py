@@ -63,7 +63,7 @@ class MatchedLikelihood:
                 least=start.least,
                 noise=seen.noise,
                 fields=seen.track.residuals.fields,
-                beside=max(sigma, spread),
+                extra_sigma=max(sigma, spread),
                 wide=wide,
                 errors=model.noise.errors,
                 association=model.association,
@@ -92,7 +92,8 @@ class MatchedLikelihood:
         """
         frame, _ = _as_moving(self.frame, fit)
         T = frame.oriented(fit.T_world_object)
-        seen = replace(matches_at(frame, T), crowd=other_matches.crowd, others=other_matches.others)
+        crowds = other_matches.crowd, other_matches.space_crowd
+        seen = replace(matches_at(frame, T), crowd=crowds[0], space_crowd=crowds[1])
         track = frame.track
         case = Case(frame.finest, T, track.residuals, track.rates, frame.prior(T), seen)
         (judged,) = judge_together([case], frame.free, frame.rules.judgement, start.left_out)

@@ -172,7 +172,7 @@ def _with_near(frame: Frame, matches: Matches) -> Matches:
     directions a match that least squares leave out is off twice as far.
     """
     reach = 2 * math.sqrt(2 * frame.rules.judgement.association.reach_squared)  # in σ_ε
-    lost = (matches.weights > 0) & (matches.shares == 0) & (matches.beside < reach)
+    lost = (matches.weights > 0) & (matches.shares == 0) & (matches.neighbour_distance < reach)
     if not np.count_nonzero(lost):
         return matches
     shares, offsets = matches.shares.copy(), matches.offsets.copy()

@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, insert, is_possible, judge_together
-from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
+from mixpose.objective import SharedDensities, View, has_bare_points, matched_objective
 from mixpose.optimise import Ascent
 from mixpose.records import Floats, Mask
 from mixpose.search import SeenTogether, search_copies
@@ -380,7 +380,7 @@ def climb_together(
     matched = {
         k: data
         for k, data in drawn.items()
-        if data.options.objective == "matched" and can_be_together(data.body)
+        if data.options.objective == "matched" and has_bare_points(data.body)
     }
     if len(matched) < 2:
         return drawn, {}

@@ -361,7 +361,7 @@ def track_after(data: Frame, verdict: Verdict) -> Track:
         shape=None if is_ok else verdict.shape,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
-        log_odds_twice=track.log_odds_twice if verdict.second is None else verdict.second.there,
+        log_odds_twice=track.log_odds_twice if verdict.second is None else verdict.second.log_odds,
         mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 
@@ -392,9 +392,9 @@ def _branches(
         T, second = pose.T_world_object, verdict.second
         other = data.log_odds_other_at(T)
         if second and pose is second.pose:
-            other = -second.either
-        elif second and second.told and pose is best:
-            other = second.either
+            other = -second.odds_over_best
+        elif second and second.is_explained and pose is best:
+            other = second.odds_over_best
         branch = Branch(T, belief, spread=spread, deviation=sigmas, log_odds_other=other)
         is_new = pose.proposer == SECOND_POSE
         alike = None if is_new else [part.T_body_other for part in congruent(data, pose)]

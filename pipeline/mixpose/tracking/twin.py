@@ -20,7 +20,7 @@ from mixpose.judgement import (
     Second,
     Verdict,
     is_sure,
-    met_by_one,
+    unconfirming_sensors,
 )
 from mixpose.matching import log_likelihood
 from mixpose.objective import View
@@ -229,7 +229,7 @@ def _may_be_elsewhere(data: Frame, best: ScoredPose, leftover: SeenTogether) -> 
     """Return sensors that miss a pose met by one alone, and may see the body elsewhere."""
     if (best.matches.dimensions != 2).any():
         return []
-    names = met_by_one(best, data.rules.acceptance)
+    names = unconfirming_sensors(best, data.rules.acceptance)
     views = [view for view in leftover.views if view.name in names and _may_fix(view, data)]
     return views if _is_in_turn(data, views) else []
 
