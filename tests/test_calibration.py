@@ -38,7 +38,7 @@ from mixpose.calibration.result import displacements
 from mixpose.calibration.rig import State, blocks_of
 from mixpose.calibration.searching import Saved
 from mixpose.calibration.task import Hypotheses
-from mixpose.calibration.telling import doubts_of
+from mixpose.calibration.telling import doubts_of, lines_of
 from mixpose.errors import RecordingError
 from mixpose.rigid import (
     from_rotation_vector,
@@ -172,6 +172,8 @@ def test_three_range_sensors_30_mm_off_are_found_in_the_papers_gauge() -> None:
     assert np.abs(np.array(in_gauge(places)) - in_gauge(PLACES)).max() < 0.5
     assert np.array_equal(places[0], (PLACES + off)[0])
     assert len(found.gauge) == 3
+    # what the gauge holds is not moved by biases that are held; the rest is, by 5 mm and more
+    assert "range biases, as exact" in "\n".join(lines_of(found, "mm"))
 
 
 def test_ranges_of_no_body_are_refused() -> None:

@@ -253,6 +253,8 @@ WRONG = {
     ),
     "ini": (texts.ROS_INI.replace("810.500000", "f"), "camera matrix: found"),
     "ini size": (texts.ROS_INI.replace("1280", "12.5"), "[image]: found [12.5, 1024]"),
+    "ini endless": (texts.ROS_INI.replace("1280", "inf"), "[image]: found [inf, 1024]"),
+    "ini no number": (texts.ROS_INI.replace("1280", "nan"), "[image]: found [nan, 1024]"),
     "caliscope": (texts.toml("cameras.").replace("1280", '"wide"', 1), "cameras.0.size: found"),
     "aniposelib": (texts.toml("cam_").replace("-0.11, ", "", 1), "cam_0.distortions: found 3"),
     "aniposelib rotation": (

@@ -86,6 +86,14 @@ def test_protocol_whose_package_is_not_there_names_its_extra(
     Publishing(["udp://127.0.0.1:9", "tcp://127.0.0.1:9"], HEADER, print)
 
 
+def test_password_that_is_not_quoted_is_not_said_where_the_address_is_refused(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    err = refusal(["--publish", "mqtt://me:se/cr@et@host/rig"], capfd)
+    assert "--publish mqtt://host/rig: is no address: of a user name or password / ? #" in err
+    assert all(part not in err for part in ("me:", "se/", "'se'", "cr@", "et@"))
+
+
 def test_password_of_a_broker_is_not_said() -> None:
     parsed = parse("mqtt://me:s%2Fecret@host:1884/rig/one?only=ok")
     assert (parsed.user, parsed.password) == ("me", "s/ecret")

@@ -60,7 +60,8 @@ def _held_lines(found: Calibration, unit: str) -> list[str]:
             "focal",
         ),
     ):
-        worst = int(np.argmax(moved / told)) if len(moved) else 0
+        # a coordinate that the gauge holds has no deviation, and is not moved
+        worst = int(np.argmax(moved / np.maximum(told, 1e-300))) if len(moved) else 0
         if len(moved) and moved[worst] > told[worst]:
             lines.append(
                 f"{'held':<10}{words} they would move what was found by {moved[worst]:.2g} {unit}, "

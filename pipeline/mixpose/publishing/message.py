@@ -83,7 +83,11 @@ def parse(url: str) -> Address:
         parts = urlsplit(url, allow_fragments=False)
         port = parts.port
     except ValueError as error:
-        raise SessionError(f"--publish {text}: is no address: {error}") from error
+        reason = str(error)
+        if "@" in url:  # the error may quote a part of a password that is not quoted itself
+            text = re.sub(r"//.*@", "//", url)
+            reason = "of a user name or password / ? # @ are written %2F %3F %23 %40"
+        raise SessionError(f"--publish {text}: is no address: {reason}") from None
     if parts.scheme not in SENDERS:
         raise SessionError(f"--publish {text}: no address of a receiver; allowed: {allowed}")
     place = parts.netloc.rpartition("@")[2]

@@ -110,7 +110,7 @@ def _ini_values(content: Content) -> dict[str, list[float]]:
 
 def _integer(values: dict[str, list[float]], word: str) -> int | float | None:
     number = next(iter(values.get(word, ())), None)
-    return number if number is None or number != int(number) else int(number)
+    return int(number) if number is not None and float(number).is_integer() else number
 
 
 ROS = Format(
