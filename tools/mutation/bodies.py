@@ -43,7 +43,7 @@ _BODY = (
     ),
     Mutant(
         "body-samples-not-mirrored",
-        "body/sampling.py",
+        "body/features.py",
         "np.concatenate([points, 1.0 - points])",
         "np.concatenate([points, points])",
         "the mean of the samples is off its feature",

@@ -230,21 +230,13 @@ def _bases(points: Floats, tolerance: float, fewest: int) -> list[list[int]]:
     first = list(widest_triple(points))
     if _is_narrow(points[first], tolerance):
         return []
-    bases = [first]
-    if len(points) > fewest:
-        for left_out in first:
-            rest = np.delete(np.arange(len(points)), left_out)
-            base = rest[list(widest_triple(points[rest]))].tolist()
-            if not _is_narrow(points[base], tolerance):
-                bases.append(base)
+    parts = [np.delete(np.arange(len(points)), k) for k in first if len(points) > fewest]
     # where a step of a grid takes those at an edge away, those in the middle have partners
     away = np.linalg.norm(points - points.mean(axis=0), axis=1)
     middle = away.argsort(kind="stable")[: len(points) // 2]
-    if len(middle) > FEWEST:
-        base = middle[list(widest_triple(points[middle]))].tolist()
-        if not _is_narrow(points[base], tolerance):
-            bases.append(base)
-    return bases
+    parts += [middle] if len(middle) > FEWEST else []
+    others = [part[list(widest_triple(points[part]))].tolist() for part in parts]
+    return [first, *(base for base in others if not _is_narrow(points[base], tolerance))]
 
 
 def _is_narrow(points: Floats, tolerance: float) -> bool:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from mixpose.body.features import Feature
-from mixpose.body.sampling import Sampler, uniforms
+from mixpose.body.features import Feature, Sampler, uniforms
 from mixpose.body.symmetry import (
     default_tolerance,
     farthest_apart,
@@ -212,14 +211,11 @@ class Body:
         """
         if self.is_exact:
             return self.means[:, None, :].copy()
-        shared = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed)
-        samples = []
-        for i, feature in enumerate(self.features):
-            own = shared
-            if not common:
-                own = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed + 7919 * i)
-            samples.append(feature.sample(own))
-        return np.array(samples)
+        drawn = partial(uniforms, count, sampler=sampler, antithetic=antithetic)
+        sets = [drawn(seed=seed)] * len(self)
+        if not common:
+            sets = [drawn(seed=seed + 7919 * i) for i in range(len(self))]
+        return np.array([one.sample(own) for one, own in zip(self.features, sets, strict=True)])
 
     def world_offsets(self, count: int, *, seed: int = 0) -> Floats:
         """Displacements along gravity (R, 3) in the world, one for each sample of a feature.
