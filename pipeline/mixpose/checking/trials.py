@@ -18,7 +18,7 @@ import numpy as np
 
 from mixpose.body import of_points
 from mixpose.checking import evidence
-from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes
 from mixpose.checking.evidence import Explained, Frames, Views, best_pose, evidence_of
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
@@ -284,7 +284,8 @@ def _fitted(
 
 def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
     """Views by sensors of other values."""
-    return [with_sensor(view, unknown.sensor(view.name, view.sensor, values)) for view in views]
+    sensors = [unknown.sensor(view.name, view.sensor, values) for view in views]
+    return [v if v.sensor is s else replace(v, sensor=s) for v, s in zip(views, sensors)]
 
 
 def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
