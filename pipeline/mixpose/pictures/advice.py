@@ -7,8 +7,7 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.pictures import levels
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.pictures.levels import FLOODED, around, direction, more, some
-from mixpose.pictures.light import Light
+from mixpose.pictures.levels import FLOODED, Light, around, direction, more, some
 from mixpose.records import GridPattern, PointPattern
 
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing

@@ -28,7 +28,7 @@ from mixpose.objective.paper import SampledTerm, sampled_terms
 from mixpose.pictures import canvas, overlay
 from mixpose.pictures.canvas import WHITE, Colour, Picture, Size
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.light import Light
+from mixpose.pictures.levels import Light
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
