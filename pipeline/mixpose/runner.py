@@ -43,16 +43,17 @@ from mixpose.tracking import (
 )
 
 if TYPE_CHECKING:
-    from mixpose.body import Body
     from mixpose.sensors import Sensor
     from mixpose.session import SensorSetup, Session, Start
 
 Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 Starts: TypeAlias = Mapping[str, Floats]
 
-
 LEAST_DELAY_S = 1e-6
 """Sensors that differ by less count as in step."""
+
+_KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
+"""What is read for sensors that are no cameras."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,6 @@ class Memory:
     """All that a run knows between two frames."""
 
     tracks: tuple[Track, ...]  # one per body
-
-
-_KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
-"""What is read for sensors that are no cameras."""
 
 
 Remember: TypeAlias = Callable[[Memory], None]
@@ -148,37 +145,26 @@ def scene_of(session: Session, starts: Starts | None = None) -> Scene:
     bodies = []
     for one in session.objects:
         for instance, label in zip(one.instances, one.labels, strict=True):
-            start, T_start = one.start if not instance else None, (starts or {}).get(label)
-            held = None if one.start is None else one.start.T_world_object
-            given = session, one.body, start, T_start
-            bodies.append(_tracker(Tracker.about_centre, *given, instance=instance, T_held=held))
+            given = _beginning(one.start if not instance else None, (starts or {}).get(label))
+            given["T_held"] = None if one.start is None else one.start.T_world_object
+            given["instance"] = instance
+            bodies.append(Tracker.about_centre(one.body, session.estimator, **given))
     return Scene(tuple(bodies))
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
     """The tracker of a session's first body, and its track before the first frame."""
-    tracker = _tracker(Tracker.create, session, session.body, session.start, T_start)
+    given = _beginning(session.start, T_start)
+    tracker = Tracker.create(session.body, session.estimator, **given)
     return tracker, tracker.begin()
 
 
-def _tracker(
-    make: Callable[..., Tracker],
-    session: Session,
-    body: Body,
-    start: Start | None,
-    T_start: Floats | None,
-    **rest: Any,
-) -> Tracker:
+def _beginning(start: Start | None, T_start: Floats | None) -> dict[str, Any]:
+    """What a tracker is told of where it begins: a pose, else that of a start, and how near it."""
     if T_start is None and start is not None:
         T_start = start.T_world_object
-    return make(
-        body,
-        session.estimator,
-        T_start,
-        rotation_deg=start.rotation_deg if start else None,
-        distance=start.distance if start else None,
-        **rest,
-    )
+    near = {"rotation_deg": start.rotation_deg, "distance": start.distance} if start else {}
+    return {"T_start": T_start, **near}
 
 
 def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
@@ -235,15 +221,10 @@ def _estimates(
         for frame_set in frames:
             frames_of = frame_set.frames.items()
             images = {name for name, one in frames_of if isinstance(one.data, np.ndarray)}
+            of_frame = frame_set.number, frame_set.time_s, partial(observe, session, frame_set)
             began = time.perf_counter()
             with one_blas_thread(), prompt_switching():
-                tracks, estimates, views = windowed.advance(
-                    tracks,
-                    frame_set.number,
-                    frame_set.time_s,
-                    partial(observe, session, frame_set),
-                    images,
-                )
+                tracks, estimates, views = windowed.advance(tracks, *of_frame, images)
             latency_ms = 1e3 * (time.perf_counter() - began)
             views = as_sensors(session, frame_set, views)
             seen = {view.name: view.observation for view in views}
