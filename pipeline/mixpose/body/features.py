@@ -113,11 +113,7 @@ def offsets(uniforms: Floats, covariance: Floats, spread: Spread) -> Floats:
 
 
 def uniforms(
-    count: int,
-    *,
-    sampler: Sampler = "latin-hypercube",
-    antithetic: bool = True,
-    seed: int = 0,
+    count: int, *, sampler: Sampler = "latin-hypercube", antithetic: bool = True, seed: int = 0
 ) -> Floats:
     """Draw R = `count` points (R, 5) of the open unit cube, strictly between 0 and 1.
 

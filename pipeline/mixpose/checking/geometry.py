@@ -12,15 +12,9 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.checking.changes import Change, called, of_units
-from mixpose.checking.evidence import (
-    Frames,
-    can_tell,
-    estimate_of,
-    evidence_of,
-    pose_near,
-)
+from mixpose.checking.evidence import Frames, can_tell, estimate_of, evidence_of, pose_near
 from mixpose.checking.keys import judge
-from mixpose.checking.placement import expected_count, fewest_count
+from mixpose.checking.placement import Camera, expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import IN_A_ROW, Diagnosis, Otherwise, diagnosis, late_sensor
@@ -30,7 +24,7 @@ from mixpose.frames.video import Video
 from mixpose.judgement import APART
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import observe
-from mixpose.sensors import CloudSensor, FisheyeCamera, PinholeCamera
+from mixpose.sensors import CloudSensor
 from mixpose.session import Session
 
 CAUSES = (
@@ -63,10 +57,7 @@ def geometry_doubts(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()
     )
-    tells = any(
-        isinstance(one.sensor, PinholeCamera | FisheyeCamera | CloudSensor)
-        for one in session.sensors
-    )
+    tells = any(isinstance(one.sensor, Camera | CloudSensor) for one in session.sensors)
     if len(session.labels) > 1 or streams or not (tells or len(sources) > 1):
         return Doubts()
     recording, count = _Recording(session, sources, surveys), DiagnosisRules().frames

@@ -15,7 +15,7 @@ from mixpose.body import LookAlike, congruent_parts, of_size
 from mixpose.checking.changes import called
 from mixpose.checking.evidence import anywhere, estimate_of
 from mixpose.checking.lookalikes import noise_of
-from mixpose.checking.placement import typical_poses
+from mixpose.checking.placement import Camera, typical_poses
 from mixpose.errors import MixposeError
 from mixpose.extraction import METHODS, ExtractOptions
 from mixpose.frames import files_of
@@ -23,7 +23,7 @@ from mixpose.objective import View
 from mixpose.records import FrameSet, Image, RawFrame
 from mixpose.runner import observe, source_spec
 from mixpose.search import is_pointlike
-from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
+from mixpose.sensors import RangeSensor
 from mixpose.session import SensorSetup, Session
 
 _FEW = 0.6  # of the expected features: fewer are too few
@@ -169,7 +169,7 @@ def _off_centre(session: Session) -> list[str]:
     warnings = []
     for setup in session.sensors:
         sensor = setup.sensor
-        if not isinstance(sensor, PinholeCamera | FisheyeCamera) or sensor.resolution is None:
+        if not isinstance(sensor, Camera) or sensor.resolution is None:
             continue
         size = np.array(sensor.resolution)
         cx, cy = sensor.camera_matrix[:2, 2]
