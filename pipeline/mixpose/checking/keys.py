@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -59,13 +60,10 @@ def advice(
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
     frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
-    before = _count(_found(session, setup, frame, {}))
-    trials = []
-    for key, value in _trials(options, image):
-        views = _found(session, setup, frame, {key: value})
-        count = _count(views)
-        if count >= 0.9 * expected and judge(count, expected) is None:
-            trials.append(_Trial(key, value, count, views))
+    before, _ = _found(session, setup, frame, {})
+    tried = _trials(options, image)
+    trials = [_Trial(k, v, *_found(session, setup, frame, {k: v})) for k, v in tried]
+    trials = [t for t in trials if t.found >= 0.9 * expected and judge(t.found, expected) is None]
     # the rule that goes by each image comes first, as a number may suit this image alone
     trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.found - expected)))
     if before > expected:
@@ -89,8 +87,7 @@ def advice(
             "mixpose inspect shows what is found"
         )
     keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
-    usual = "polarity, threshold, min_area and max_area"
-    change = keys.get(options.method, usual)
+    change = keys.get(options.method, "polarity, threshold, min_area and max_area")
     own = [key for key in re.findall(r"\w+", change) if key in setup.own]
     beside = f", {' and '.join(own)} {_OWN}" if own else ""
     is_hidden = before > 0 and session.body.normals is None
@@ -141,22 +138,15 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
 
 def _found(
     session: Session, setup: SensorSetup, frame: RawFrame, changed: dict[str, Any]
-) -> list[View]:
-    """What the sensor alone finds in a frame with other options; nothing where they are wrong."""
-    options = replace(setup.extract, **changed)
-    if options.max_area is not None and options.max_area <= options.min_area:
-        return []
-    alone = replace(session, sensors=(replace(setup, extract=options),))
-    try:
-        return observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
-    except MixposeError:
-        return []
-
-
-def _count(views: Sequence[View]) -> int:
-    """How many features were found, where they are points."""
+) -> tuple[int, list[View]]:
+    """How many points the sensor alone finds with other options; none where they are wrong."""
+    options, views = replace(setup.extract, **changed), list[View]()
+    if options.max_area is None or options.max_area > options.min_area:
+        alone = replace(session, sensors=(replace(setup, extract=options),))
+        with suppress(MixposeError):
+            views = observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
     seen = [view.observation for view in views]
-    return sum(each.found for each in seen if each.points is not None)
+    return sum(each.found for each in seen if each.points is not None), views
 
 
 def key_warnings(session: Session) -> list[str]:

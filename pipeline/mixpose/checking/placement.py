@@ -166,8 +166,7 @@ def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> l
     if not unseen:
         return []
     cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
-    stand = [n for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))]
-    placed = {name: cameras[name] for name in stand}
+    placed = {n: s for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))}
     names = {setup.name for setup in unseen}
     # only where the inverse mends every camera, chance is no likely reason
     if placed and names.issuperset(placed):

@@ -49,9 +49,8 @@ def _sees_something_else(expected: Expectation) -> bool:
 def _counts(finding: Finding, body: Body, unit: str) -> str:
     unit = "px" if finding.setup.sensor.unit == "px" else unit
     if finding.points is None:
-        found = f"light as of {finding.count:.1f} points"
-        if finding.setup.sensor.dimension == 1:
-            found = f"echoes as of {finding.count:.1f} points"
+        what = "echoes" if finding.setup.sensor.dimension == 1 else "light"
+        found = f"{what} as of {finding.count:.1f} points"
     else:
         found = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
         found += ", which are too many to use any" * (finding.passed_over > 0)

@@ -67,10 +67,23 @@ def find(
 ) -> list[Finding]:
     """Compare what every sensor found with what the estimate expects of it."""
     by_name = {view.name: view for view in views}
-    return [
-        _finding(setup, frames.get(setup.name), by_name.get(setup.name), body, estimate)
-        for setup in setups
-    ]
+    T, sure = estimate.T_world_object, estimate.status == "ok"
+    found = []
+    for setup in setups:
+        frame, view = frames.get(setup.name), by_name.get(setup.name)
+        if view is None:
+            found.append(Finding(setup, frame, None, None, 0.0, None))
+            continue
+        pattern, sigma = view.observation.pattern, view.observation.sigma
+        if isinstance(pattern, PointPattern):
+            points, count = pattern.points, float(view.observation.found)
+        else:  # so many equal features would have the energy of the grid
+            top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
+            energy = view.observation.energy(sigma)
+            points, count = None, float(top / energy) if energy > 0 else 0.0
+        expectation = None if T is None else _expect(view, body, T, points, sure=sure)
+        found.append(Finding(setup, frame, view, points, count, expectation))
+    return found
 
 
 def find_several(
@@ -103,23 +116,6 @@ def _unexplained(view: View, others: Sequence[Finding]) -> View:
         if finding.name == view.name and finding.expectation is not None:
             left &= finding.expectation.unexplained
     return replace(view, observation=view.observation.only(left))
-
-
-def _finding(
-    setup: SensorSetup, frame: RawFrame | None, view: View | None, body: Body, estimate: Estimate
-) -> Finding:
-    if view is None:
-        return Finding(setup, frame, None, None, 0.0, None)
-    pattern, sigma = view.observation.pattern, view.observation.sigma
-    if isinstance(pattern, PointPattern):
-        points, count = pattern.points, float(view.observation.found)
-    else:  # so many equal features would have the energy of the grid
-        top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
-        energy = view.observation.energy(sigma)
-        points, count = None, float(top / energy) if energy > 0 else 0.0
-    T, sure = estimate.T_world_object, estimate.status == "ok"
-    expectation = None if T is None else _expect(view, body, T, points, sure=sure)
-    return Finding(setup, frame, view, points, count, expectation)
 
 
 def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:

@@ -58,8 +58,8 @@ def features_picture(finding: Finding, room: Size) -> Picture:
     """The frame with a cross at every feature found."""
     picture, part = backdrop(finding.setup, finding.frame, room)
     _mark(picture, part, finding)
-    count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
-    text = f"{count} found" if finding.points is not None else f"light as of {count} points"
+    is_grid, count = finding.points is None, finding.count
+    text = f"light as of {count:.1f} points" if is_grid else f"{count:.0f} found"
     return titled(picture, f"{finding.name}: {text}")
 
 
