@@ -129,7 +129,7 @@ class PointPattern:
 class GridPattern:
     """Feature pattern g0 as values on a regular grid: grey values or a range profile."""
 
-    values: NDArray[np.float32]  # (H, W) not negative after extraction; a profile has H = 1
+    values: Singles  # (H, W) not negative after extraction; a profile has H = 1
     origin: Floats  # (m,) sensor coordinates of ``values[0, 0]``, u first
     step: float  # sensor units from one grid point to the next
 
@@ -249,8 +249,8 @@ class SensorReport:
 class Offsets:
     """By how much a sensor met the features of a pose; n of them are in view."""
 
-    features: NDArray[np.intp]  # (n,) their places in the body
-    met: NDArray[np.bool_]  # (n,)
+    features: Indices  # (n,) their places in the body
+    met: Mask  # (n,)
     offsets: Floats  # (n, m) observed minus predicted place, sensor units; 0 where it was not met
     # (n, m, 3) derivative of the predicted place by a shift of the body in the world
     by_shift: Floats

@@ -17,14 +17,13 @@ from itertools import chain, combinations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mixpose.body.features import PointFeature
 from mixpose.body.model import Body
 from mixpose.body.symmetry import SAME_NORMAL, congruent_triples, motions, widest_triple
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, rotation_angle_deg, transform
 
 ASIDE = "the body explains as much a step of its grid aside"
@@ -246,16 +245,11 @@ def _is_narrow(points: Floats, tolerance: float) -> bool:
 
 
 def _kept(
-    body: Body,
-    chosen: NDArray[np.intp],
-    other: Body,
-    T_other_body: Floats,
-    tolerance: float,
-    least: int,
+    body: Body, chosen: Indices, other: Body, T_other_body: Floats, tolerance: float, least: int
 ) -> Iterable[LookAlike]:
     """Of motions (K, 4, 4), those that bring enough of the chosen features to partners."""
     T, lacking = T_other_body, np.zeros(len(T_other_body), dtype=np.intp)
-    tried: list[tuple[NDArray[np.intp], NDArray[np.bool_]]] = []
+    tried: list[tuple[Indices, Mask]] = []
     # some from everywhere at a time: few motions leave so many of them without
     chosen = np.random.default_rng(0).permutation(chosen)
     for first in range(0, len(chosen), _TOGETHER):
@@ -275,7 +269,7 @@ def _kept(
             yield part
 
 
-def _a_step_aside(body: Body, chosen: NDArray[np.intp], tolerance: float) -> Iterable[LookAlike]:
+def _a_step_aside(body: Body, chosen: Indices, tolerance: float) -> Iterable[LookAlike]:
     """Steps of a body's grid that leave half of the chosen features: of small ones few do more."""
     steps = np.tile(np.eye(4), (len(body.grid_steps), 1, 1))
     steps[:, :3, 3] = body.grid_steps
@@ -287,8 +281,8 @@ def _a_step_aside(body: Body, chosen: NDArray[np.intp], tolerance: float) -> Ite
 
 
 def _partners(
-    body: Body, chosen: NDArray[np.intp], other: Body, T_other_body: Floats, reach: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    body: Body, chosen: Indices, other: Body, T_other_body: Floats, reach: float
+) -> tuple[Indices, Mask]:
     """Nearest partners (K, n) of features moved by motions (K, 4, 4), and whether they will do."""
     moved = transform(T_other_body, body.means[chosen])
     away, partners = _tree(other).query(moved, distance_upper_bound=reach)
@@ -300,9 +294,7 @@ def _partners(
     return partners, near
 
 
-def _fitted(
-    body: Body, other: Body, features: NDArray[np.intp], partners: NDArray[np.intp]
-) -> LookAlike:
+def _fitted(body: Body, other: Body, features: Indices, partners: Indices) -> LookAlike:
     """The motion of the other's features onto a body's."""
     points, targets = body.means[features], other.means[partners]
     T = motions(targets, points[None])[0]
@@ -311,7 +303,7 @@ def _fitted(
 
 
 def _grown(
-    body: Body, other: Body, base: Sequence[int], image: NDArray[np.intp], tolerance: float
+    body: Body, other: Body, base: Sequence[int], image: Indices, tolerance: float
 ) -> LookAlike | None:
     """All pairs that fit the motion of a triple, or none if the triple itself does not."""
     points, targets = body.means[:60], other.means[:60]
@@ -327,7 +319,7 @@ def _grown(
     return _fitted(body, other, np.flatnonzero(near), partners[near])
 
 
-def _are_among(triples: NDArray[np.intp], known: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _are_among(triples: Indices, known: Indices) -> Mask:
     """Whether triples (K, 3) of numbers are among known ones (F, 3)."""
     one, other = (each @ [1_000_000, 1000, 1] for each in (triples, known))
     return np.isin(one, other[(known >= 0).all(axis=1)])
@@ -346,7 +338,7 @@ def _is_symmetry(part: LookAlike) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _permutations(body: Body) -> NDArray[np.intp]:
+def _permutations(body: Body) -> Indices:
     """The feature that each feature goes to (G, N), by each symmetry."""
     return np.array([cdist(moved, body.means).argmin(axis=1)
                      for moved in transform(body.symmetries, body.means)])  # fmt: skip

@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from mixpose.body.features import Feature, Sampler, uniforms
@@ -34,7 +33,7 @@ class Nodes:
 
     points: Floats  # (Q, 3)
     weights: Floats  # (Q,) of each feature 1 together, so that all sum to N
-    feature: NDArray[np.intp]  # (Q,) that a node belongs to
+    feature: Indices  # (Q,) that a node belongs to
 
 
 @dataclass(frozen=True)

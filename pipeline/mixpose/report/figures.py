@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mixpose.records import Floats
-from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
+from mixpose.records import Floats, Mask
+from mixpose.report.series import Errors, Series, jumps_of_turns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,7 +87,7 @@ class TimeAxes:
     Lines break where frames are lost or left out, and at `jumps` (n,), which are no motion.
     """
 
-    def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
+    def __init__(self, axes: Axes, series: Series, jumps: Mask | None = None) -> None:
         self._axes, self._series = axes, series
         self._breaks = series.breaks if jumps is None else series.breaks | jumps
         x, gaps = series.x, np.diff(series.x)
@@ -117,7 +117,7 @@ class TimeAxes:
         self._axes.fill_between(x, y - width, y + width, color=_BLUE, alpha=0.25, **self._filled)
 
 
-def line(axes: Axes, x: Floats, y: Floats, breaks: Flags, look: dict[str, Any] = POSE) -> None:
+def line(axes: Axes, x: Floats, y: Floats, breaks: Mask, look: dict[str, Any] = POSE) -> None:
     """Draw a line that leaves out breaks and missing values, and dots where it would not show."""
     many, dotted = len(x) > _MANY, len(x) <= _DOTS
     x, y = _broken(x, breaks), _broken(y, breaks)
@@ -137,7 +137,7 @@ def mark_ambiguous(axes: Axes, x: Floats, y: Floats, series: Series) -> None:
     axes.plot(x[doubtful], y[doubtful], **look)
 
 
-def _broken(values: Floats, breaks: Flags) -> Floats:
+def _broken(values: Floats, breaks: Mask) -> Floats:
     """Values (..., n) with a NaN before each break."""
     return np.insert(values, np.flatnonzero(breaks), np.nan, axis=-1)
 
@@ -315,7 +315,7 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
 
 
 def _values(
-    series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
+    series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Mask
 ) -> str:
     """Values with their band above, the band's half-width alone below; none where it is open."""
     figure, (upper, lower) = stacked((3.0, 1.2))
@@ -344,7 +344,7 @@ def _values(
     return drawn(figure)
 
 
-def _open(is_open: Flags, half_width: Floats) -> str:
+def _open(is_open: Mask, half_width: Floats) -> str:
     """What a figure says of frames whose covariance leaves a direction open."""
     count, known = int(is_open.sum()), int(is_open.sum() + np.isfinite(half_width).sum())
     return f"open in {count} of {known} frames, where any value fits: no band"
