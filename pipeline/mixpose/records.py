@@ -346,10 +346,8 @@ class Estimate:
     @property
     def tip(self) -> Floats | None:
         """Where the tip is in the world, (3,); None without a tip or a pose."""
-        T = self.T_world_object
-        return (
-            None if T is None or self.tip_object is None else T[:3, :3] @ self.tip_object + T[:3, 3]
-        )
+        T, tip = self.T_world_object, self.tip_object
+        return None if T is None or tip is None else T[:3, :3] @ tip + T[:3, 3]
 
     @property
     def tip_covariance(self) -> Floats | None:

@@ -1,11 +1,8 @@
 """Motions of a body, or onto another body, under which it looks the same or nearly so.
 
 Found from coordinates alone: parts of two bodies that are congruent, all ways in which some of a
-body's features lie like others of it or of another body (a step of a grid, a turn of a square),
-the other tilt of a flat body along a line of sight, and the mirror image.
-
-A motion is fixed by where it sends three features that are not on a line.  All triples with the
-same sides are tried, and those kept under which the other features have partners, too.
+body's features lie like others of it or of another body (a step of a grid, a turn of a square), by
+triples as in `symmetry`, the other tilt of a flat body along a line of sight, and the mirror image.
 """
 
 from __future__ import annotations

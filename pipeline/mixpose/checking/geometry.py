@@ -65,8 +65,8 @@ def geometry_doubts(
     if not frames:
         return Doubts()
     chosen = [number for number, _ in frames]
-    others = _otherwise(recording, chosen)
-    seen = [views for each in (frames, *(changed for _, changed in others)) for _, views in each]
+    odd = _otherwise(recording, chosen)
+    seen = [views for each in (frames, *(changed for _, changed in odd)) for _, views in each]
     if not any(can_tell(views, len(session.body)) for views in seen):
         return _at_the_start(recording)
 
@@ -77,11 +77,11 @@ def geometry_doubts(
         chosen.extend(number for number, _ in found)
         return found
 
-    def otherwise() -> Otherwise:
-        """Though there are as many features as there should be."""
-        return others or _otherwise(recording, chosen, are_odd=False)
+    def otherwise(is_good: bool) -> Otherwise:
+        """Where nothing is explained, also of as many features as there should be."""
+        return odd if odd or is_good else _otherwise(recording, chosen, are_odd=False)
 
-    found = diagnosis(session, frames, others, further, otherwise)
+    found = diagnosis(session, frames, otherwise, further)
     if (told := _told(recording, frames, found)) is not None:
         return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()

@@ -290,7 +290,6 @@ def _text(part: LookAlike, unit: str, size: float) -> str:
         )
     return (
         f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
-        f"{other.name!r} to "
-        f"{off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
-        "expect ambiguous frames, or move a marker"
+        f"{other.name!r} to {off:.2g} {unit} ({pairs}): where the others are hidden the one may be "
+        "the other; expect ambiguous frames, or move a marker"
     )

@@ -96,16 +96,14 @@ class Tried(NamedTuple):
 def diagnosis(
     session: Session,
     frames: Frames,
-    others: Otherwise = (),
+    otherwise: Callable[[bool], Otherwise] = lambda _: (),
     further: Callable[[], Frames] = lambda: (),
-    otherwise: Callable[[], Otherwise] = lambda: (),
 ) -> Diagnosis:
     """What is most likely wrong with a session of one body, by frames of its recording.
 
-    Frames are by number, those that show most first. `others` are changes of how features are
-    extracted, with what is extracted then; where no frame is explained as it is, what `otherwise`
-    gives in their place. `further` frames are looked at, too, where these leave a change by values
-    undecided.
+    Frames are by number, those that show most first. `otherwise` gives changes of how features are
+    extracted, by whether any frame is explained as it is. `further` frames are looked at, too,
+    where these leave a change by values undecided.
     """
     session, rules = evidence.anywhere(session), DiagnosisRules()
     before = _as_it_is(session, frames)
@@ -114,7 +112,7 @@ def diagnosis(
     is_good = sum(evidence.is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        tried += _without_values(case, others if before.good(rules) else otherwise() or others)
+        tried += _without_values(case, otherwise(before.good(rules) > 0))
     # values only follow the noise where all frames are explained to within it without any
     if not any(
         all(evidence.is_well_explained(pose, rules) for pose in one.explained.poses)
