@@ -37,8 +37,8 @@ _BODY = (
     Mutant(
         "body-symmetry-without-spread",
         "body/model.py",
-        "symmetries(points, max(default_tolerance(points), self._widest))",
-        "symmetries(points, default_tolerance(points))",
+        "max(symmetry.default_tolerance(points), self._widest)",
+        "symmetry.default_tolerance(points)",
         "poses that the spread of the features hides are not known as alike",
     ),
     Mutant(

@@ -10,14 +10,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.special import ndtri
 
+from mixpose.body import symmetry
 from mixpose.body.features import Feature, Sampler, uniforms
-from mixpose.body.symmetry import (
-    default_tolerance,
-    farthest_apart,
-    grid_steps,
-    keeps_normals,
-    symmetries,
-)
 from mixpose.records import Floats, Indices
 
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
@@ -166,15 +160,16 @@ class Body:
     def symmetries(self) -> Floats:
         """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""
         points = self.nodes.points
-        found = symmetries(points, max(default_tolerance(points), self._widest))
+        tolerance = max(symmetry.default_tolerance(points), self._widest)
+        found = symmetry.symmetries(points, tolerance)
         if self.node_normals is None:
             return found
-        return found[[keeps_normals(T, points, self.node_normals) for T in found]]
+        return found[[symmetry.keeps_normals(T, points, self.node_normals) for T in found]]
 
     @cached_property
     def asymmetry(self) -> float:
         """How far symmetries put features from each other, at most; 0 but for rounding errors."""
-        return farthest_apart(self.symmetries, self.nodes.points)
+        return symmetry.farthest_apart(self.symmetries, self.nodes.points)
 
     @cached_property
     def identity(self) -> int:
@@ -191,8 +186,8 @@ class Body:
     @cached_property
     def grid_steps(self) -> Floats:
         """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
-        tolerance = max(default_tolerance(self.means), self._widest)
-        return grid_steps(self.means, tolerance, RECURRENT)
+        tolerance = max(symmetry.default_tolerance(self.means), self._widest)
+        return symmetry.grid_steps(self.means, tolerance, RECURRENT)
 
     def sample(
         self,
