@@ -225,8 +225,7 @@ def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> lis
     }
     warnings = []
     for (a, own), (b, others) in combinations(read.items(), 2):
-        both = own & others
-        if both:
+        if both := own & others:
             first = os.path.basename(min(both))  # noqa: PTH119 - of an address too
             files = first if len(both) == 1 else f"{len(both)} files ({first}, ...)"
             warnings.append(

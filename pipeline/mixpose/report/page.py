@@ -92,9 +92,7 @@ def _content(
     path = Path(named) if isinstance(named, str) and named else poses.path
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
-    files = [poses]
-    if len(labels) > 1:
-        files = [_of_body(poses, label) for label in labels]
+    files = [_of_body(poses, label) for label in labels] if len(labels) > 1 else [poses]
     template = environment.get_template(_BODY_TEMPLATE)
     parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
     for k, content in enumerate(contents):
