@@ -308,6 +308,5 @@ def _alone(session: Session, number: int, view: View) -> Floats | None:
     """T_world_object (4, 4) that one camera finds by itself."""
     if not (isinstance(view.sensor, Camera) and can_tell([view], len(session.body))):
         return None
-    most = DiagnosisRules().guesses
-    pose, _ = best_pose(anywhere(session), session.body, number, [view], most)
+    pose, _ = best_pose(anywhere(session), session.body, number, [view], DiagnosisRules().guesses)
     return None if pose is None else pose.T_world_object

@@ -60,9 +60,8 @@ class _Runner:
     def advance(self, session: Session, useful: float) -> int:
         """Try the next frame, for a pose of `useful` evidence; the guesses that took."""
         number, views = self.frames[len(self.poses)]
-        body = self.change.body(session.body)
-        seen, most = self.change.views(views), DiagnosisRules().guesses
-        pose, made = best_pose(session, body, number, seen, most, useful)
+        body, seen = self.change.body(session.body), self.change.views(views)
+        pose, made = best_pose(session, body, number, seen, DiagnosisRules().guesses, useful)
         self.poses.append(pose)
         return made
 
