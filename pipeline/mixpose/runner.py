@@ -312,7 +312,13 @@ def _observations(
     there = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
     for setup, data in there:
         if isinstance(data, np.ndarray):
-            _refuse_code(session, setup.extract.method)
+            # a session file comes from anywhere: what it names is run only where that was allowed
+            if ":" in (method := setup.extract.method) and not session.allow_code:
+                raise SessionError(
+                    f'{session.path}: extract.method: "{method}" runs code of a module that the '
+                    "session names; if you trust it, add --allow-code (in Python: "
+                    "load_session(..., allow_code=True))"
+                )
             images[setup.name] = data, setup.extract, windows.get(setup.name)
     patterns = extract_together(images, base=session.folder)
     for setup, data in there:
@@ -330,16 +336,6 @@ def _observations(
             observation = Observation(pattern, options.sigma)
         observations.append((setup, observation))
     return observations
-
-
-def _refuse_code(session: Session, method: str) -> None:
-    """A session file comes from anywhere: what it names is run only where that was allowed."""
-    if ":" in method and not session.allow_code:
-        raise SessionError(
-            f'{session.path}: extract.method: "{method}" runs code of a module that the session '
-            "names; if you trust it, add --allow-code (in Python: load_session(..., "
-            "allow_code=True))"
-        )
 
 
 def clouds_of(session: Session) -> dict[str, CloudSensor]:

@@ -83,8 +83,8 @@ def changes(session: Session) -> Iterator[Change]:
         if len(clouds) < len(session.sensors):  # beside nothing else it is told of the cloud
             yield from of_units(session.body)
         yield from _of_the_body(session.body)
-    yield from _inversions(cameras)
     sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
+    yield from _inversions(sensors)
     for a, b in combinations(sensors, 2):
         yield Change(
             f"{a!r} and {b!r} {{are}} swapped",
@@ -230,9 +230,8 @@ def called(names: Sequence[str]) -> str:
     return " and ".join(repr(name) for name in names)
 
 
-def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
+def _inversions(sensors: Mapping[str, Any]) -> Iterator[Change]:
     """Cameras of which the session has their own poses in the world: all of them, or one."""
-    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     stand = {name: each.T_sensor_world for name, each in sensors.items()}
     far = [name for name, T in stand.items() if not np.allclose(T, np.eye(4), atol=1e-5)]
     for names in _all_or_one(far):
