@@ -78,37 +78,30 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     compared.
     """
     environment = page_templates()
-    return environment.get_template(_TEMPLATE).render(
-        mark=MARK, version=version, **_content(poses, truth, cut, environment)
-    )
-
-
-def _content(
-    poses: PoseFile, truth: PoseFile | None, cut: bool, environment: Environment
-) -> dict[str, Any]:
-    """What is said once, and the parts of the page about each body."""
     labels = list(dict.fromkeys(line.label for line in poses.poses))
     origin, swaps, named = find_session(poses), None, poses.header.get("session")
     path = Path(named) if isinstance(named, str) and named else poses.path
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
     files = [_of_body(poses, label) for label in labels] if len(labels) > 1 else [poses]
-    template = environment.get_template(_BODY_TEMPLATE)
+    template = environment.get_template(_BODY_TEMPLATE)  # of what is said of each body
     parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
     for k, content in enumerate(contents):
         at = f"-{k + 1}" if len(files) > 1 else ""
         parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
-    return {
-        "name": "/".join(path.parts[-2:]),  # the folder says more than the file alone
-        "truth": truth,
-        "facts": _facts(poses, labels),
-        "notices": contents[0]["notices"] if len(files) == 1 else [],
-        "counts": list(zip(_STATUSES, map(sum, zip(*counts, strict=True)), strict=True)),
-        "swaps": swaps,
-        "parts": parts,
-        "origin": origin,
-    }
+    return environment.get_template(_TEMPLATE).render(
+        mark=MARK,
+        version=version,
+        name="/".join(path.parts[-2:]),  # the folder says more than the file alone
+        truth=truth,
+        facts=_facts(poses, labels),
+        notices=contents[0]["notices"] if len(files) == 1 else [],
+        counts=list(zip(_STATUSES, map(sum, zip(*counts, strict=True)), strict=True)),
+        swaps=swaps,
+        parts=parts,
+        origin=origin,
+    )
 
 
 def _body_content(
