@@ -77,7 +77,7 @@ def test_lost_frames_are_gaps_in_every_line(tmp_path: Path) -> None:
 def test_lost_frames_are_shaded_half_a_frame_to_either_side(tmp_path: Path) -> None:
     series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", STATUSES)))
     _, axes = blank()
-    TimeAxes(axes, series).mark_lost()
+    TimeAxes(axes, series)
     lost = np.flatnonzero(series.status == "lost")
     assert lost.tolist() == [5, 6, 7]
     half = 0.5 * (series.x[1] - series.x[0])
@@ -134,7 +134,7 @@ def test_times_since_1970_and_equal_ones_have_ticks_that_can_be_read(
     series = series_of(read_poses(write_run(tmp_path / "poses.jsonl", {})))
     figure, axes = blank()
     times = np.array([1.7e9 + step_s * k for k in range(len(series.x))])
-    TimeAxes(axes, replace(series, x=times)).frame()
+    TimeAxes(axes, replace(series, x=times))
     figure.draw_without_rendering()
     labels = [label.get_text() for label in axes.get_xticklabels()]
     # some twelve characters are an inch, and a figure is four inches wide

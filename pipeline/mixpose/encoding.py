@@ -29,11 +29,10 @@ def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
     if isinstance(value, np.ndarray):
         # sums depend in their last bit on the order in memory
         by_columns = value.flags.f_contiguous and not value.flags.c_contiguous
-        shape, kind = list(value.shape), value.dtype.name
         return {
             _KIND: "array",
-            "dtype": kind,
-            "shape": shape,
+            "dtype": value.dtype.name,
+            "shape": list(value.shape),
             "order": "F" if by_columns else "C",
             "values": value.ravel().tolist(),
         }

@@ -129,7 +129,7 @@ class PointPattern:
 class GridPattern:
     """Feature pattern g0 as values on a regular grid: grey values or a range profile."""
 
-    values: NDArray[np.float32]  # (H, W) not negative after extraction; a profile has H = 1
+    values: Singles  # (H, W) not negative after extraction; a profile has H = 1
     origin: Floats  # (m,) sensor coordinates of ``values[0, 0]``, u first
     step: float  # sensor units from one grid point to the next
 

@@ -1,18 +1,8 @@
 """A recording for the Rerun viewer: what the sensors saw, what was found in it, and the poses.
 
-Entities, on the timelines ``frame`` and, where the recording has times, ``time``:
-
-* ``world/<sensor>``: where the sensor is; below it ``image`` with the frames as JPEG, on it
-  ``features`` (found) and ``predicted`` (of the pose, lens distortion included).  Rerun's camera
-  has no distortion: in the view of the world, images are shown as if the lens had none.
-* ``density/<sensor>``: g_l, as an image or, for ranges, as a bar chart.
-* ``world/<object>``: the pose, with the features as ``points``; beside it ``world/<object>
-  covariance``, the ellipsoid that holds the position with 95 %.
-* ``plots/score`` and ``status``.
-
-Of several bodies each has its name behind ``predicted``, ``plots/score`` and ``status``.
-
-Lengths are in the session's unit.
+What is logged is in `docs/formats.md`: sensors with their images and bodies with their features
+below ``world``, g_l below ``density``, ``plots/score`` and ``status``.  Of several bodies each has
+its name behind the last two, and behind ``predicted``.  Lengths are in the session's unit.
 """
 
 from __future__ import annotations

@@ -50,9 +50,11 @@ if TYPE_CHECKING:
 Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 Starts: TypeAlias = Mapping[str, Floats]
 
-
 LEAST_DELAY_S = 1e-6
 """Frames of sensors that differ by less are simultaneous."""
+
+_KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
+"""Kind of source of sensors that are no cameras, by their model."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,6 @@ class Memory:
     """The state of a run between two frames."""
 
     tracks: tuple[Track, ...]  # one per body
-
-
-_KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
-"""Kind of source of sensors that are no cameras, by their model."""
 
 
 Remember: TypeAlias = Callable[[Memory], None]
@@ -330,7 +328,13 @@ def _observations(
     available = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
     for setup, data in available:
         if isinstance(data, np.ndarray):
-            _refuse_code(session, setup.extract.method)
+            # a session file comes from anywhere: what it names is run only where that was allowed
+            if ":" in (method := setup.extract.method) and not session.allow_code:
+                raise SessionError(
+                    f'{session.path}: extract.method: "{method}" runs code of a module that the '
+                    "session names; if you trust it, add --allow-code (in Python: "
+                    "load_session(..., allow_code=True))"
+                )
             images[setup.name] = data, setup.extract, windows.get(setup.name)
     patterns = extract_together(images, base=session.folder)
     for setup, data in available:

@@ -37,13 +37,13 @@ _BODY = (
     Mutant(
         "body-symmetry-without-spread",
         "body/model.py",
-        "symmetries(points, max(default_tolerance(points), self._widest))",
-        "symmetries(points, default_tolerance(points))",
+        "max(symmetry.default_tolerance(points), self._widest)",
+        "symmetry.default_tolerance(points)",
         "poses that the spread of the features hides are not known as alike",
     ),
     Mutant(
         "body-samples-not-mirrored",
-        "body/sampling.py",
+        "body/features.py",
         "np.concatenate([points, 1.0 - points])",
         "np.concatenate([points, points])",
         "the mean of the samples is off its feature",

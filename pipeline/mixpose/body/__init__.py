@@ -3,8 +3,10 @@
 from mixpose.body.features import (
     Feature as Feature,
     PointFeature as PointFeature,
+    Sampler as Sampler,
     SegmentFeature as SegmentFeature,
     Spread as Spread,
+    uniforms as uniforms,
 )
 from mixpose.body.look_alikes import (
     ASIDE as ASIDE,
@@ -22,7 +24,6 @@ from mixpose.body.look_alikes import (
     tolerance_of as tolerance_of,
 )
 from mixpose.body.model import Body as Body, Gravity as Gravity, Nodes as Nodes, Shape as Shape
-from mixpose.body.sampling import Sampler as Sampler, uniforms as uniforms
 from mixpose.body.symmetry import (
     default_tolerance as default_tolerance,
     is_on_a_line as is_on_a_line,

@@ -1,14 +1,18 @@
-"""Kinds of feature: the densities q_i of where a feature of the object may be.
+"""Kinds of feature, the densities q_i of where a feature of the object may be, and their samples.
 
-A feature kind states its mean and covariance, how uniform numbers become samples of it, and the
-few weighted points that stand for it where the body is not sampled (`nodes`).  A new kind is one
-class with these members.
+A kind has a mean, a covariance about its nodes (the few weighted points that stand for it where the
+body is not sampled), and a way from uniform numbers to samples of it.
+
+Every feature takes the *same* set of uniform numbers: sampling errors then shift all features alike
+instead of deforming the body, which makes the angles of an estimate several times more accurate at
+the same number of samples.  Antithetic sets (u and 1 − u) cancel the mean error of symmetric
+densities.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.special import ndtri
@@ -16,43 +20,10 @@ from scipy.special import ndtri
 from mixpose.records import Floats
 
 Spread: TypeAlias = Literal["gaussian", "uniform"]
+Sampler: TypeAlias = Literal["latin-hypercube", "low-discrepancy"]
 
 SEGMENT_NODES = 24
-
-
-@runtime_checkable
-class Feature(Protocol):
-    """A feature density q_i in the object's frame."""
-
-    @property
-    def spread(self) -> Spread:
-        """Density of the spread about the nodes."""
-        ...
-
-    @property
-    def mean(self) -> Floats:
-        """Expected position (3,)."""
-        ...
-
-    @property
-    def covariance(self) -> Floats:
-        """Spread about the nodes (3, 3); zero where the feature is exact."""
-        ...
-
-    def nodes(self) -> tuple[Floats, Floats]:
-        """Points (K, 3) and weights (K,), summing to 1, that carry the spread."""
-        ...
-
-    def shifted(self, by: Floats) -> Feature:
-        """The same elsewhere, by a shift (3,)."""
-        ...
-
-    def sample(self, uniforms: Floats) -> Floats:
-        """Turn uniform numbers (R, 5) in (0, 1) into samples (R, 3) of the density.
-
-        The first three are for the spread, the fourth runs along a line, the fifth is the body's.
-        """
-        ...
+_DIMENSIONS = 5  # three for a feature's spread, one along a line, one along gravity
 
 
 def no_spread() -> Floats:
@@ -125,6 +96,9 @@ class SegmentFeature:
         return on_line + offsets(uniforms, self.covariance, self.spread)
 
 
+Feature: TypeAlias = PointFeature | SegmentFeature
+
+
 def offsets(uniforms: Floats, covariance: Floats, spread: Spread) -> Floats:
     """Zero-mean offsets (R, 3) of a covariance from the first three of uniform numbers (R, 5)."""
     if not covariance.any():
@@ -136,3 +110,32 @@ def offsets(uniforms: Floats, covariance: Floats, spread: Spread) -> Floats:
     else:
         unit = np.sqrt(12.0) * (uniforms[:, :3] - 0.5)
     return np.asarray(unit @ root.T)
+
+
+def uniforms(
+    count: int, *, sampler: Sampler = "latin-hypercube", antithetic: bool = True, seed: int = 0
+) -> Floats:
+    """Draw R = `count` points (R, 5) of the open unit cube, strictly between 0 and 1.
+
+    Latin hypercube is the paper's `lhsnorm`, the other a scrambled Sobol sequence.  Of antithetic
+    points the second half mirrors the first, and the odd one of an odd count is left out.  Raises
+    `ValueError` if the count is below 2 or the sampler is unknown.
+    """
+    if count < 2:
+        raise ValueError(f"{count} samples, at least 2 are needed")
+    from scipy.stats import qmc  # noqa: PLC0415 - scipy.stats takes a second to import
+
+    drawn = count // 2 if antithetic else count
+    rng = np.random.default_rng(seed)
+    if sampler == "latin-hypercube":
+        points = qmc.LatinHypercube(_DIMENSIONS, rng=rng).random(drawn)
+    elif sampler == "low-discrepancy":
+        # Sobol points are balanced only in powers of two: draw the next one and keep the first
+        exponent = int(np.ceil(np.log2(max(drawn, 2))))
+        points = qmc.Sobol(_DIMENSIONS, rng=rng).random_base2(exponent)[:drawn]
+    else:
+        raise ValueError(f"sampler {sampler!r}, allowed are latin-hypercube, low-discrepancy")
+    if antithetic:
+        points = np.concatenate([points, 1.0 - points])
+    smallest = np.finfo(np.float64).eps
+    return np.asarray(np.clip(points, smallest, 1.0 - smallest), dtype=np.float64)

@@ -1,11 +1,8 @@
 """Motions of a body, or onto another body, under which it looks the same or nearly so.
 
 Found from coordinates alone: parts of two bodies that are congruent, all ways in which some of a
-body's features lie like others of it or of another body (a step of a grid, a turn of a square),
-the other tilt of a flat body along a line of sight, and the mirror image.
-
-A motion is fixed by where it sends three features that are not on a line.  All triples with the
-same sides are tried, and those kept under which the other features have partners, too.
+body's features lie like others of it or of another body (a step of a grid, a turn of a square), by
+triples as in `symmetry`, the other tilt of a flat body along a line of sight, and the mirror image.
 """
 
 from __future__ import annotations
@@ -17,14 +14,13 @@ from itertools import chain, combinations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mixpose.body.features import PointFeature
 from mixpose.body.model import Body
 from mixpose.body.symmetry import SAME_NORMAL, congruent_triples, motions, widest_triple
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, rotation_angle_deg, transform
 
 ASIDE = "the body explains as much a step of its grid aside"
@@ -230,21 +226,13 @@ def _bases(points: Floats, tolerance: float, fewest: int) -> list[list[int]]:
     first = list(widest_triple(points))
     if _is_narrow(points[first], tolerance):
         return []
-    bases = [first]
-    if len(points) > fewest:
-        for left_out in first:
-            rest = np.delete(np.arange(len(points)), left_out)
-            base = rest[list(widest_triple(points[rest]))].tolist()
-            if not _is_narrow(points[base], tolerance):
-                bases.append(base)
+    parts = [np.delete(np.arange(len(points)), k) for k in first if len(points) > fewest]
     # where a step of a grid takes those at an edge away, those in the middle have partners
     away = np.linalg.norm(points - points.mean(axis=0), axis=1)
     middle = away.argsort(kind="stable")[: len(points) // 2]
-    if len(middle) > FEWEST:
-        base = middle[list(widest_triple(points[middle]))].tolist()
-        if not _is_narrow(points[base], tolerance):
-            bases.append(base)
-    return bases
+    parts += [middle] if len(middle) > FEWEST else []
+    others = [part[list(widest_triple(points[part]))].tolist() for part in parts]
+    return [first, *(base for base in others if not _is_narrow(points[base], tolerance))]
 
 
 def _is_narrow(points: Floats, tolerance: float) -> bool:
@@ -254,16 +242,11 @@ def _is_narrow(points: Floats, tolerance: float) -> bool:
 
 
 def _kept(
-    body: Body,
-    chosen: NDArray[np.intp],
-    other: Body,
-    T_other_body: Floats,
-    tolerance: float,
-    least: int,
+    body: Body, chosen: Indices, other: Body, T_other_body: Floats, tolerance: float, least: int
 ) -> Iterable[LookAlike]:
     """Of motions (K, 4, 4), those that bring enough of the chosen features to partners."""
     T, lacking = T_other_body, np.zeros(len(T_other_body), dtype=np.intp)
-    tried: list[tuple[NDArray[np.intp], NDArray[np.bool_]]] = []
+    tried: list[tuple[Indices, Mask]] = []
     # some from everywhere at a time: few motions leave so many of them without
     chosen = np.random.default_rng(0).permutation(chosen)
     for first in range(0, len(chosen), _TOGETHER):
@@ -283,7 +266,7 @@ def _kept(
             yield part
 
 
-def _a_step_aside(body: Body, chosen: NDArray[np.intp], tolerance: float) -> Iterable[LookAlike]:
+def _a_step_aside(body: Body, chosen: Indices, tolerance: float) -> Iterable[LookAlike]:
     """Steps of a body's grid that leave half of the chosen features: of small ones few do more."""
     steps = np.tile(np.eye(4), (len(body.grid_steps), 1, 1))
     steps[:, :3, 3] = body.grid_steps
@@ -295,8 +278,8 @@ def _a_step_aside(body: Body, chosen: NDArray[np.intp], tolerance: float) -> Ite
 
 
 def _partners(
-    body: Body, chosen: NDArray[np.intp], other: Body, T_other_body: Floats, reach: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    body: Body, chosen: Indices, other: Body, T_other_body: Floats, reach: float
+) -> tuple[Indices, Mask]:
     """Nearest partners (K, n) of features moved by motions (K, 4, 4), and whether they will do."""
     moved = transform(T_other_body, body.means[chosen])
     away, partners = _tree(other).query(moved, distance_upper_bound=reach)
@@ -308,9 +291,7 @@ def _partners(
     return partners, near
 
 
-def _fitted(
-    body: Body, other: Body, features: NDArray[np.intp], partners: NDArray[np.intp]
-) -> LookAlike:
+def _fitted(body: Body, other: Body, features: Indices, partners: Indices) -> LookAlike:
     """The motion of the other's features onto a body's."""
     points, targets = body.means[features], other.means[partners]
     T = motions(targets, points[None])[0]
@@ -319,7 +300,7 @@ def _fitted(
 
 
 def _grown(
-    body: Body, other: Body, base: Sequence[int], image: NDArray[np.intp], tolerance: float
+    body: Body, other: Body, base: Sequence[int], image: Indices, tolerance: float
 ) -> LookAlike | None:
     """All pairs that fit the motion of a triple, or none if the triple itself does not."""
     points, targets = body.means[:60], other.means[:60]
@@ -335,7 +316,7 @@ def _grown(
     return _fitted(body, other, np.flatnonzero(near), partners[near])
 
 
-def _are_among(triples: NDArray[np.intp], known: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _are_among(triples: Indices, known: Indices) -> Mask:
     """Whether triples (K, 3) of numbers are among known ones (F, 3)."""
     one, other = (each @ [1_000_000, 1000, 1] for each in (triples, known))
     return np.isin(one, other[(known >= 0).all(axis=1)])
@@ -354,7 +335,7 @@ def _is_symmetry(part: LookAlike) -> bool:
 
 
 @lru_cache(maxsize=256)
-def _permutations(body: Body) -> NDArray[np.intp]:
+def _permutations(body: Body) -> Indices:
     """The feature that each feature goes to (G, N), by each symmetry."""
     return np.array([cdist(moved, body.means).argmin(axis=1)
                      for moved in transform(body.symmetries, body.means)])  # fmt: skip

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from mixpose.body.features import Feature
-from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import (
-    default_tolerance,
-    farthest_apart,
-    grid_steps,
-    keeps_normals,
-    symmetries,
-)
+from mixpose.body import symmetry
+from mixpose.body.features import Feature, Sampler, uniforms
 from mixpose.records import Floats, Indices
 
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
@@ -35,7 +27,7 @@ class Nodes:
 
     points: Floats  # (Q, 3)
     weights: Floats  # (Q,) of each feature 1 together, so that all sum to N
-    feature: NDArray[np.intp]  # (Q,) that a node belongs to
+    feature: Indices  # (Q,) that a node belongs to
 
 
 @dataclass(frozen=True)
@@ -168,15 +160,16 @@ class Body:
     def symmetries(self) -> Floats:
         """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""
         points = self.nodes.points
-        found = symmetries(points, max(default_tolerance(points), self._widest))
+        tolerance = max(symmetry.default_tolerance(points), self._widest)
+        found = symmetry.symmetries(points, tolerance)
         if self.node_normals is None:
             return found
-        return found[[keeps_normals(T, points, self.node_normals) for T in found]]
+        return found[[symmetry.keeps_normals(T, points, self.node_normals) for T in found]]
 
     @cached_property
     def asymmetry(self) -> float:
         """How far symmetries put features from each other, at most; 0 but for rounding errors."""
-        return farthest_apart(self.symmetries, self.nodes.points)
+        return symmetry.farthest_apart(self.symmetries, self.nodes.points)
 
     @cached_property
     def identity(self) -> int:
@@ -193,8 +186,8 @@ class Body:
     @cached_property
     def grid_steps(self) -> Floats:
         """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
-        tolerance = max(default_tolerance(self.means), self._widest)
-        return grid_steps(self.means, tolerance, RECURRENT)
+        tolerance = max(symmetry.default_tolerance(self.means), self._widest)
+        return symmetry.grid_steps(self.means, tolerance, RECURRENT)
 
     def sample(
         self,
@@ -212,14 +205,11 @@ class Body:
         """
         if self.is_exact:
             return self.means[:, None, :].copy()
-        shared = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed)
-        samples = []
-        for i, feature in enumerate(self.features):
-            own = shared
-            if not common:
-                own = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed + 7919 * i)
-            samples.append(feature.sample(own))
-        return np.array(samples)
+        drawn = partial(uniforms, count, sampler=sampler, antithetic=antithetic)
+        sets = [drawn(seed=seed)] * len(self)
+        if not common:
+            sets = [drawn(seed=seed + 7919 * i) for i in range(len(self))]
+        return np.array([one.sample(own) for one, own in zip(self.features, sets, strict=True)])
 
     def world_offsets(self, count: int, *, seed: int = 0) -> Floats:
         """Displacements along gravity (R, 3) in the world, one for each sample of a feature.

@@ -11,11 +11,10 @@ a feature within the tolerance are kept.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts, transform
 
 SAME_NORMAL = 0.99  # cosine
@@ -136,7 +135,7 @@ def widest_triple(points: Floats) -> tuple[int, int, int]:
     return first, second, int(area.argmax())
 
 
-def congruent_triples(base: Floats, points: Floats, slack: float) -> NDArray[np.intp]:
+def congruent_triples(base: Floats, points: Floats, slack: float) -> Indices:
     """Ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
     apart = cdist(points, points)
     np.fill_diagonal(apart, np.inf)
@@ -145,7 +144,7 @@ def congruent_triples(base: Floats, points: Floats, slack: float) -> NDArray[np.
 
 def congruent_triples_of_each(
     base: Floats, apart: Floats, slack: Floats
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Indices, Indices]:
     """Such triples of several clouds of points, by distances (C, N, N); and the cloud (K,) of each.
 
     Sides may be off by the slack (C,) of the cloud.

@@ -1,13 +1,9 @@
 """What can be said of a session before its poses are estimated.
 
-`recordings` reads every frame and counts features in some, `keys` says which key to change where
-the count is off and the body is found with that change, doubts calibrations and widths, and finds
-bodies that could be taken for each other and recordings that are given twice, `placement` looks at
-where sensors stand and the body starts, `lookalikes` finds poses that the sensors could not tell
-apart. `geometry` takes a few frames all over the recording, and `trials` tries what else the
-session could have said: `changes` of it as a whole, by two of them, and `values` that are adjusted
-to what sensors met; `evidence` says what they met and how well frames are explained, `rules` when a
-change is told.
+`recordings` reads every frame, `keys`, `placement` and `lookalikes` doubt what the session says by
+itself and by the features that are found.  `geometry` takes a few frames, and `trials` tries what
+else the session could have said: `changes` of it as a whole, and `values` that are adjusted to what
+sensors met, judged by `evidence` and `rules`.
 """
 
 from mixpose.checking.changes import times_as_large as times_as_large

@@ -7,27 +7,25 @@ A change is of the body, of sensors, or of what they see; those with values to b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from mixpose.body import Body, PointFeature, of_points, of_size
+from mixpose.body import Body, of_points, of_size
 from mixpose.checking.evidence import Frames, Views, anywhere, best_pose, can_tell
+from mixpose.checking.placement import Camera
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse, rotation_angle_deg
-from mixpose.sensors import (
-    CloudPlane,
-    CloudSensor,
-    FisheyeCamera,
-    PinholeCamera,
-    RangeSensor,
-)
+from mixpose.search import is_pointlike
+from mixpose.sensors import CloudSensor, RangeSensor
 from mixpose.session import SensorSetup, Session
+from mixpose.tracking import plane_names
 
 # of mm, cm and m
 _UNITS = (
@@ -75,47 +73,40 @@ class Change:
 
 def changes(session: Session) -> Iterator[Change]:
     """Changes without values, those that are simple first."""
-    cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
+    cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Camera)]
     clouds = [setup.name for setup in session.sensors if isinstance(setup.sensor, CloudSensor)]
-    are_points = all(isinstance(feature, PointFeature) for feature in session.body.features)
     ranges = [setup.name for setup in session.sensors if isinstance(setup.sensor, RangeSensor)]
-    if clouds:
-        yield from _in_another_unit("points", clouds, CloudPlane)
-    if ranges:
-        yield from _in_another_unit("ranges", ranges, RangeSensor)
-    if are_points:
+    planes = [plane for name in clouds for plane in plane_names(name)]
+    yield from _in_another_unit("points", clouds, planes)
+    yield from _in_another_unit("ranges", ranges, ranges)
+    if is_pointlike(session.body):
         if len(clouds) < len(session.sensors):  # beside nothing else it is told of the cloud
             yield from of_units(session.body)
         yield from _of_the_body(session.body)
-    yield from _inversions(cameras)
-    for a, b in combinations([setup.name for setup in cameras], 2):
+    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
+    yield from _inversions(sensors)
+    for a, b in combinations(sensors, 2):
         yield Change(
             f"{a!r} and {b!r} {{are}} swapped",
             "with the source of each given to the other",
-            lambda views, a=a, b=b: _swapped(views, a, b),  # type: ignore[misc]
+            partial(_swapped, other={a: b, b: a}),
         )
-    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
-            lenses = {a: sensors[b], b: sensors[a]}  # each where it is, with that of the other
             yield _of_sensors(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
                 (a, b),
-                lambda view, lenses=lenses: of_camera(  # type: ignore[misc]
-                    view,
-                    camera_matrix=lenses[view.name].camera_matrix,
-                    distortion=lenses[view.name].distortion,
-                ),
+                partial(_with_lens, lenses={a: sensors[b], b: sensors[a]}),
             )
     yield from _flips(cameras, "mirrored", "left and right", 0)
-    for names in _all_or_one([setup.name for setup in cameras]):
+    for names in _all_or_one(list(sensors)):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
             yield _of_sensors(
                 f"camera_matrix of {called(names)} {{is}} that of images {images} as large",
                 f"with fx, fy, cx and cy {done}",
                 names,
-                lambda view, k=factor: with_sensor(view, scaled(view.sensor, k)),  # type: ignore[misc]
+                partial(_scaled, factor=factor),
             )
     if len(cameras) > 1:  # to one camera that is mirrored, but for a half-turn
         for change in _flips(cameras, "upside down", "top and bottom", 1):
@@ -125,12 +116,18 @@ def changes(session: Session) -> Iterator[Change]:
 def _flips(cameras: Sequence[SensorSetup], what: str, ends: str, axis: int) -> Iterator[Change]:
     """Images of which an axis counts from the other end."""
     sized = {s.name: s.resolution for s in cameras if s.resolution is not None}
+    along = np.arange(2) == axis
+
+    def flipped(view: View) -> View:
+        last = sized[view.name][axis] - 1.0
+        return _with_points(view, lambda points: np.where(along, last - points, points))
+
     for names in _all_or_one(list(sized)):
         yield _of_sensors(
             f"images of {called(names)} {{are}} {what}",
             f"with {ends} of them exchanged",
             names,
-            lambda view: _flipped(view, sized[view.name][axis], axis),
+            flipped,
         )
 
 
@@ -141,35 +138,32 @@ def _of_sensors(
     return Change(what, remedy, lambda views: [changed(v) if v.name in names else v for v in views])
 
 
-def scaled(sensor: Any, factor: float) -> Any:
-    """A camera of images that are so many times as large."""
-    K = np.array(sensor.camera_matrix) * np.array([[factor], [factor], [1.0]])
-    return replace(sensor, camera_matrix=K)
-
-
-def with_sensor(view: View, sensor: Any) -> View:
-    """A view as if by another sensor."""
-    return view if sensor is view.sensor else replace(view, sensor=sensor)
-
-
-def of_camera(view: View, **changed: Floats) -> View:
+def _by(view: View, **changed: Floats) -> View:
     """A view as if by a camera that differs in what is changed."""
     camera: Any = view.sensor
     return replace(view, sensor=replace(camera, **changed))
 
 
-def _in_another_unit(what: str, names: Sequence[str], kind: type) -> Iterator[Change]:
-    """What a kind of sensors measures in a unit of length that is not that of the session."""
+def _scaled(view: View, factor: float) -> View:
+    """A view as if by a camera of images that are so many times as large."""
+    camera: Any = view.sensor
+    return _by(view, camera_matrix=camera.camera_matrix * np.array([[factor], [factor], [1.0]]))
 
-    def of(view: View, factor: float) -> View:
-        is_one = isinstance(view.sensor, kind)
-        return _with_points(view, lambda points: factor * points) if is_one else view
 
-    for factor, where in _UNITS:
-        yield Change(
+def _with_lens(view: View, lenses: Mapping[str, Any]) -> View:
+    """A view as if by a camera that is where it is, with another lens."""
+    lens = lenses[view.name]
+    return _by(view, camera_matrix=lens.camera_matrix, distortion=lens.distortion)
+
+
+def _in_another_unit(what: str, names: Sequence[str], views: Sequence[str]) -> Iterator[Change]:
+    """What sensors measure, in some views, in a unit of length that is not that of the session."""
+    for factor, where in _UNITS if names else ():
+        yield _of_sensors(
             f"the {what} of {called(names)} {{are}} in another unit than the session",
             f"with them {where}",
-            lambda views, k=factor: [of(view, k) for view in views],  # type: ignore[misc]
+            views,
+            partial(_with_points, changed=partial(np.multiply, factor)),
         )
 
 
@@ -196,7 +190,7 @@ def of_units(body: Body) -> Iterator[Change]:
         yield Change(
             "points and translations {are} in two units of length",
             f"with points {where}",
-            body=lambda body, k=factor: of_size(body, k),  # type: ignore[misc]
+            body=partial(of_size, factor=factor),
         )
 
 
@@ -236,38 +230,23 @@ def called(names: Sequence[str]) -> str:
     return " and ".join(repr(name) for name in names)
 
 
-def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
+def _inversions(sensors: Mapping[str, Any]) -> Iterator[Change]:
     """Cameras of which the session has their own poses in the world: all of them, or one."""
-    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
-    far = [
-        n
-        for n, each in sensors.items()
-        if not np.allclose(each.T_sensor_world, np.eye(4), atol=1e-5)
-    ]
+    stand = {name: each.T_sensor_world for name, each in sensors.items()}
+    far = [name for name, T in stand.items() if not np.allclose(T, np.eye(4), atol=1e-5)]
     for names in _all_or_one(far):
         yield _of_sensors(
             f"T_sensor_world of {called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
             "(it maps world to sensor coordinates)",
             "with the inverse",
             names,
-            lambda view: of_camera(view, T_sensor_world=inverse(view.sensor.T_sensor_world)),  # type: ignore[attr-defined]
+            lambda view: _by(view, T_sensor_world=inverse(view.sensor.T_sensor_world)),  # type: ignore[attr-defined]
         )
 
 
-def _swapped(views: Views, a: str, b: str) -> Views:
-    seen = {view.name: view.observation for view in views}
-    other = {a: b, b: a}
-    return [
-        replace(view, observation=seen[other.get(view.name, view.name)])
-        for view in views
-        if other.get(view.name, view.name) in seen
-    ]
-
-
-def _flipped(view: View, pixels: int, axis: int) -> View:
-    """A view of which an axis, of so many pixels, counts from the other end."""
-    along = np.arange(2) == axis
-    return _with_points(view, lambda points: np.where(along, pixels - 1.0 - points, points))
+def _swapped(views: Views, other: Mapping[str, str]) -> Views:
+    seen = {other.get(view.name, view.name): view.observation for view in views}
+    return [replace(view, observation=seen[view.name]) for view in views if view.name in seen]
 
 
 def _with_points(view: View, changed: Callable[[Floats], Floats]) -> View:
@@ -285,7 +264,7 @@ def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
     for number, views in frames:
         poses = [(view, _alone(session, number, view)) for view in views]
         found.append({view.name: (view.sensor, T) for view, T in poses if T is not None})
-    if all(isinstance(feature, PointFeature) for feature in session.body.features):
+    if is_pointlike(session.body):
         yield from _other_sizes(session, found)
     for setup in session.sensors:
         name, seen = setup.name, [each for each in found if setup.name in each and len(each) > 1]
@@ -297,7 +276,7 @@ def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
                 misplaced(setup),
                 moved_by(sensor.T_sensor_world, T, session.unit),
                 [name],
-                lambda view, T=T: of_camera(view, T_sensor_world=T),  # type: ignore[misc]
+                partial(_by, T_sensor_world=T),
             )
             yield replace(moved, cost=3 * math.log(2 * len(session.body) * len(found)), values=6)
 
@@ -326,9 +305,7 @@ def _other_sizes(session: Session, found: Sequence[dict[str, Any]]) -> Iterator[
 
 def _alone(session: Session, number: int, view: View) -> Floats | None:
     """T_world_object (4, 4) that one camera finds by itself."""
-    is_camera = isinstance(view.sensor, PinholeCamera | FisheyeCamera)
-    if not (is_camera and can_tell([view], len(session.body))):
+    if not (isinstance(view.sensor, Camera) and can_tell([view], len(session.body))):
         return None
-    most = DiagnosisRules().guesses
-    pose, _ = best_pose(anywhere(session), session.body, number, [view], most)
+    pose, _ = best_pose(anywhere(session), session.body, number, [view], DiagnosisRules().guesses)
     return None if pose is None else pose.T_world_object

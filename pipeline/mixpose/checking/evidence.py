@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.checking.lookalikes import NOISE_OF_SIGMA
+from mixpose.checking.placement import Camera
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
@@ -22,7 +23,6 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Indices, Mask, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin
-from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.sensors.moving import moments
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
@@ -247,7 +247,7 @@ def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
 def is_camera(view: View) -> bool:
     """Whether a view holds points in the image of a camera with a centre."""
     has_points = isinstance(view.observation.pattern, PointPattern)
-    return has_points and isinstance(view.sensor, PinholeCamera | FisheyeCamera)
+    return has_points and isinstance(view.sensor, Camera)
 
 
 def _pattern(view: View) -> PointPattern:
@@ -276,7 +276,7 @@ def _met(matches: Matches, k: int) -> Pairs:
 def _shifted(views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]) -> list[Pairs]:
     """Features and the detections upon which one displacement of all brings them."""
     detections, sensor = [_pattern(view).points for view in views], views[0].sensor
-    assert isinstance(sensor, PinholeCamera | FisheyeCamera)
+    assert isinstance(sensor, Camera)
     differences = np.concatenate(
         [(d[:, None] - y[None, i]).reshape(-1, 2) for d, (i, y) in zip(detections, predicted)]
     )

@@ -12,15 +12,9 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.checking.changes import Change, called, of_units
-from mixpose.checking.evidence import (
-    Frames,
-    can_tell,
-    estimate_of,
-    evidence_of,
-    pose_near,
-)
+from mixpose.checking.evidence import Frames, can_tell, estimate_of, evidence_of, pose_near
 from mixpose.checking.keys import judge
-from mixpose.checking.placement import expected_count, fewest_count
+from mixpose.checking.placement import Camera, expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import IN_A_ROW, Diagnosis, Otherwise, diagnosis, late_sensor
@@ -30,7 +24,7 @@ from mixpose.frames.video import Video
 from mixpose.judgement import APART
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import observe
-from mixpose.sensors import CloudSensor, FisheyeCamera, PinholeCamera
+from mixpose.sensors import CloudSensor
 from mixpose.session import Session
 
 CAUSES = (
@@ -63,10 +57,7 @@ def geometry_doubts(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()
     )
-    tells = any(
-        isinstance(one.sensor, PinholeCamera | FisheyeCamera | CloudSensor)
-        for one in session.sensors
-    )
+    tells = any(isinstance(one.sensor, Camera | CloudSensor) for one in session.sensors)
     if len(session.labels) > 1 or streams or not (tells or len(sources) > 1):
         return Doubts()
     recording, count = _Recording(session, sources, surveys), DiagnosisRules().frames
@@ -74,8 +65,8 @@ def geometry_doubts(
     if not frames:
         return Doubts()
     chosen = [number for number, _ in frames]
-    others = _otherwise(recording, chosen)
-    seen = [views for each in (frames, *(changed for _, changed in others)) for _, views in each]
+    odd = _otherwise(recording, chosen)
+    seen = [views for each in (frames, *(changed for _, changed in odd)) for _, views in each]
     if not any(can_tell(views, len(session.body)) for views in seen):
         return _at_the_start(recording)
 
@@ -86,11 +77,11 @@ def geometry_doubts(
         chosen.extend(number for number, _ in found)
         return found
 
-    def otherwise() -> Otherwise:
-        """Though there are as many features as there should be."""
-        return others or _otherwise(recording, chosen, are_odd=False)
+    def otherwise(is_good: bool) -> Otherwise:
+        """Where nothing is explained, also of as many features as there should be."""
+        return odd if odd or is_good else _otherwise(recording, chosen, are_odd=False)
 
-    found = diagnosis(session, frames, others, further, otherwise)
+    found = diagnosis(session, frames, otherwise, further)
     if (told := _told(recording, frames, found)) is not None:
         return told
     doubts = _at_the_start(recording) if found.good or len(sources) == 1 else Doubts()

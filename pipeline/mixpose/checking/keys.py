@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from mixpose.body import LookAlike, congruent_parts, of_size
 from mixpose.checking.changes import called
 from mixpose.checking.evidence import anywhere, estimate_of
 from mixpose.checking.lookalikes import noise_of
-from mixpose.checking.placement import typical_poses
+from mixpose.checking.placement import Camera, typical_poses
 from mixpose.errors import MixposeError
 from mixpose.extraction import METHODS, ExtractOptions
 from mixpose.frames import files_of
@@ -23,7 +24,7 @@ from mixpose.objective import View
 from mixpose.records import FrameSet, Image, RawFrame
 from mixpose.runner import observe, source_spec
 from mixpose.search import is_pointlike
-from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
+from mixpose.sensors import RangeSensor
 from mixpose.session import SensorSetup, Session
 
 _FEW = 0.6  # of the expected features: fewer are too few
@@ -59,13 +60,10 @@ def advice(
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
     frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
-    before = _count(_found(session, setup, frame, {}))
-    trials = []
-    for key, value in _trials(options, image):
-        views = _found(session, setup, frame, {key: value})
-        count = _count(views)
-        if count >= 0.9 * expected and judge(count, expected) is None:
-            trials.append(_Trial(key, value, count, views))
+    before, _ = _found(session, setup, frame, {})
+    tried = _trials(options, image)
+    trials = [_Trial(k, v, *_found(session, setup, frame, {k: v})) for k, v in tried]
+    trials = [t for t in trials if t.found >= 0.9 * expected and judge(t.found, expected) is None]
     # the rule that goes by each image comes first, as a number may suit this image alone
     trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.found - expected)))
     if before > expected:
@@ -89,8 +87,7 @@ def advice(
             "mixpose inspect shows what is found"
         )
     keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
-    usual = "polarity, threshold, min_area and max_area"
-    change = keys.get(options.method, usual)
+    change = keys.get(options.method, "polarity, threshold, min_area and max_area")
     own = [key for key in re.findall(r"\w+", change) if key in setup.own]
     beside = f", {' and '.join(own)} {_OWN}" if own else ""
     is_hidden = before > 0 and session.body.normals is None
@@ -141,22 +138,15 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
 
 def _found(
     session: Session, setup: SensorSetup, frame: RawFrame, changed: dict[str, Any]
-) -> list[View]:
-    """What the sensor alone finds in a frame with other options; nothing where they are wrong."""
-    options = replace(setup.extract, **changed)
-    if options.max_area is not None and options.max_area <= options.min_area:
-        return []
-    alone = replace(session, sensors=(replace(setup, extract=options),))
-    try:
-        return observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
-    except MixposeError:
-        return []
-
-
-def _count(views: Sequence[View]) -> int:
-    """How many features were found, where they are points."""
+) -> tuple[int, list[View]]:
+    """How many points the sensor alone finds with other options; none where they are wrong."""
+    options, views = replace(setup.extract, **changed), list[View]()
+    if options.max_area is None or options.max_area > options.min_area:
+        alone = replace(session, sensors=(replace(setup, extract=options),))
+        with suppress(MixposeError):
+            views = observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
     seen = [view.observation for view in views]
-    return sum(each.found for each in seen if each.points is not None)
+    return sum(each.found for each in seen if each.points is not None), views
 
 
 def key_warnings(session: Session) -> list[str]:
@@ -169,7 +159,7 @@ def _off_centre(session: Session) -> list[str]:
     warnings = []
     for setup in session.sensors:
         sensor = setup.sensor
-        if not isinstance(sensor, PinholeCamera | FisheyeCamera) or sensor.resolution is None:
+        if not isinstance(sensor, Camera) or sensor.resolution is None:
             continue
         size = np.array(sensor.resolution)
         cx, cy = sensor.camera_matrix[:2, 2]
@@ -235,8 +225,7 @@ def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> lis
     }
     warnings = []
     for (a, own), (b, others) in combinations(read.items(), 2):
-        both = own & others
-        if both:
+        if both := own & others:
             first = os.path.basename(min(both))  # noqa: PTH119 - of an address too
             files = first if len(both) == 1 else f"{len(both)} files ({first}, ...)"
             warnings.append(
@@ -300,7 +289,6 @@ def _text(part: LookAlike, unit: str, size: float) -> str:
         )
     return (
         f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
-        f"{other.name!r} to "
-        f"{off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
-        "expect ambiguous frames, or move a marker"
+        f"{other.name!r} to {off:.2g} {unit} ({pairs}): where the others are hidden the one may be "
+        "the other; expect ambiguous frames, or move a marker"
     )

@@ -79,7 +79,7 @@ def look_alikes(
     is_new = rotation_angle_deg(poses[:, None], known).min(axis=1, initial=180.0) >= _NEAR_DEG
     if not is_new.any():
         return []
-    ends = ascend(_Paired(measured), poses[is_new], perturb, free, _TO_THE_END)
+    ends = ascend(measured, poses[is_new], perturb, free, _TO_THE_END)
     differences = np.sqrt(np.maximum(-2 * ends.values, 0.0))
     alike: list[LookAlike] = []
     for k in np.flatnonzero(differences <= _LIMIT):
@@ -94,12 +94,30 @@ def look_alikes(
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """What L sensors measure of a body of n points at the pose."""
+    """What L sensors measure of a body of n points at the pose.
+
+    As a function of other poses: minus half the squared distances, in noise, where each point has a
+    measured one of its own; minus infinity where as many points are not in view.
+    """
 
     projection: BodyProjection
     y: Floats  # (L, n, 2)
     seen: Mask  # (L, n)
     noise: Floats  # (L,)
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        at, toward = self.projection.project(poses), np.zeros((*self.seen.shape, 2))
+        toward = np.repeat(toward[:, None], len(poses), axis=1)
+        is_whole = np.ones(len(poses), dtype=np.bool_)
+        for k, (y, seen) in enumerate(zip(self.y, self.seen, strict=True)):
+            is_whole &= at.seen[k].sum(axis=1) == seen.sum()
+            for h in np.flatnonzero(is_whole):
+                away = y[seen] - at.y[k, h, at.seen[k, h], None]
+                rows, columns = linear_sum_assignment((away**2).sum(axis=2))
+                toward[k, h, at.seen[k, h]] = away[rows, columns]
+        model = _least_squares(toward, at.J, at.seen, self.noise)
+        return model._replace(value=np.where(is_whole, model.value, -np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,31 +162,6 @@ class _Nearest:
         seen = at.seen & takes_part[:, None, None]
         squared = ((at.y[:, :, :, None] - whole.y[:, None, None]) ** 2).sum(axis=4)
         return at.y, at.J, seen, np.where(whole.seen[:, None, None], squared, np.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class _Paired:
-    """Minus half the squared distances, in noise, where each point has a measured one of its own.
-
-    Minus infinity where as many points are not in view.
-    """
-
-    measured: _Measured
-
-    def linearise(self, poses: Floats) -> Quadratic:
-        """Second-order models at poses (H, 4, 4)."""
-        whole = self.measured
-        at, toward = whole.projection.project(poses), np.zeros((*whole.seen.shape, 2))
-        toward = np.repeat(toward[:, None], len(poses), axis=1)
-        is_whole = np.ones(len(poses), dtype=np.bool_)
-        for k, (y, seen) in enumerate(zip(whole.y, whole.seen, strict=True)):
-            is_whole &= at.seen[k].sum(axis=1) == seen.sum()
-            for h in np.flatnonzero(is_whole):
-                away = y[seen] - at.y[k, h, at.seen[k, h], None]
-                rows, columns = linear_sum_assignment((away**2).sum(axis=2))
-                toward[k, h, at.seen[k, h]] = away[rows, columns]
-        model = _least_squares(toward, at.J, at.seen, whole.noise)
-        return model._replace(value=np.where(is_whole, model.value, -np.inf))
 
 
 def _least_squares(toward: Floats, J: Floats, seen: Mask, noise: Floats) -> Quadratic:

@@ -27,7 +27,8 @@ from mixpose.sensors import (
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import count_seen, pivot_of, places
 
-Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
+Camera: TypeAlias = PinholeCamera | FisheyeCamera
+Looking: TypeAlias = Camera | ParallelBeam
 
 _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
@@ -101,7 +102,7 @@ def _twins(session: Session) -> list[str]:
 
 def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
     """Cameras nearer to each other than their lenses allow: lengths in another unit."""
-    if not all(isinstance(each.sensor, PinholeCamera | FisheyeCamera) for each in (a, b)):
+    if not (isinstance(a.sensor, Camera) and isinstance(b.sensor, Camera)):
         return []
     apart = float(np.linalg.norm(_centre(a.sensor) - _centre(b.sensor)))
     if apart * session.metres_per_unit > _LENSES_APART_M:
@@ -141,9 +142,7 @@ def _no_common_view(session: Session) -> list[str]:
 
 def _sizes(session: Session, cameras: list[SensorSetup]) -> str:
     """Two lengths to compare, lest one of them is in another unit."""
-    places = [
-        _centre(s.sensor) for s in cameras if isinstance(s.sensor, PinholeCamera | FisheyeCamera)
-    ]
+    places = [_centre(setup.sensor) for setup in cameras if isinstance(setup.sensor, Camera)]
     apart = max((float(np.linalg.norm(a - b)) for a, b in combinations(places, 2)), default=0.0)
     if apart == 0:
         return ""
@@ -167,8 +166,7 @@ def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> l
     if not unseen:
         return []
     cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
-    stand = [n for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))]
-    placed = {name: cameras[name] for name in stand}
+    placed = {n: s for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))}
     names = {setup.name for setup in unseen}
     # only where the inverse mends every camera, chance is no likely reason
     if placed and names.issuperset(placed):
@@ -254,8 +252,7 @@ def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:
     return np.asarray(sensor.project(transform(T_world_object, session.body.means))[1])
 
 
-def _centre(sensor: Sensor) -> Floats:
-    assert isinstance(sensor, PinholeCamera | FisheyeCamera)
+def _centre(sensor: Camera) -> Floats:
     return np.asarray(inverse(sensor.T_sensor_world)[:3, 3])
 
 
@@ -276,14 +273,14 @@ def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | Non
     for setup in session.sensors:
         sensor = setup.sensor
         size = setup.resolution or sizes.get(setup.name) or _size_by_axis(sensor)
-        if isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
+        if isinstance(sensor, Looking):
             sensor = replace(sensor, resolution=size)
         setups.append(replace(setup, resolution=size, sensor=sensor))
     return replace(session, sensors=tuple(setups))
 
 
 def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:
-    if isinstance(sensor, PinholeCamera | FisheyeCamera):
+    if isinstance(sensor, Camera):
         u, v = sensor.camera_matrix[:2, 2]
     elif isinstance(sensor, ParallelBeam):
         u, v = sensor.principal_point
@@ -317,6 +314,4 @@ def typical_poses(session: Session, count: int, *, away: float = 1.0) -> list[Fl
 
 def depends_on_distance(session: Session) -> bool:
     """Whether nothing but the distance from one camera says how well poses are seen."""
-    return len(session.sensors) == 1 and isinstance(
-        session.sensors[0].sensor, PinholeCamera | FisheyeCamera
-    )
+    return len(session.sensors) == 1 and isinstance(session.sensors[0].sensor, Camera)

@@ -78,47 +78,42 @@ def survey(
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: Damage = []
-    counts: dict[int, int | None] = {}
-    numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
-    times, repeated, before = dict[int, float](), list[int](), None
-    doubled = list[int]()
-    size: tuple[int, int] | None = None
+    numbers, times, size = list[int](), dict[int, float](), None
+    counted, counts, found = list[int](), list[int](), dict[int, RawFrame]()
+    empty, doubled, repeated, before = list[int](), list[int](), list[int](), None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
-            numbers.append(frame.number)
+            number, data = frame.number, frame.data
+            numbers.append(number)
             if frame.time_s is not None:
-                times[frame.number] = frame.time_s
+                times[number] = frame.time_s
             shown = shown_by(frame)
             if shown is not None and shown.size < _TELLING:
                 shown = None
             if shown is not None and shown.any() and is_same(before, shown):
-                repeated.append(frame.number)
+                repeated.append(number)
             before = shown
-            if isinstance(frame.data, np.ndarray):
-                size = (frame.data.shape[1], frame.data.shape[0])
-                if looked_at is not None and frame.number not in looked_at:
-                    done()
-                    continue
-            if isinstance(frame.data, PointPattern) and has_twins(frame.data.points):
-                doubled.append(frame.number)
-            observation = observation_of(session, setup, frame)
-            pattern = observation.pattern
-            if isinstance(pattern, PointPattern):
-                counts[frame.number] = observation.found
-                found[frame.number] = replace(frame, data=pattern)
-                is_empty = not observation.found
-            else:
-                counts[frame.number] = None
-                is_empty = bool(np.ptp(pattern.values) == 0)
-            if is_empty:
-                empty.append(frame.number)
+            if isinstance(data, np.ndarray):
+                size = (data.shape[1], data.shape[0])
+            elif isinstance(data, PointPattern) and has_twins(data.points):
+                doubled.append(number)
+            if not isinstance(data, np.ndarray) or looked_at is None or number in looked_at:
+                counted.append(number)
+                observation = observation_of(session, setup, frame)
+                pattern = observation.pattern
+                if isinstance(pattern, PointPattern):
+                    counts.append(observation.found)
+                    found[number] = replace(frame, data=pattern)
+                    is_empty = not observation.found
+                else:
+                    is_empty = not np.ptp(pattern.values)
+                if is_empty:
+                    empty.append(number)
             done()
-    known = [count for count in counts.values() if count is not None]
-    counted = bool(known) and len(known) == len(counts)
     return Survey(
         numbers=tuple(numbers),
-        counted=tuple(counts),
-        counts=tuple(known) if counted else None,
+        counted=tuple(counted),
+        counts=tuple(counts) if counts and len(counts) == len(counted) else None,
         empty=tuple(empty),
         size=size,
         damage=tuple(text for _, text in damage),

@@ -18,7 +18,7 @@ import numpy as np
 
 from mixpose.body import of_points
 from mixpose.checking import evidence
-from mixpose.checking.changes import Change, by_cameras_alone, changes, with_sensor
+from mixpose.checking.changes import Change, by_cameras_alone, changes
 from mixpose.checking.evidence import Explained, Frames, Views, best_pose, evidence_of
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, Unknown, adjusted, promise, unknowns
@@ -60,9 +60,8 @@ class _Runner:
     def advance(self, session: Session, useful: float) -> int:
         """Try the next frame, for a pose of `useful` evidence; the guesses that took."""
         number, views = self.frames[len(self.poses)]
-        body = self.change.body(session.body)
-        seen, most = self.change.views(views), DiagnosisRules().guesses
-        pose, made = best_pose(session, body, number, seen, most, useful)
+        body, seen = self.change.body(session.body), self.change.views(views)
+        pose, made = best_pose(session, body, number, seen, DiagnosisRules().guesses, useful)
         self.poses.append(pose)
         return made
 
@@ -96,16 +95,14 @@ class Tried(NamedTuple):
 def diagnosis(
     session: Session,
     frames: Frames,
-    others: Otherwise = (),
+    otherwise: Callable[[bool], Otherwise] = lambda _: (),
     further: Callable[[], Frames] = lambda: (),
-    otherwise: Callable[[], Otherwise] = lambda: (),
 ) -> Diagnosis:
     """What is most likely wrong with a session of one body, by frames of its recording.
 
-    Frames are by number, those that show most first. `others` are changes of how features are
-    extracted, with what is extracted then; where no frame is explained as it is, what `otherwise`
-    gives in their place. `further` frames are looked at, too, where these leave a change by values
-    undecided.
+    Frames are by number, those that show most first. `otherwise` gives changes of how features are
+    extracted, by whether any frame is explained as it is. `further` frames are looked at, too,
+    where these leave a change by values undecided.
     """
     session, rules = evidence.anywhere(session), DiagnosisRules()
     before = _as_it_is(session, frames)
@@ -114,7 +111,7 @@ def diagnosis(
     is_good = sum(evidence.is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        tried += _without_values(case, others if before.good(rules) else otherwise() or others)
+        tried += _without_values(case, otherwise(before.good(rules) > 0))
     # values only follow the noise where all frames are explained to within it without any
     if not any(
         all(evidence.is_well_explained(pose, rules) for pose in one.explained.poses)
@@ -284,7 +281,8 @@ def _fitted(
 
 def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
     """Views by sensors of other values."""
-    return [with_sensor(view, unknown.sensor(view.name, view.sensor, values)) for view in views]
+    sensors = [unknown.sensor(view.name, view.sensor, values) for view in views]
+    return [v if v.sensor is s else replace(v, sensor=s) for v, s in zip(views, sensors)]
 
 
 def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from mixpose.body import PointFeature
 from mixpose.checking.changes import OTHER_SIZE, called, misplaced, moved_by, times_as_large
 from mixpose.checking.evidence import Seen
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats
 from mixpose.rigid import perturb
+from mixpose.search import is_pointlike
 from mixpose.sensors import PinholeCamera, Sensor
 from mixpose.session import SensorSetup, Session
 
@@ -46,10 +46,14 @@ class Unknown:
     deviations: Floats  # (k,), how far off they may be
     # points (N, 3) of the body by those given and values (k,)
     points: Callable[[Floats, Floats], Floats] = lambda points, _: points
-    # a sensor by its name, the one given and values (k,)
-    sensor: Callable[[str, Any, Floats], Any] = lambda _, sensor, __: sensor
+    # those that are changed, by name: a sensor by the one given and values (k,)
+    sensors: Mapping[str, Callable[[Any, Floats], Any]] = field(default_factory=dict)
     feature: int | None = None  # the only one that is changed
     cost: float = 0.0  # nats against it, beside what its values cost
+
+    def sensor(self, name: str, given: Any, values: Floats) -> Any:
+        """A sensor by the one given and values (k,)."""
+        return self.sensors[name](given, values) if name in self.sensors else given
 
 
 @dataclass(frozen=True)
@@ -204,7 +208,7 @@ def unknowns(session: Session) -> Iterator[Unknown]:
     """Values that may be off, those that few describe first."""
     cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera)]
     body = session.body
-    are_points = all(isinstance(feature, PointFeature) for feature in body.features)
+    are_points = is_pointlike(body)
     if are_points and len(cameras) > 1:
         yield Unknown(
             OTHER_SIZE,
@@ -221,16 +225,11 @@ def unknowns(session: Session) -> Iterator[Unknown]:
     for setup in cameras:
         yield _calibration(setup, cameras)
     for setup in cameras if len(cameras) > 1 else ():
-        name, radius = setup.name, body.radius
         yield Unknown(
             misplaced(setup),
             lambda v: moved_by(np.eye(4), perturb(np.eye(4), v), session.unit),
-            np.array([_MOVED * radius] * 3 + [_TURNED] * 3),
-            sensor=lambda own, sensor, v, name=name: (  # type: ignore[misc]
-                replace(sensor, T_sensor_world=perturb(sensor.T_sensor_world, v))
-                if own == name
-                else sensor
-            ),
+            np.array([_MOVED * body.radius] * 3 + [_TURNED] * 3),
+            sensors={setup.name: _moved},
         )
 
 
@@ -250,18 +249,17 @@ def _markers(session: Session) -> Iterator[Unknown]:
         )
 
 
+def _moved(sensor: Any, v: Floats) -> Any:
+    return replace(sensor, T_sensor_world=perturb(sensor.T_sensor_world, v))
+
+
 def _distortion(names: Sequence[str]) -> Unknown:
     """Two coefficients of each camera that has none."""
-
-    def bent(name: str, sensor: Any, v: Floats) -> Any:
-        k = names.index(name) if name in names else None
-        return sensor if k is None else _bent(sensor, v[2 * k : 2 * k + 2])
-
     return Unknown(
         f"distortion of {called(names)} {{is}} left out",
         lambda v: "with two coefficients k1 and k2 for each lens",
         np.full(2 * len(names), _BENT),
-        sensor=bent,
+        sensors={name: partial(_bent, own=slice(2 * k, 2 * k + 2)) for k, name in enumerate(names)},
         cost=-_LEFT_OUT,
     )
 
@@ -269,7 +267,7 @@ def _distortion(names: Sequence[str]) -> Unknown:
 def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
     """Focal length, principal point and two coefficients of the distortion of a camera."""
     camera: Any = setup.sensor
-    given, name = camera.camera_matrix, setup.name
+    given = camera.camera_matrix
     others: dict[str, Any] = {each.name: each.sensor for each in cameras if each is not setup}
     twins = [
         other
@@ -280,19 +278,15 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
     ]
     centre = _CENTRE * 2 * float(given[0, 2])
 
-    def matrix(K: Floats, v: Floats) -> Floats:
-        changed = np.array(K)
-        changed[:2, :2] *= 1 + v[0]
-        changed[:2, 2] += v[1:3]
-        return changed
-
-    def other(own: str, sensor: Any, v: Floats) -> Any:
-        if own != name:
-            return sensor
-        return replace(_bent(sensor, v[3:]), camera_matrix=matrix(sensor.camera_matrix, v))
+    def other(sensor: Any, v: Floats) -> Any:
+        K = np.array(sensor.camera_matrix)
+        K[:2, :2] *= 1 + v[0]
+        K[:2, 2] += v[1:3]
+        return replace(_bent(sensor, v, slice(3, None)), camera_matrix=K)
 
     def remedy(v: Floats) -> str:
-        K, k = matrix(given, v), other(name, camera, v).distortion[:2]
+        changed = other(camera, v)
+        K, k = changed.camera_matrix, changed.distortion[:2]
         return (
             f"with about fx = {K[0, 0]:.5g}, cx = {K[0, 2]:.4g}, cy = {K[1, 2]:.4g}, "
             f"k1 = {k[0]:.2g}, k2 = {k[1]:.2g}{moved}"
@@ -302,19 +296,19 @@ def _calibration(setup: SensorSetup, cameras: Sequence[SensorSetup]) -> Unknown:
     is_copied = len(twins) == 1  # cameras of a kind may all have the same
     copied = f", but that of {twins[0]!r}" if is_copied else ""
     return Unknown(
-        f"the calibration of {name!r} {{is}} not that of its images{copied}",
+        f"the calibration of {setup.name!r} {{is}} not that of its images{copied}",
         remedy,
         np.array([_FOCAL, centre, centre, _BENT, _BENT]),
-        sensor=other,
+        sensors={setup.name: other},
         cost=-_COPIED if is_copied else 0.0,
     )
 
 
-def _bent(sensor: Any, v: Floats) -> Any:
-    """A camera whose lens moves the corners of its image by so much more, of their distance."""
+def _bent(sensor: Any, v: Floats, own: slice) -> Any:
+    """A camera whose lens moves the corners of its image by two values more, of their distance."""
     K = sensor.camera_matrix
     squared = float((K[:2, 2] / K[[0, 1], [0, 1]]) @ (K[:2, 2] / K[[0, 1], [0, 1]]))
     k = np.zeros(max(len(sensor.distortion), 4))
     k[: len(sensor.distortion)] = sensor.distortion
-    k[:2] += v / [squared, squared**2]
+    k[:2] += v[own] / [squared, squared**2]
     return replace(sensor, distortion=k)

@@ -7,8 +7,7 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.pictures import levels
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.pictures.levels import FLOODED, around, direction, more, some
-from mixpose.pictures.light import Light
+from mixpose.pictures.levels import FLOODED, Light, around, direction, more, some
 from mixpose.records import GridPattern, PointPattern
 
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
@@ -50,9 +49,8 @@ def _sees_something_else(expected: Expectation) -> bool:
 def _counts(finding: Finding, body: Body, unit: str) -> str:
     unit = "px" if finding.setup.sensor.unit == "px" else unit
     if finding.points is None:
-        found = f"light as of {finding.count:.1f} points"
-        if finding.setup.sensor.dimension == 1:
-            found = f"echoes as of {finding.count:.1f} points"
+        what = "echoes" if finding.setup.sensor.dimension == 1 else "light"
+        found = f"{what} as of {finding.count:.1f} points"
     else:
         found = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
         found += ", which are too many to use any" * (finding.passed_over > 0)

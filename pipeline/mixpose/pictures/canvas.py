@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mixpose.records import Floats
 
@@ -47,9 +47,10 @@ def stroke(picture: Picture) -> float:
 
 
 def polyline(
-    picture: Picture, places: Floats, colour: Colour, *, width: float = 1.0, closed: bool = False
+    picture: Picture, places: ArrayLike, colour: Colour, *, width: float = 1.0, closed: bool = False
 ) -> None:
     """Draw a line through places (n, 2), `width` thin strokes wide."""
+    places = np.asarray(places, dtype=np.float64)
     if len(places) < 2 or not np.isfinite(places).all() or np.abs(places).max() > _FAR:
         return
     thin = stroke(picture) * width
@@ -146,8 +147,7 @@ def in_grid(pictures: Sequence[Picture], columns: int, cell: Size | None = None)
 
 def stacked(pictures: Sequence[Picture]) -> Picture:
     """Pictures one below the other; narrower ones have black beside them."""
-    width = max(picture.shape[1] for picture in pictures)
-    return _joined([fit_into(each, (width, each.shape[0])) for each in pictures], axis=0)
+    return in_grid(pictures, 1)
 
 
 def _joined(pictures: Sequence[Picture], axis: int) -> Picture:

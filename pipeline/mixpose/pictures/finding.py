@@ -9,7 +9,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.judgement import JudgementRules
-from mixpose.matching import AssociationRules, Matches, associate
+from mixpose.matching import associate
 from mixpose.objective import View, matched_objective
 from mixpose.pictures.overlay import projected_features
 from mixpose.records import Estimate, Floats, Mask, PointPattern, RawFrame
@@ -67,10 +67,23 @@ def find(
 ) -> list[Finding]:
     """Compare what every sensor found with what the estimate expects of it."""
     by_name = {view.name: view for view in views}
-    return [
-        _finding(setup, frames.get(setup.name), by_name.get(setup.name), body, estimate)
-        for setup in setups
-    ]
+    T, sure = estimate.T_world_object, estimate.status == "ok"
+    found = []
+    for setup in setups:
+        frame, view = frames.get(setup.name), by_name.get(setup.name)
+        if view is None:
+            found.append(Finding(setup, frame, None, None, 0.0, None))
+            continue
+        pattern, sigma = view.observation.pattern, view.observation.sigma
+        if isinstance(pattern, PointPattern):
+            points, count = pattern.points, float(view.observation.found)
+        else:  # so many equal features would have the energy of the grid
+            top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
+            energy = view.observation.energy(sigma)
+            points, count = None, float(top / energy) if energy > 0 else 0.0
+        expectation = None if T is None else _expect(view, body, T, points, sure=sure)
+        found.append(Finding(setup, frame, view, points, count, expectation))
+    return found
 
 
 def find_several(
@@ -87,65 +100,40 @@ def find_several(
         return alone
     found = []
     for k, (body, one) in enumerate(pairs):
-        others = [each for j, each in enumerate(alone) if j != k]
+        others = [finding for each in (*alone[:k], *alone[k + 1 :]) for finding in each]
         left = [_unexplained(view, others) for view in views]
         found.append(find(setups, frames, left, body, one))
     return found
 
 
-def _unexplained(view: View, others: Sequence[Sequence[Finding]]) -> View:
+def _unexplained(view: View, others: Sequence[Finding]) -> View:
     """What poses of other bodies leave of a view of detections."""
     pattern = view.observation.pattern
     if not isinstance(pattern, PointPattern):
         return view
     left = np.ones(len(pattern.points), dtype=np.bool_)
-    for finding in (one for each in others for one in each):
+    for finding in others:
         if finding.name == view.name and finding.expectation is not None:
             left &= finding.expectation.unexplained
     return replace(view, observation=view.observation.only(left))
 
 
-def _finding(
-    setup: SensorSetup, frame: RawFrame | None, view: View | None, body: Body, estimate: Estimate
-) -> Finding:
-    if view is None:
-        return Finding(setup, frame, None, None, 0.0, None)
-    pattern, sigma = view.observation.pattern, view.observation.sigma
-    if isinstance(pattern, PointPattern):
-        points, count = pattern.points, float(view.observation.found)
-    else:  # so many equal features would have the energy of the grid
-        top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
-        energy = view.observation.energy(sigma)
-        points, count = None, float(top / energy) if energy > 0 else 0.0
-    T, sure = estimate.T_world_object, estimate.status == "ok"
-    expectation = None if T is None else _expect(view, body, T, points, sure=sure)
-    return Finding(setup, frame, view, points, count, expectation)
-
-
 def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
     nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
-    met, explained, rms, rules = np.zeros_like(seen), 0.0, None, AssociationRules()
-    found = _association(view, body, T)
-    if found is not None:
-        shares = np.bincount(body.nodes.feature, found.shares[0], minlength=len(body))
-        full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
-        met = seen & (shares > rules.min_share * full)
-        in_view &= found.weights[0] > 0
-        explained, rms = float(found.explained[0]), found.rms[0]
+    met, explained, rms, rules = np.zeros_like(seen), 0.0, None, JudgementRules()
+    if not view.observation.is_empty:
+        objective = matched_objective([view], body, [view.observation.sigma])
+        found = associate(objective, T, rules.association, rules.noise.errors.narrowest)
+        if found.weights.any():
+            shares = np.bincount(body.nodes.feature, found.shares[0], minlength=len(body))
+            full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
+            met = seen & (shares > rules.association.min_share * full)
+            in_view &= found.weights[0] > 0
+            explained, rms = float(found.explained[0]), found.rms[0]
     unexplained = np.zeros(0, dtype=np.bool_)
     if points is not None:
         away = np.linalg.norm(points[:, None] - nodes[in_view], axis=-1)
-        reach = view.observation.sigma * np.sqrt(2 * rules.reach_squared)
+        reach = view.observation.sigma * np.sqrt(2 * rules.association.reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
     return Expectation(y, seen, met, unexplained, explained, rms, sure)
-
-
-def _association(view: View, body: Body, T: Floats) -> Matches | None:
-    """The pose against the sensor's density; None where the sensor has nothing of either."""
-    if view.observation.is_empty:
-        return None
-    objective = matched_objective([view], body, [view.observation.sigma])
-    rules = JudgementRules()
-    found = associate(objective, T, rules.association, rules.noise.errors.narrowest)
-    return found if found.weights.any() else None

@@ -120,17 +120,14 @@ class VideoSink:
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
         """Write the picture of a frame; the first ones wait for others, which tell the rate."""
-        if self._writer is not None:
-            self._write(picture)
-            return
         self._waiting.append((picture, time_s))
-        if len(self._waiting) == _WAITING:
-            self._open()
+        if self._writer is not None or len(self._waiting) == _WAITING:
+            self._write()
 
     def close(self) -> None:
         """Finish the file, sign it and put it in its place: until then it has another name."""
         if self._waiting:
-            self._open()
+            self._write()
         if self._writer is None:
             return
         self._writer.release()
@@ -151,24 +148,22 @@ class VideoSink:
         finally:
             self._part.unlink(missing_ok=True)
 
-    def _open(self) -> None:
-        """Begin with the pictures that wait."""
+    def _write(self) -> None:
+        """Write the pictures that wait, the first ones into a new file."""
         waiting, self._waiting = self._waiting, []
-        picture, fps = waiting[0][0], _rate([time_s for _, time_s in waiting])
-        # codecs want even sides
-        self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
-        codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
-        self._writer = cv2.VideoWriter(str(self._part), codec, fps, self._size)
-        if not self._writer.isOpened():
-            self._writer = None
-            raise SessionError(
-                f"--overlay {self._path}: cannot be written as a video; name an .avi, or a folder"
-            )
+        if self._writer is None:
+            picture, fps = waiting[0][0], _rate([time_s for _, time_s in waiting])
+            # codecs want even sides
+            self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
+            codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
+            writer = cv2.VideoWriter(str(self._part), codec, fps, self._size)
+            if not writer.isOpened():
+                raise SessionError(
+                    f"--overlay {self._path}: cannot be written as a video; name an .avi, or a "
+                    "folder"
+                )
+            self._writer = writer
         for picture, _ in waiting:
-            self._write(picture)
-
-    def _write(self, picture: Picture) -> None:
-        if self._writer is not None:
             self._writer.write(fit_into(picture, self._size))
             self._count += 1
 

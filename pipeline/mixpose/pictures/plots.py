@@ -138,10 +138,9 @@ def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
     """One range sensor; each curve is divided by its largest value, which the legend states."""
-    title = f"{finding.name}: echoes as of {finding.count:.1f} points"
-    if finding.points is not None:
-        title = f"{finding.name}: {len(finding.points)} ranges"
-    axes.set_title(title, fontsize=9, loc="left", parse_math=False)
+    what = f"echoes as of {finding.count:.1f} points"
+    what = what if finding.points is None else f"{len(finding.points)} ranges"
+    axes.set_title(f"{finding.name}: {what}", fontsize=9, loc="left", parse_math=False)
     axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
@@ -158,18 +157,12 @@ def _plot_ranges(
     if not finding.view.observation.is_empty:
         shades = np.linspace(0.75, 0.35, len(blurs))
         for sigma, shade in zip(blurs, shades, strict=True):
-            ends = np.array([low]), np.array([high])
-            g = finding.view.observation.density(sigma, ends)
-            values = np.ravel(g.values)
+            g = finding.view.observation.density(sigma, (np.array([low]), np.array([high])))
+            values, ranges = np.ravel(g.values), g.window.axis(0)
             top = max(float(values.max()), 1e-30)
-            axes.fill_between(
-                g.window.axis(0),
-                values / top,
-                color=str(shade),
-                alpha=0.45,
-                lw=0,
-                label=f"g / {top:.2g}, σ = {sigma:.2g}",
-            )
+            look: dict[str, Any] = {"color": str(shade), "alpha": 0.45, "lw": 0}
+            label = f"g / {top:.2g}, σ = {sigma:.2g}"
+            axes.fill_between(ranges, values / top, label=label, **look)
         _plot_matched(axes, finding.view, body, blurs[-1], np.linspace(low, high, _PLACES))
     _plot_expected(axes, finding, body, estimate)
     axes.set_xlim(low, high)
@@ -191,13 +184,12 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
         return
     sensor, T = finding.setup.sensor, estimate.T_world_object
     spread = half_widths_95(sensor, body, T, estimate.covariance)
-    for n, i in enumerate(np.flatnonzero(expected.seen)):
-        r = float(expected.y[i, 0])
-        label = "pose, 95 %" if n == 0 else None
-        axes.errorbar(
-            r, 1.08, xerr=spread[i], fmt="v", ms=5, color=_EXPECTED, capsize=2, label=label
-        )
-    order = np.flatnonzero(expected.seen)[np.argsort(expected.y[expected.seen, 0])]
+    look: dict[str, Any] = {"fmt": "v", "ms": 5, "color": _EXPECTED, "capsize": 2}
+    seen = np.flatnonzero(expected.seen)
+    for i in seen:
+        label = "pose, 95 %" if i == seen[0] else None
+        axes.errorbar(float(expected.y[i, 0]), 1.08, xerr=spread[i], label=label, **look)
+    order = seen[np.argsort(expected.y[seen, 0])]
     ranges = expected.y[order, 0]
     # features whose names would stand on each other share one line of names
     near = np.diff(ranges) < _APART * np.ptp(axes.get_xlim())
@@ -289,13 +281,12 @@ def objective_around(
         found = np.nan_to_num(np.concatenate(parts))
         return np.asarray(found / max(float(found.max()), 1e-300))
 
-    slices = []
+    slices, maps = [], []
     for k in free:
         offsets = _half_width(wide * unit[k], k) * np.linspace(-1, 1, _POINTS)
         twists = offsets[:, None] * np.eye(6)[k]
         curves = np.array([values(sigmas, twists) for sigmas in levels])
         slices.append(Slice(k, offsets, curves))
-    maps = []
     pairs = list(combinations(free, 2))
     if covariance is not None and np.isfinite(covariance).all():
         deviations = np.sqrt(np.maximum(np.diag(covariance), 1e-300))

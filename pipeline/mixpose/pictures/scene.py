@@ -282,8 +282,8 @@ def draw_ranges(
         canvas.polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.FOUND)
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
-            bar = np.array([[u, _TOP * size[1]], [u, _BASE * size[1]]])
-            canvas.polyline(picture, bar, overlay.FOUND, width=2)
+            ends = (u, _TOP * size[1]), (u, _BASE * size[1])
+            canvas.polyline(picture, ends, overlay.FOUND, width=2)
     if T is not None:
         colour = overlay.STATUS_COLOURS[estimate.status]
         spread = half_widths_95(sensor, body, T, estimate.covariance) * width / (high - low)
@@ -333,15 +333,14 @@ def _draw_scale(
     picture: Picture, low: float, high: float, across: Callable[[Floats], Floats]
 ) -> None:
     """A line with round numbers between two ends."""
-    height = picture.shape[0]
-    ends = np.array([[_MARGIN_PX, _BASE * height], [picture.shape[1] - _MARGIN_PX, _BASE * height]])
-    canvas.polyline(picture, ends, GREY)
+    height, width = picture.shape[:2]
+    base = _BASE * height
+    canvas.polyline(picture, [(_MARGIN_PX, base), (width - _MARGIN_PX, base)], GREY)
     step = _round_number((high - low) / _TICKS)
     first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
     ticks = np.asarray(step * np.arange(first, last + 1))
     for value, u in zip(ticks, across(ticks), strict=True):
-        tick = np.array([[u, _BASE * height], [u, (_BASE + 0.04) * height]])
-        canvas.polyline(picture, tick, GREY)
+        canvas.polyline(picture, [(u, base), (u, (_BASE + 0.04) * height)], GREY)
         canvas.words(picture, f"{value:g}", (u - 8, 0.96 * height), GREY, size=0.8)
 
 
@@ -356,11 +355,10 @@ def _draw_expected(
         u = places[i]
         if not np.isfinite(u):
             continue
-        corners = np.array([[u, tip], [u - half, tip - 1.6 * half], [u + half, tip - 1.6 * half]])
+        corners = (u, tip), (u - half, tip - 1.6 * half), (u + half, tip - 1.6 * half)
         canvas.polyline(picture, corners, colour, closed=True)
         if spread[i] > half:
-            ends = np.array([[u - spread[i], tip], [u + spread[i], tip]])
-            canvas.polyline(picture, ends, WHITE)
+            canvas.polyline(picture, [(u - spread[i], tip), (u + spread[i], tip)], WHITE)
         if u - previous > 3 * half:  # else numbers would lie upon each other
             canvas.words(picture, labels[i], (u - 4, tip - 2.2 * half), colour, size=0.8)
             previous = u

@@ -39,11 +39,8 @@ def inspection_pictures(
     session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
     """All pictures of one body in one frame, by file name; ``sheet.png`` is the first."""
-    views = [
-        finding.view
-        for finding in findings
-        if finding.view is not None and not finding.view.observation.is_empty
-    ]
+    views = [finding.view for finding in findings if finding.view is not None]
+    views = [view for view in views if not view.observation.is_empty]
     blurs = fitted_blurs(views, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
@@ -64,9 +61,9 @@ def inspection_pictures(
         picture = ranges_picture(ranged, ends, body, estimate, session.unit, _WIDTH, height)
         pictures["ranges.png"] = picture
         rows.append(picture)
-    if estimate.T_world_object is not None and views:
+    T, covariance = estimate.T_world_object, estimate.covariance
+    if T is not None and views:
         levels = list(zip(*(blurs[view.name] for view in views), strict=True))
-        T, covariance = estimate.T_world_object, estimate.covariance
         around = objective_around(views, body, T, covariance, session.estimator, levels)
         finest = [view.observation.sigma for view in views]
         factors = [max(a / b for a, b in zip(level, finest)) for level in levels]

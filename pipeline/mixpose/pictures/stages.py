@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import cv2
@@ -28,7 +29,7 @@ from mixpose.objective.paper import SampledTerm, sampled_terms
 from mixpose.pictures import canvas, overlay
 from mixpose.pictures.canvas import WHITE, Colour, Picture, Size
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.light import Light
+from mixpose.pictures.levels import Light
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
@@ -57,8 +58,8 @@ def features_picture(finding: Finding, room: Size) -> Picture:
     """The frame with a cross at every feature found."""
     picture, part = backdrop(finding.setup, finding.frame, room)
     _mark(picture, part, finding)
-    count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
-    text = f"{count} found" if finding.points is not None else f"light as of {count} points"
+    is_grid, count = finding.points is None, finding.count
+    text = f"light as of {count:.1f} points" if is_grid else f"{count:.0f} found"
     return titled(picture, f"{finding.name}: {text}")
 
 
@@ -72,11 +73,9 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     size = picture.shape[1], picture.shape[0]
     if options.method == "corners":
         blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CORNERS.blur)
-        values = np.sqrt(np.maximum(saddle_strength(blurred), 0))
-        title = "strength of saddles"
+        values, title = np.sqrt(np.maximum(saddle_strength(blurred), 0)), "strength of saddles"
     elif options.method == "log":
-        values = np.maximum(spot_strength(data, options), 0)
-        title = "height of spots"
+        values, title = np.maximum(spot_strength(data, options), 0), "height of spots"
     elif options.method == "intensity":
         values = feature_values(data, options, (0, 0, data.shape[1], data.shape[0]))
         title = "grey values above the threshold"
@@ -85,8 +84,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         # a pixel of the picture is marked if any of those behind it is
         behind = np.ones([max(int(np.ceil(1 / part.zoom)), 1)] * 2, np.uint8)
         mask = cv2.dilate(Light(data, options).above, behind)
-        shown = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
-        picture[shown > 0] = ABOVE
+        picture[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0] = ABOVE
         title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
         return titled(picture, f"{options.method}: its own threshold")
@@ -107,17 +105,9 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     whole, _ = backdrop(finding.setup, finding.frame, None)
     cut = cut_out(whole, part, room, cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR)
     factor, note = _magnifier(finding, body, estimate, part.zoom, canvas.stroke(cut))
+    posed = T, estimate.covariance, estimate.status, estimate.frame
     drawn = overlay.draw_pose(
-        cut,
-        finding.setup.sensor,
-        body,
-        T,
-        estimate.covariance,
-        estimate.status,
-        estimate.frame,
-        part=part,
-        found=finding.points,
-        magnified=factor,
+        cut, finding.setup.sensor, body, *posed, part=part, found=finding.points, magnified=factor
     )
     if note:
         place = canvas.caption_place(drawn)[0], drawn.shape[0] - 8
@@ -224,17 +214,15 @@ def densities_picture(
         peaks = [float(one.values.max()) for one in panels]
         top = max(peaks) or 1.0  # where nothing was found about the body, all is black
         bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
-        drawn = [_headed(_coloured(one.values, bottom, top), one.title) for one in panels]
+        drawn = []
+        for one in panels:
+            picture = _coloured(one.values, bottom, top)
+            above = round(1.5 * canvas.line_height(picture)), picture.shape[1], 3
+            head = titled(np.zeros(above, np.uint8), one.title)
+            drawn.append(np.concatenate([head, picture]))
         row = canvas.in_grid(drawn, len(drawn))
         rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
     return canvas.stacked(rows)
-
-
-def _headed(picture: Picture, title: str) -> Picture:
-    """The picture below a title, which hides nothing of it."""
-    height = round(1.5 * canvas.line_height(picture))
-    strip = np.zeros((height, picture.shape[1], 3), np.uint8)
-    return np.concatenate([titled(strip, title), picture])
 
 
 def panels_of(
@@ -265,25 +253,22 @@ def panels_of(
         else:
             # as the objectives that draw samples have it: around these, and 0 elsewhere
             samples = body.sample(options.samples, seed=options.seed)
-            terms = sampled_terms([view], samples, [sigma], T)
-            word, look = "g sampled", _of_samples(terms)
+            word, look = "g sampled", partial(_sampled, sampled_terms([view], samples, [sigma], T))
         values = _largest(look, sigma, points, part, size)
         observed.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
     for sigma in judged:
-        look = _of_atlas(matched_objective([view], body, [sigma]).atlas)
+        look = partial(_looked_up, matched_objective([view], body, [sigma]).atlas)
         title = f"C = g ∗ ε, σ = {sigma:.3g} px"
         twice.append(Panel(title, _largest(look, sigma, points, part, size)))
     return [observed, twice]
 
 
-def _of_samples(terms: Sequence[SampledTerm]) -> Look:
-    if not terms:
-        return lambda places: np.zeros(places.shape[:-1])
-    return lambda places: terms[0].density.sample(places)[..., 0]
+def _sampled(terms: Sequence[SampledTerm], places: Floats) -> NDArray[Any]:
+    return terms[0].density.sample(places)[..., 0] if terms else np.zeros(places.shape[:-1])
 
 
-def _of_atlas(atlas: Atlas) -> Look:
-    return lambda places: atlas.look_up(places[None])[0, ..., 0]
+def _looked_up(atlas: Atlas, places: Floats) -> NDArray[Any]:
+    return atlas.look_up(places[None])[0, ..., 0]
 
 
 def _largest(look: Look, sigma: float, points: Floats, part: Part, size: Size) -> Floats:

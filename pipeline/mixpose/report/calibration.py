@@ -24,10 +24,9 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
 
     `unit` is of lengths, `version` of mixpose. A `SessionError` where a library is missing.
     """
-    environment = page_templates()
-    sensors = range(len(found.after.names))
-    charts = [_sensor_chart(found, index, unit) for index in sensors]
-    return environment.get_template(_TEMPLATE).render(
+    template = page_templates().get_template(_TEMPLATE)
+    charts = [_sensor_chart(found, index, unit) for index in range(len(found.after.names))]
+    return template.render(
         mark=MARK,
         version=version,
         name=name,
@@ -55,17 +54,10 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
             low, high = np.zeros(2), np.array(eye.resolution, dtype=float)
         axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
         width = float(np.ptp(axes.get_xlim()))
-        scale = 3 * found.noise[index] / (_LONG * width)
-        axes.quiver(
-            *sights.y.T,
-            *sights.offset.T,
-            angles="xy",
-            scale_units="xy",
-            scale=max(scale, 1e-12),
-            width=0.003,
-            **POSE,
-        )
-        axes.set_xlabel(f"px; residuals are drawn {1 / max(scale, 1e-12):.2g} times as long")
+        scale = max(3 * found.noise[index] / (_LONG * width), 1e-12)
+        look: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "width": 0.003, **POSE}
+        axes.quiver(*sights.y.T, *sights.offset.T, scale=scale, **look)
+        axes.set_xlabel(f"px; residuals are drawn {1 / scale:.2g} times as long")
     rms = float(np.sqrt((sights.offset**2).sum(axis=1).mean()))
     title = f"{found.after.names[index]}: what was met, and by how much it is off"
     alt = f"{len(sights.y)} detections, residual {rms:.3g} RMS"

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mixpose.records import Floats
-from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
+from mixpose.records import Floats, Mask
+from mixpose.report.series import Errors, Series, jumps_of_turns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,13 +30,7 @@ POSE: dict[str, Any] = {"color": _BLUE}
 BARS: dict[str, Any] = {"color": _BLUE}
 TRUTH: dict[str, Any] = {"color": _GREY, "linestyle": (0, (3, 1.5)), "linewidth": 1.1, "marker": ""}
 BAND: dict[str, Any] = {"color": _BLUE, "linewidth": 0.9, "markersize": 1.5}
-_AMBIGUOUS: dict[str, Any] = {
-    "linestyle": "none",
-    "marker": "D",
-    "markeredgewidth": 0,
-    "color": _ORANGE,
-    "zorder": 4,
-}
+_AMBIGUOUS: dict[str, Any] = {"linestyle": "none", "marker": "D", "color": _ORANGE, "zorder": 4}
 
 # Stand-ins that `drawn` exchanges for the page's colours.
 _INK, _RULE = "#1a1b1c", "#c1c2c3"
@@ -83,68 +77,47 @@ def stacked(shares: tuple[float, ...], height: float = 1.15 * _HEIGHT) -> tuple[
 
     with rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-        grid = figure.subplots(
-            len(shares), 1, squeeze=False, sharex=True, height_ratios=list(shares)
-        )
+        grid = figure.subplots(len(shares), squeeze=False, sharex=True, height_ratios=shares)
     return figure, list(grid[:, 0])
 
 
 class TimeAxes:
-    """Axes over the frames of a run; lines break at `jumps` (n,), which are no motion."""
+    """Axes over all frames of a run, those that are lost shaded from top to bottom.
 
-    def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
+    Lines break where frames are lost or left out, and at `jumps` (n,), which are no motion.
+    """
+
+    def __init__(self, axes: Axes, series: Series, jumps: Mask | None = None) -> None:
         self._axes, self._series = axes, series
         self._breaks = series.breaks if jumps is None else series.breaks | jumps
-        self._as_pixels = len(series.x) > _MANY
-        gaps = np.diff(series.x)
-        self._half_step = 0.5 * float(np.median(gaps)) if gaps.any() else 0.5
-
-    def frame(self) -> None:
-        """Show all frames, those without a value too."""
-        x = self._series.x
+        x, gaps = series.x, np.diff(series.x)
+        half_step = 0.5 * float(np.median(gaps)) if gaps.any() else 0.5
+        # without a line around it, and as pixels where there are many
+        self._filled: dict[str, Any] = {"linewidth": 0, "rasterized": len(x) > _MANY}
+        edges = np.flatnonzero(np.diff(series.status == "lost", prepend=False, append=False))
+        stretches = [
+            (x[first] - half_step, x[last - 1] - x[first] + 2 * half_step)
+            for first, last in edges.reshape(-1, 2)
+        ]
+        if stretches:
+            whole = axes.get_xaxis_transform()
+            look: dict[str, Any] = {"color": _RED, "alpha": 0.3, **self._filled}
+            axes.broken_barh(stretches, (0.0, 1.0), transform=whole, **look)
         if x.size:
-            margin = max(0.01 * float(x[-1] - x[0]), self._half_step)
-            self._axes.set_xlim(float(x.min()) - margin, float(x.max()) + margin)
+            margin = max(0.01 * float(x[-1] - x[0]), half_step)
+            axes.set_xlim(float(x.min()) - margin, float(x.max()) + margin)
 
     def draw(self, values: Floats, look: dict[str, Any] = POSE) -> None:
-        """Draw a line that breaks where frames are lost or left out."""
+        """Draw a line."""
         line(self._axes, self._series.x, values, self._breaks, look)
 
     def band(self, values: Floats, half_width: Floats) -> None:
         """Fill the band about values."""
         x, y, width = (_broken(each, self._breaks) for each in (self._series.x, values, half_width))
-        self._axes.fill_between(
-            x,
-            y - width,
-            y + width,
-            color=_BLUE,
-            alpha=0.25,
-            linewidth=0,
-            rasterized=self._as_pixels,
-        )
-
-    def mark_lost(self) -> None:
-        """Shade the stretches of lost frames from top to bottom."""
-        lost = self._series.status == "lost"
-        edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
-        x = self._series.x
-        stretches = [
-            (x[first] - self._half_step, x[last - 1] - x[first] + 2 * self._half_step)
-            for first, last in edges.reshape(-1, 2)
-        ]
-        if stretches:
-            self._axes.broken_barh(
-                stretches,
-                (0.0, 1.0),
-                transform=self._axes.get_xaxis_transform(),
-                color=_RED,
-                alpha=0.3,
-                linewidth=0,
-                rasterized=self._as_pixels,
-            )
+        self._axes.fill_between(x, y - width, y + width, color=_BLUE, alpha=0.25, **self._filled)
 
 
-def line(axes: Axes, x: Floats, y: Floats, breaks: Flags, look: dict[str, Any] = POSE) -> None:
+def line(axes: Axes, x: Floats, y: Floats, breaks: Mask, look: dict[str, Any] = POSE) -> None:
     """Draw a line that leaves out breaks and missing values, and dots where it would not show."""
     many, dotted = len(x) > _MANY, len(x) <= _DOTS
     x, y = _broken(x, breaks), _broken(y, breaks)
@@ -160,11 +133,11 @@ def mark_ambiguous(axes: Axes, x: Floats, y: Floats, series: Series) -> None:
     """Mark ambiguous frames at places (x, y) of all n frames; smaller where they are many."""
     doubtful = series.status == "ambiguous"
     size = 3.5 * np.clip(np.sqrt(_DOTS / max(len(x), 1)), 0.4, 1.0)
-    look = {**_AMBIGUOUS, "markersize": size, "rasterized": len(x) > _MANY}
+    look = {**_AMBIGUOUS, "markeredgewidth": 0, "markersize": size, "rasterized": len(x) > _MANY}
     axes.plot(x[doubtful], y[doubtful], **look)
 
 
-def _broken(values: Floats, breaks: Flags) -> Floats:
+def _broken(values: Floats, breaks: Mask) -> Floats:
     """Values (..., n) with a NaN before each break."""
     return np.insert(values, np.flatnonzero(breaks), np.nan, axis=-1)
 
@@ -305,11 +278,9 @@ def latency(series: Series) -> list[Chart]:
 
 def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
     """Errors of rotation and position, frame by frame."""
+    titles = "Rotation error, deg", f"Position error, {series.unit}"
     charts = []
-    for title, values in (
-        ("Rotation error, deg", errors.rotation_deg),
-        (f"Position error, {series.unit}", errors.distance),
-    ):
+    for title, values in zip(titles, (errors.rotation_deg, errors.distance), strict=True):
         figure, axes = blank()
         _draw(axes, series, values)
         axes.set_xlabel(series.x_label)
@@ -319,55 +290,46 @@ def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
 
 def _draw(axes: Axes, series: Series, values: Floats) -> None:
     """Values of all frames, none of them negative; those of ambiguous and lost frames marked."""
-    panel = TimeAxes(axes, series)
-    panel.mark_lost()
-    panel.draw(values)
+    TimeAxes(axes, series).draw(values)
     mark_ambiguous(axes, series.x, values, series)
-    panel.frame()
     axes.set_ylim(bottom=0.0)
 
 
 def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
     figure, axes = blank(height=3.6)
-    position = series.position
+    x, y = series.position[:, a], series.position[:, b]
     if errors is not None:
         line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
-    line(axes, position[:, a], position[:, b], series.breaks)
-    mark_ambiguous(axes, position[:, a], position[:, b], series)
-    known = position[series.status != "lost"]
-    if len(known):
-        ink = {"linestyle": "none", "color": POSE["color"], "zorder": 5}
-        axes.plot(*known[0, [a, b]], marker="o", markersize=7, fillstyle="none", **ink)
-        axes.plot(*known[-1, [a, b]], marker="s", markersize=7, fillstyle="none", **ink)
+    line(axes, x, y, series.breaks)
+    mark_ambiguous(axes, x, y, series)
+    known = np.flatnonzero(series.status != "lost")
+    ends = {"linestyle": "none", "zorder": 5, "markersize": 7, "fillstyle": "none", **POSE}
+    for k, marker in zip(known[[0, -1]] if len(known) else (), "os"):  # the first and the last
+        axes.plot(x[k], y[k], marker=marker, **ends)
     axes.set_aspect("equal", adjustable="datalim")
     axes.ticklabel_format(useOffset=False)
     axes.set(xlabel=f"{AXES[a]}, {series.unit}", ylabel=f"{AXES[b]}, {series.unit}")
     title = f"Plane {AXES[a]}{AXES[b]}"
-    spoken = [_spoken(AXES[k], position[:, k]) for k in (a, b)]
+    spoken = [_spoken(AXES[k], series.position[:, k]) for k in (a, b)]
     return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawn(figure))
 
 
 def _values(
-    series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
+    series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Mask
 ) -> str:
     """Values with their band above, the band's half-width alone below; none where it is open."""
     figure, (upper, lower) = stacked((3.0, 1.2))
     is_open = np.isinf(half_width)
     half_width = np.where(is_open, np.nan, half_width)
     panel = TimeAxes(upper, series, jumps)
-    panel.mark_lost()
     panel.band(values, half_width)
     if truth is not None:
         panel.draw(truth, TRUTH)
     panel.draw(values)
     mark_ambiguous(upper, series.x, values, series)
-    panel.frame()
     limit(upper, values, truth, half_width)
     upper.tick_params(labelbottom=False)
-    below = TimeAxes(lower, series)
-    below.mark_lost()
-    below.draw(half_width, BAND)
-    below.frame()
+    TimeAxes(lower, series).draw(half_width, BAND)
     positive = half_width[half_width > 0]
     # one frame without support must not hide how good the others are
     if positive.size and positive.max() > 30 * np.median(positive):
@@ -382,7 +344,7 @@ def _values(
     return drawn(figure)
 
 
-def _open(is_open: Flags, half_width: Floats) -> str:
+def _open(is_open: Mask, half_width: Floats) -> str:
     """What a figure says of frames whose covariance leaves a direction open."""
     count, known = int(is_open.sum()), int(is_open.sum() + np.isfinite(half_width).sum())
     return f"open in {count} of {known} frames, where any value fits: no band"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Generator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +16,7 @@ from mixpose.frames.capture import is_stream
 from mixpose.pictures import Part, displayable, draw_pose
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame, Status
+from mixpose.records import FrameSet, Image, PointPattern, RawFrame, Status
 from mixpose.report.series import Errors, Series
 from mixpose.rigid import transform
 from mixpose.runner import observation_of, source_spec
@@ -56,11 +56,14 @@ class OverlayFrame:
 
 
 def overlay_frames(
-    session: Session, poses: PoseFile, series: Series, errors: Errors | None
+    session: Session | None, poses: PoseFile, series: Series, errors: Errors | None
 ) -> tuple[list[OverlayFrame], list[str]]:
     """A few frames, ascending, with their poses on them, and sentences on what is not read."""
-    setups, opened, notices = _open(session, poses.sources)
+    if session is None:
+        return [], []
+    opened, notices = _open(session, poses.sources)
     chosen = chosen_frames(series, errors)
+    setups = {setup.name: setup for setup in session.sensors}
     lines = {line.frame: line for line in poses.poses}
     frames: list[OverlayFrame] = []
     if not opened or not chosen:
@@ -74,8 +77,7 @@ def overlay_frames(
                     for name, frame in frame_set.frames.items()
                     if isinstance(frame.data, np.ndarray)
                 )
-                why = chosen[frame_set.number]
-                frames.append(OverlayFrame(frame_set.number, line.status, why, shots))
+                frames.append(OverlayFrame(line.frame, line.status, chosen[line.frame], shots))
     except RecordingError as error:
         notices.append(f"The recording cannot be read to the end: {error}")
     absent = sorted(set(chosen) - {frame.frame for frame in frames})
@@ -89,26 +91,23 @@ def chosen_frames(series: Series, errors: Errors | None) -> dict[int, str]:
     count = len(series.frames)
     if not count:
         return {}
-    reasons: dict[int, list[str]] = {
-        round(i): [] for i in np.linspace(0, count - 1, min(_EVENLY, count))
-    }
+    evenly = np.linspace(0, count - 1, min(_EVENLY, count))
+    reasons: dict[int, list[str]] = {round(i): [] for i in evenly}
     if errors is None:
         badness, words = -series.score, ("best score", "worst score")
     else:
         badness, words = errors.rotation_deg, ("smallest rotation error", "largest rotation error")
-    badness = np.where(series.status == "lost", np.nan, badness)
+    is_lost = series.status == "lost"
+    badness = np.where(is_lost, np.nan, badness)
     if np.isfinite(badness).any():
         reasons.setdefault(int(np.nanargmin(badness)), []).append(words[0])
         reasons.setdefault(int(np.nanargmax(badness)), []).append(words[1])
-    lost = np.flatnonzero(series.status == "lost")
-    if lost.size:
-        reasons.setdefault(int(lost[0]), []).append("first lost frame")
+    if is_lost.any():
+        reasons.setdefault(int(is_lost.argmax()), []).append("first lost frame")
     return {series.frames[i]: ", ".join(why) for i, why in sorted(reasons.items())}
 
 
-def _open(
-    session: Session, replaced: Mapping[str, str]
-) -> tuple[dict[str, SensorSetup], dict[str, Source], list[str]]:
+def _open(session: Session, replaced: Mapping[str, str]) -> tuple[dict[str, Source], list[str]]:
     """Recordings with images; a stream is over, and is not asked for again."""
     opened: dict[str, Source] = {}
     notices: list[str] = []
@@ -130,7 +129,7 @@ def _open(
             continue
         if source.kind in ("images", "video"):
             opened[setup.name] = source
-    return {setup.name: setup for setup in session.sensors}, opened, notices
+    return opened, notices
 
 
 def _read(
@@ -146,15 +145,6 @@ def _read(
         yield from pair(opened, number, number + 1)
 
 
-def _found(session: Session, setup: SensorSetup, frame: RawFrame) -> Floats | None:
-    """Features as the run found them; None where they are no points."""
-    try:
-        pattern = observation_of(session, setup, frame).pattern
-    except MixposeError:  # the pose can be drawn all the same
-        return None
-    return pattern.points if isinstance(pattern, PointPattern) else None
-
-
 def _shot(
     session: Session, setup: SensorSetup, frame: RawFrame, image: Image, line: PoseLine
 ) -> Shot:
@@ -165,18 +155,14 @@ def _shot(
     zoom = min(_WIDEST / (right - left), _LARGEST_ZOOM if is_part else 1.0)
     size = round((right - left) * zoom), max(round((bottom - top) * zoom), 1)
     kind = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
-    scaled = cv2.resize(picture[top:bottom, left:right], size, interpolation=kind)
-    drawn = draw_pose(
-        np.asarray(scaled, dtype=np.uint8),
-        setup.sensor,
-        session.body,
-        line.T_world_object,
-        line.covariance,
-        line.status,
-        line.frame,
-        part=Part(zoom, (left, top)),
-        found=_found(session, setup, frame),
-    )
+    part, scaled = Part(zoom, (left, top)), picture[top:bottom, left:right]
+    scaled = np.asarray(cv2.resize(scaled, size, interpolation=kind), dtype=np.uint8)
+    found = None  # features as the run found them
+    with suppress(MixposeError):  # the pose can be drawn all the same
+        pattern = observation_of(session, setup, frame).pattern
+        found = pattern.points if isinstance(pattern, PointPattern) else None
+    posed = line.T_world_object, line.covariance, line.status, line.frame
+    drawn = draw_pose(scaled, setup.sensor, session.body, *posed, part=part, found=found)
     _, jpeg = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     uri = f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode('ascii')}"
     return Shot(setup.name, uri, *size, zoom, is_part)

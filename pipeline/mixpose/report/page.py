@@ -78,42 +78,30 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     compared.
     """
     environment = page_templates()
-    return environment.get_template(_TEMPLATE).render(
-        mark=MARK, version=version, **_content(poses, truth, cut, environment)
-    )
-
-
-def _content(
-    poses: PoseFile, truth: PoseFile | None, cut: bool, environment: Environment
-) -> dict[str, Any]:
-    """What is said once, and the parts of the page about each body."""
     labels = list(dict.fromkeys(line.label for line in poses.poses))
     origin, swaps, named = find_session(poses), None, poses.header.get("session")
     path = Path(named) if isinstance(named, str) and named else poses.path
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
-    files = [poses]
-    if len(labels) > 1:
-        files = [
-            replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
-            for label in labels
-        ]
-    template = environment.get_template(_BODY_TEMPLATE)
+    files = [_of_body(poses, label) for label in labels] if len(labels) > 1 else [poses]
+    template = environment.get_template(_BODY_TEMPLATE)  # of what is said of each body
     parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
     for k, content in enumerate(contents):
         at = f"-{k + 1}" if len(files) > 1 else ""
         parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
-    return {
-        "name": "/".join(path.parts[-2:]),  # the folder says more than the file alone
-        "truth": truth,
-        "facts": _facts(poses, labels),
-        "notices": contents[0]["notices"] if len(files) == 1 else [],
-        "counts": list(zip(_STATUSES, map(sum, zip(*counts, strict=True)), strict=True)),
-        "swaps": swaps,
-        "parts": parts,
-        "origin": origin,
-    }
+    return environment.get_template(_TEMPLATE).render(
+        mark=MARK,
+        version=version,
+        name="/".join(path.parts[-2:]),  # the folder says more than the file alone
+        truth=truth,
+        facts=_facts(poses, labels),
+        notices=contents[0]["notices"] if len(files) == 1 else [],
+        counts=list(zip(_STATUSES, map(sum, zip(*counts, strict=True)), strict=True)),
+        swaps=swaps,
+        parts=parts,
+        origin=origin,
+    )
 
 
 def _body_content(
@@ -127,17 +115,13 @@ def _body_content(
     errors = None if truth is None else errors_of(series, poses, truth)
     evaluation = None
     if truth is not None:  # which may hold other bodies
-        own = tuple(line for line in truth.poses if line.label == series.label)
-        evaluation = evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
+        own = _of_body(truth, series.label)
+        evaluation = evaluate(poses, own if own.poses else truth, numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
         names = [one.body.name for one in origin.session.objects]
         alone = origin.session.alone(series.object) if series.object in names else None
         origin = replace(origin, session=alone)
-    overlays, overlay_notices = (
-        ([], [])
-        if origin.session is None
-        else overlay_frames(origin.session, poses, series, errors)
-    )
+    overlays, overlay_notices = overlay_frames(origin.session, poses, series, errors)
     unit_of = _unit_of(origin, series)
     has_poses = bool(np.any(series.status != "lost"))
     return {
@@ -151,7 +135,7 @@ def _body_content(
         "error_charts": [] if errors is None else figures.errors_over_time(series, errors),
         "trajectory_charts": figures.trajectory(series, errors) if has_poses else [],
         "motion_charts": figures.motion(series, errors) if has_poses else [],
-        "sensor_charts": [*figures.sensors(series, unit_of), *figures.features(series, unit_of)]
+        "sensor_charts": figures.sensors(series, unit_of) + figures.features(series, unit_of)
         if has_poses
         else [],
         "latency_charts": figures.latency(series),
@@ -160,15 +144,21 @@ def _body_content(
     }
 
 
+def _of_body(file: PoseFile, label: str) -> PoseFile:
+    return replace(file, poses=tuple(line for line in file.poses if line.label == label))
+
+
 def _facts(poses: PoseFile, labels: Sequence[str]) -> list[tuple[str, str]]:
     header = poses.header
-    facts = [("Poses", str(poses.path)), ("Session", header.get("session"))]
-    facts += [
-        ("Objects" if len(labels) > 1 else "Object", ", ".join(labels) or None),
-        ("Unit", poses.unit),
-    ]
-    facts += [("mixpose", header.get("mixpose")), ("Seed", header.get("seed"))]
-    return [(name, str(value)) for name, value in facts if value is not None]
+    facts = {
+        "Poses": poses.path,
+        "Session": header.get("session"),
+        "Objects" if len(labels) > 1 else "Object": ", ".join(labels) or None,
+        "Unit": poses.unit,
+        "mixpose": header.get("mixpose"),
+        "Seed": header.get("seed"),
+    }
+    return [(name, str(value)) for name, value in facts.items() if value is not None]
 
 
 def _notices(poses: PoseFile, series: Series, cut: bool) -> list[str]:

@@ -16,10 +16,9 @@ from mixpose.errors import RecordingError
 from mixpose.poses.evaluate import errors_to_truth
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Floats, Status
+from mixpose.records import Floats, Mask, Status
 
 Texts: TypeAlias = NDArray[np.str_]
-Flags: TypeAlias = NDArray[np.bool_]
 
 SIGMAS_95 = 1.96
 """Standard deviations to either side that hold 95 % of a Gaussian."""
@@ -39,7 +38,7 @@ class Series:
     # (n,), where a frame stands in figures: its time in s, or its number where times are missing
     x: Floats
     x_label: str
-    breaks: Flags  # (n,), whether frame numbers are missing before a frame
+    breaks: Mask  # (n,), whether frame numbers are missing before a frame
     status: Texts  # (n,)
     position: Floats  # (n, 3)
     # (n, 3), rotation vector in world axes, degrees, of the turn from `T_reference`
@@ -135,7 +134,7 @@ def turns_deg(T: Floats, T_reference: Floats) -> Floats:
     return np.round(turns, _DECIMALS_DEG)
 
 
-def jumps_of_turns(turn_deg: Floats) -> Flags:
+def jumps_of_turns(turn_deg: Floats) -> Mask:
     """Before which frames (n,) rotation vectors (n, 3) pass half a turn, all components at once."""
     with np.errstate(invalid="ignore"):
         far = np.linalg.norm(np.diff(turn_deg, axis=0), axis=1) > _HALF_TURN_DEG
@@ -183,7 +182,7 @@ def _of_features(lines: list[PoseLine], name: str) -> dict[str, Floats]:
     return found
 
 
-def _breaks(frames: Sequence[int]) -> Flags:
+def _breaks(frames: Sequence[int]) -> Mask:
     """Where more frame numbers are left out than usual in the file."""
     steps = np.array([0, *(after - before for before, after in pairwise(frames))], dtype=np.float64)
     usual = np.median(steps[1:]) if len(steps) > 1 else 1.0
