@@ -397,10 +397,12 @@ def follow(
                 # per frame, where the change was seen over several
                 change = np.abs(change / (1 + track.misses)).reshape(2, 3)
                 uncertainty = np.maximum(change.max(axis=1).repeat(3), steady)
-            if deviation is not None and parent.motion_filter and elapsed <= rules.longest_s:
+            if frame.is_timed and parent.motion_filter and elapsed <= rules.longest_s:
                 motion_filter = parent.motion_filter.followed(moved, deviation, elapsed)
-        if deviation is not None:
+        if frame.is_timed:
             motion_filter = motion_filter or MotionFilter.begun(deviation, body.radius, rules)
+        # a prediction errs by the motion, and by the pose that it starts from
+        uncertainty = np.minimum(np.hypot(uncertainty, deviation), frame.flat_prior[1])
         branch = replace(branch, velocity=velocity, uncertainty=uncertainty)
         branches.append(replace(branch, motion_filter=motion_filter))
     return replace(

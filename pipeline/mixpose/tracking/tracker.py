@@ -387,7 +387,8 @@ def _branches(
     for pose, weight in (*verdict.kept, *unlikely[: data.rules.ranges.modes]):
         # a pose that may be clutter counts as little in the next frame
         belief = weight * float(expit(pose.log_evidence))
-        sigmas = np.sqrt((pose.covariance - pose.persistent).diagonal()) if data.is_timed else None
+        # a persistent error is that of the next frame too
+        variances = (pose.covariance - pose.persistent).diagonal()
         spread = pose.spread if fuse else None
         T, second = pose.T_world_object, verdict.second
         other = data.log_odds_other_at(T)
@@ -395,7 +396,13 @@ def _branches(
             other = -second.odds_over_best
         elif second and second.is_explained and pose is best:
             other = second.odds_over_best
-        branch = Branch(T, belief, spread=spread, deviation=sigmas, log_odds_other=other)
+        branch = Branch(
+            T,
+            belief,
+            spread=spread,
+            deviation=np.sqrt(np.maximum(variances, 0.0)),
+            log_odds_other=other,
+        )
         is_new = pose.proposer == SECOND_POSE
         alike = None if is_new else [part.T_body_other for part in congruent(data, pose)]
         branches.append((branch, alike))
