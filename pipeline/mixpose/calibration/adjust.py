@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
+from mixpose.calibration.bundle import Bundle, Weighted, apply_step, rows_of, solve_step
 from mixpose.calibration.matching import feature_spacing, match, nearest_distance
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
@@ -83,19 +83,19 @@ def adjust(
     blur = _first_blurs(bundle, state) if blurs is None else blurs
     for _ in range(_MOST_BLURS):
         for _ in range(rules.steps):
-            state, _ = _climbed(bundle, state, _weighted(bundle, state, blur, blur)[0])
-        estimate = noise if noise is not None else _noise(bundle, 1.0, state, blur)
+            state, _ = _take_step(bundle, state, _weighted_pairs(bundle, state, blur, blur)[0])
+        estimate = noise if noise is not None else _estimate_noise(bundle, 1.0, state, blur)
         # crowded features look like noise at a wide blur, which must not widen it further
         last = np.minimum(rules.blur * estimate, _widest_alike(state.rig, blur, bundle.sigmas))
         if (blur <= last / rules.narrowing).all():
             break
         blur = np.maximum(blur * rules.narrowing, last)
     if noise is not None:
-        return _ended(bundle, state, noise, None)
-    adjusted = _ended(bundle, state, last / rules.blur, 1.0)
+        return _finish(bundle, state, noise, None)
+    adjusted = _finish(bundle, state, last / rules.blur, 1.0)
     if adjusted.inflation > 1:
         return adjusted
-    return _ended(bundle, adjusted.state, adjusted.noise, rules.unlike)
+    return _finish(bundle, adjusted.state, adjusted.noise, rules.unlike)
 
 
 def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
@@ -104,20 +104,20 @@ def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
     return np.array([sigma * (blur / sigmas)[units == u].max() for sigma, u in zip(sigmas, units)])
 
 
-def _ended(bundle: Bundle, state: State, noise: Floats, unlike: float | None) -> Adjusted:
+def _finish(bundle: Bundle, state: State, noise: Floats, unlike: float | None) -> Adjusted:
     """Take the last steps; estimate noise by `_noise` with `unlike`, unless that is None."""
     rules = bundle.rules
     most = rules.unlike * noise
     for _ in range(rules.last_steps):
-        weighted, _ = weighted_at_the_end(bundle, state, noise)
-        state, size = _climbed(bundle, state, weighted)
+        weighted, _ = final_weights(bundle, state, noise)
+        state, size = _take_step(bundle, state, weighted)
         before = noise
         if unlike is not None:
-            noise = np.minimum(_noise(bundle, unlike, state, rules.blur * noise), most)
+            noise = np.minimum(_estimate_noise(bundle, unlike, state, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
-    weighted, alone = weighted_at_the_end(bundle, state, noise)
-    step = solved(bundle, state, weighted)
+    weighted, alone = final_weights(bundle, state, noise)
+    step = solve_step(bundle, state, weighted)
     scattered = step.covariance * variance_ratio(state.rig, rules)
     inflation = _inflation(bundle, weighted, scattered)
     covariance = scattered * inflation + step.of_held
@@ -125,20 +125,20 @@ def _ended(bundle: Bundle, state: State, noise: Floats, unlike: float | None) ->
     return Adjusted(state, noise, covariance, step.unknown, pairs, inflation)
 
 
-def weighted_at_the_end(
+def final_weights(
     bundle: Bundle, state: State, noise: Floats
 ) -> tuple[list[Weighted], list[Floats]]:
     """Return pairs with weights of the last steps, and weights (n,) of the objective alone."""
-    return _weighted(bundle, state, bundle.rules.blur * noise, noise, last=True)
+    return _weighted_pairs(bundle, state, bundle.rules.blur * noise, noise, last=True)
 
 
-def moved_by_held(bundle: Bundle, adjusted: Adjusted) -> Floats:
+def deviations_by_held(bundle: Bundle, adjusted: Adjusted) -> Floats:
     """Return standard deviations (G,) of the rig's parameters by errors of held parameters."""
-    weighted, _ = weighted_at_the_end(bundle, adjusted.state, adjusted.noise)
-    return np.asarray(np.sqrt(np.diag(solved(bundle, adjusted.state, weighted).of_held)))
+    weighted, _ = final_weights(bundle, adjusted.state, adjusted.noise)
+    return np.asarray(np.sqrt(np.diag(solve_step(bundle, adjusted.state, weighted).of_held)))
 
 
-def _weighted(
+def _weighted_pairs(
     bundle: Bundle, state: State, blur: Floats, noise: Floats, *, last: bool = False
 ) -> tuple[list[Weighted], list[Floats]]:
     """Return pairs of all sensors with weights, and their weights by the objective alone."""
@@ -159,9 +159,9 @@ def _weighted(
     return weighted, alone
 
 
-def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tuple[State, float]:
+def _take_step(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tuple[State, float]:
     """Take a step; return the state and the step's size in standard deviations of the rig."""
-    step = solved(bundle, state, weighted, 1e-9)
+    step = solve_step(bundle, state, weighted, 1e-9)
     is_turn = [unit == "rad" for block in bundle.blocks for unit in block.units]
     turns = np.concatenate([step.poses[:, 3:].ravel(), step.rig[is_turn]])
     largest = float(np.abs(turns).max(initial=0.0))
@@ -173,17 +173,17 @@ def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tupl
     size = float(np.abs(ratios).max(initial=0.0))
     if not bundle.count:
         size = float(np.abs(step.poses).max(initial=0.0)) * 1e3
-    return stepped(bundle, state, step), size
+    return apply_step(bundle, state, step), size
 
 
-def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
+def _estimate_noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
     """Estimate standard deviations of detections (L,) from residuals under a Gaussian weight."""
     # noise of a sensor is that of its kind, within the factor `unlike`. If whole frames are off the
     # factor is 1: else poses would be drawn to the sensor that happens to fit best until it had no
     # noise at all
     rules, sigmas, sensors = bundle.rules, bundle.sigmas, state.rig.sensors
     count, squares = np.zeros((2, len(sensors)))
-    weighted, alone = _weighted(bundle, state, blur, np.ones(len(blur)))
+    weighted, alone = _weighted_pairs(bundle, state, blur, np.ones(len(blur)))
     for s, ((rows, _), weight) in enumerate(zip(weighted, alone, strict=True)):
         near = weight * rows.pairs.nearest
         count[s] = sensors[s].dimension * float(near.sum())
@@ -252,7 +252,7 @@ def _frame_equations(
     return joined[:, 0], joined[:, 1 : 1 + bundle.count], joined[:, 1 + bundle.count :]
 
 
-def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
+def fit_pairs(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
     """Fit a bundle's parameters and poses to known pairs; return the parameters' whole step (G,).
 
     Also return squared residuals (n,) of each sensor's pairs; NaN of pairs that are not met.
@@ -268,7 +268,7 @@ def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[F
         before, misfit = misfit, sum(float(weight @ values) for (_, weight), values in weighed)
         if before - misfit < _CLIMBED * misfit or not bundle.pose_free.any():
             break
-        step = solved(bundle, state, rows, 1e-6)
-        state, change = stepped(bundle, state, step), change + step.rig
+        step = solve_step(bundle, state, rows, 1e-6)
+        state, change = apply_step(bundle, state, step), change + step.rig
     pairs = zip(rows, squared, strict=True)
     return change, [np.where(w > 0, values, np.nan) for (_, w), values in pairs]

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from mixpose.calibration.matching import Clock, Pairs, clock_of, interpolate
-from mixpose.calibration.rig import Block, Rig, State, by_parameters, moved
+from mixpose.calibration.rig import Block, Rig, State, moved, parameter_jacobian
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame
 from mixpose.objective.projection import pose_jacobian
@@ -101,7 +101,7 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
                 J = J * clock.elapsed[sensor, frame][:, None, None]
             by_rig[:, :, block.place] = J
         else:
-            by_rig[:, :, block.place] = by_parameters(geometry, block.kind, world, by_world)
+            by_rig[:, :, block.place] = parameter_jacobian(geometry, block.kind, world, by_world)
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
         by_held = by_calibration(doubted(geometry, bundle.errors[sensor]), world)
@@ -169,7 +169,7 @@ class Step:
     unknown: Floats  # (G, u): undetermined directions, in units of the parameters' sizes
 
 
-def solved(
+def solve_step(
     bundle: Bundle, state: State, weighted: Sequence[Weighted], damping: float = 0.0
 ) -> Step:
     """Solve for a step within the gauge that leaves undetermined directions alone."""
@@ -209,7 +209,7 @@ def _complement(gauge: Floats, count: int) -> Floats:
     return np.asarray(Vt[rank:].T)
 
 
-def stepped(bundle: Bundle, state: State, step: Step) -> State:
+def apply_step(bundle: Bundle, state: State, step: Step) -> State:
     """Return rig and poses after a step."""
     rig, poses = moved(state.rig, bundle.blocks, step.rig), state.poses
     return State(rig, perturb(poses, step.poses) if bundle.pose_free.any() else poses)

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose.calibration import result
-from mixpose.calibration.adjust import Adjusted, adjust, fitted, moved_by_held
+from mixpose.calibration.adjust import Adjusted, adjust, deviations_by_held, fit_pairs
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import place_camera
-from mixpose.calibration.profile import Contradiction, contradiction, profiled
-from mixpose.calibration.recorded import held_back_with
+from mixpose.calibration.profile import Contradiction, find_contradiction, with_profiled_lenses
+from mixpose.calibration.recorded import folds_of
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import posed_frames, search_cameras
@@ -193,8 +193,8 @@ class _Run:
 
     def profiled(self) -> result.Calibration:
         """Return the calibration with deviations of lenses by how much worse the fit gets."""
-        self._adjustment = profiled(self._bundle(self._last_start), self._adjustment)
-        best = self._adjustment
+        best = with_profiled_lenses(self._bundle(self._last_start), self._adjustment)
+        self._adjustment = best
         return replace(self.calibration, deviations=best.deviations, covariance=best.covariance)
 
     def residuals(self) -> dict[int, result.Residual]:
@@ -203,12 +203,12 @@ class _Run:
         Matches are the same in all three, and poses are fitted to each rig.
         """
         start, best = self._last_start, self._adjustment
-        folds = held_back_with(len(start.frames), self._rules, runs=self._task.times_matter)
+        folds = folds_of(len(start.frames), self._rules, runs=self._task.times_matter)
         rms, sensors = result.rms, range(len(self._task.rig.sensors))
         # without parameters of the rig, so that only poses are fitted, to every rig alike
         bundle = replace(self._bundle(start), blocks=(), gauge=lambda _: np.eye(0), errors={})
-        _, before = fitted(bundle, self._task.rig, best)
-        _, after = fitted(bundle, best.state.rig, best)
+        _, before = fit_pairs(bundle, self._task.rig, best)
+        _, after = fit_pairs(bundle, best.state.rig, best)
         held_back: list[list[Floats]] = [[] for _ in sensors]
         for fold in np.unique(folds[folds >= 0]):
             self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
@@ -218,7 +218,7 @@ class _Run:
                 for block in self._blocks
                 if (fit.undetermined & ~best.undetermined)[block.place].any()
             }
-            _, squared = fitted(bundle, fit.state.rig, best)
+            _, squared = fit_pairs(bundle, fit.state.rig, best)
             for s in sensors:
                 if s not in undetermined:
                     pairs = best.weighted[s][0].pairs
@@ -231,7 +231,7 @@ class _Run:
     def contradicted(self) -> Contradiction | None:
         """Return the held parameters that the recording contradicts most."""
         sizes = {"length": self._length, "interval": self._interval}
-        return contradiction(self._bundle(self._last_start), self._adjustment, **sizes)
+        return find_contradiction(self._bundle(self._last_start), self._adjustment, **sizes)
 
     def _with_latecomers(self, start: Start, noise: Floats) -> Start:
         """Return the start with unlinked cameras placed, as far as possible, by its poses."""
@@ -282,7 +282,7 @@ class _Run:
         }
         if not errors:
             return np.zeros(sum(len(block.names) for block in self._blocks))
-        return moved_by_held(replace(self._bundle(start), errors=errors), adjusted)
+        return deviations_by_held(replace(self._bundle(start), errors=errors), adjusted)
 
     def _summarised(self, start: Start, adjusted: Adjusted, bad: list[int]) -> result.Calibration:
         task, rig = self._task, adjusted.state.rig

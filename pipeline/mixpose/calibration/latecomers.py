@@ -92,7 +92,7 @@ def _motions(
     """Return small motions (H, 4, 4) of the world, by three detections each; the first is none."""
     # three features, about equally far off in the image, are brought onto the lines of sight of
     # detections of any frames
-    places, lines, offsets, number = _near(rig, sensor, seen, rules)
+    places, lines, offsets, number = _nearby_pairs(rig, sensor, seen, rules)
     none = np.eye(4)[None]
     if len(offsets) < 3:
         return none
@@ -116,7 +116,7 @@ def _motions(
     return np.concatenate([none, motions[small]])
 
 
-def _near(
+def _nearby_pairs(
     rig: Rig, sensor: int, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
 ) -> tuple[Floats, Floats, Floats, Indices]:
     """Return features near detections (n): place, line of sight, offset in px, and detection."""

@@ -159,7 +159,7 @@ def match(
         points = np.full((len(seen), max(1, *map(len, seen)), y.shape[2]), np.inf)
         for number, detections in enumerate(seen):
             points[number, : len(detections)] = detections
-        k, i, j, share, nearest = _near(y[batch], visible[batch], points, blur, reach)
+        k, i, j, share, nearest = _pairs_within(y[batch], visible[batch], points, blur, reach)
         parts.append((first + k, i, j, points[k, j], share, nearest))
     return Pairs(*(np.concatenate(batches) for batches in zip(*parts, strict=True)))
 
@@ -182,7 +182,7 @@ def _projected(state: State, clock: Clock, sensor: int) -> tuple[Floats, Mask]:
     return y, visible
 
 
-def _near(
+def _pairs_within(
     y: Floats, visible: Mask, points: Floats, blur: float, reach: float
 ) -> tuple[Indices, Indices, Indices, Floats, Mask]:
     """Return pairs within reach: frames, features, detections, shares, and which are nearest."""

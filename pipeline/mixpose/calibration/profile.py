@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from mixpose.calibration.adjust import Adjusted, fitted, variance_ratio, weighted_at_the_end
+from mixpose.calibration.adjust import Adjusted, final_weights, fit_pairs, variance_ratio
 from mixpose.calibration.bundle import Bundle, normal_equations
 from mixpose.calibration.rig import Block, Kind, Rig, blocks_of, kinds_of, moved
 from mixpose.records import Floats
@@ -25,7 +25,7 @@ _LENSES = ("focal", "principal_point", "distortion")
 _WIDER, _TIMES = 10.0, 4  # largest factor of one widening, and number of widenings
 
 
-def profiled(bundle: Bundle, adjusted: Adjusted) -> Adjusted:
+def with_profiled_lenses(bundle: Bundle, adjusted: Adjusted) -> Adjusted:
     """Return the fit with wider deviations of lenses whose errors hardly make it worse."""
     rules, covariance = bundle.rules, adjusted.covariance.copy()
     lenses = [block for block in bundle.blocks if block.kind in _LENSES]
@@ -58,7 +58,7 @@ def _misfit_at(bundle: Bundle, adjusted: Adjusted, k: int, step: Floats) -> tupl
         return np.vstack([bundle.gauge(rig).reshape(-1, bundle.count), stays])
 
     start = moved(adjusted.state.rig, bundle.blocks, step)
-    change, squared = fitted(replace(bundle, gauge=gauge), start, adjusted)
+    change, squared = fit_pairs(replace(bundle, gauge=gauge), start, adjusted)
     by_sensor = zip(squared, adjusted.noise, strict=True)
     return step + change, float(sum(np.nansum(s) / noise**2 for s, noise in by_sensor))
 
@@ -72,7 +72,7 @@ class Contradiction:
     deviations: float  # standard deviations by which freeing it moves free parameters
 
 
-def contradiction(
+def find_contradiction(
     bundle: Bundle, adjusted: Adjusted, *, length: float, interval: float
 ) -> Contradiction | None:
     """Return the kind of held parameters, tested one by one, that the recording contradicts most.
@@ -83,7 +83,7 @@ def contradiction(
     rules, count, state = bundle.rules, bundle.count, adjusted.state
     held = _blocks_held(bundle, adjusted, length, interval)
     wide = replace(bundle, blocks=(*bundle.blocks, *held), errors={})
-    weighted, _ = weighted_at_the_end(wide, state, adjusted.noise)
+    weighted, _ = final_weights(wide, state, adjusted.noise)
     S, _, b, _ = normal_equations(wide, weighted, 0.0)
     scales = wide.scales
     S, b = S * np.outer(scales, scales), b * scales

@@ -152,7 +152,7 @@ def _profile_peaks(pattern: GridPattern) -> Floats:
     return np.asarray(places[:, None])
 
 
-def held_back_with(count: int, rules: CalibrationRules, *, runs: bool) -> Indices:
+def folds_of(count: int, rules: CalibrationRules, *, runs: bool) -> Indices:
     """Return fold numbers (count,) of frames held back together, a fifth at a time; -1 for none.
 
     Every fifth frame is in the same fold, or every fifth run of four.

@@ -162,7 +162,7 @@ def displacements(calibration: Calibration, rules: CalibrationRules) -> tuple[Di
     linked = [k for k in range(len(names)) if k not in calibration.unlinked]
     G, deviations, displaced = _consensus(*rigs, linked), _deviations(calibration), []
     for index in linked:
-        turn, shift = _apart(*rigs, index, G)
+        turn, shift = _displacement_of(*rigs, index, G)
         sd_turn, sd_shift = deviations[index]
         residual = calibration.residuals[index]
         before, after = residual.before, residual.held
@@ -195,12 +195,12 @@ def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
         return motions_of_world[0]
     worth = []
     for G in motions_of_world:
-        apart = [_apart(before, after, k, G) for k in linked]
+        apart = [_displacement_of(before, after, k, G) for k in linked]
         worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
     return motions_of_world[int(np.lexsort(np.array(worth).T[::-1])[0])]
 
 
-def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
+def _displacement_of(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
     """Return turn (degrees) and shift of a sensor, after G moves the new world into the old one."""
     poses = before_and_after(before, after, index)
     if poses is None:

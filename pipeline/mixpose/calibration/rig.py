@@ -142,7 +142,7 @@ def blocks_of(
     sensor_kinds = [(s, kind) for s in sorted(free) for kind in KINDS if kind in free[s]]
     start = 0
     for index, kind in sensor_kinds:
-        names, units, scales = _laid_out(rig.sensors[index], kind, length, interval)
+        names, units, scales = _parameters_of(rig.sensors[index], kind, length, interval)
         blocks.append(Block(kind, index, start, names, units, scales))
         start += len(names)
     if body:
@@ -153,7 +153,7 @@ def blocks_of(
     return tuple(blocks)
 
 
-def _laid_out(
+def _parameters_of(
     sensor: Any, kind: Kind, length: float, interval: float
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
     """Return names, units and scales of a sensor's parameters of one kind."""
@@ -233,7 +233,7 @@ def _changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
 _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}
 
 
-def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
+def parameter_jacobian(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
     """Return the Jacobian (n, m, k) of images of points (n, 3) by a sensor's own parameters.
 
     `by_world` is the Jacobian by the points (n, m, 3).
@@ -245,7 +245,7 @@ def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> F
         return -by_world
     if kind == "range_bias":
         return np.ones((len(world), 1, 1))
-    count = len(_laid_out(sensor, kind, 1.0, 1.0)[0])
+    count = len(_parameters_of(sensor, kind, 1.0, 1.0)[0])
     unbounded = replace(sensor, resolution=None)
     J = np.empty((len(world), 2, count))
     for k, step in enumerate(_STEPS[kind] * np.eye(count)):

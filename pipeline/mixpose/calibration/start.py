@@ -112,7 +112,7 @@ def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> 
         start = Start.of(
             task.rig, [PosedFrame(f, known[f.number]) for f in task.frames if f.number in known]
         )
-        rig = _biased(task, start.frames, start.state.poses)
+        rig = _with_biases(task, start.frames, start.state.poses)
         yield replace(start, state=start.state._replace(rig=rig))
         return
     for factor in rules.widened:
@@ -163,7 +163,7 @@ def agreement(rig: Rig, sensor: int, poses: Floats, points: Floats, blur: float)
     return np.asarray(score / np.maximum(np.minimum(visible.sum(axis=1), len(points)), 1))
 
 
-def _biased(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
+def _with_biases(task: Task, frames: Sequence[SeenFrame], poses: Floats) -> Rig:
     """Return the rig with free range biases set to those on which most ranges agree."""
     rig = task.rig
     for sensor, kinds in task.free.items():

@@ -127,12 +127,12 @@ def known_length(rig: Rig, words: str) -> tuple[tuple[int, int], float]:
                 "allowed: a session of cameras alone"
             )
     pair = (rig.names.index(first), rig.names.index(second))
-    if _apart(rig, pair) == 0:
+    if _distance(rig, pair) == 0:
         raise SessionError(f"--length {words}: the session has both at one place")
     return pair, length
 
 
-def _apart(rig: Rig, pair: tuple[int, int]) -> float:
+def _distance(rig: Rig, pair: tuple[int, int]) -> float:
     first, second = (centre_of(rig.sensors[k]) for k in pair)
     return float(np.linalg.norm(second - first))
 
@@ -144,7 +144,7 @@ def in_length(calibration: Calibration, words: str) -> Calibration:
     """
     rig, units = calibration.after, [u for block in calibration.blocks for u in block.units]
     pair, length = known_length(rig, words)
-    factor = length / _apart(rig, pair)
+    factor = length / _distance(rig, pair)
     sizes = [factor if unit == "length" else 1.0 for unit in units]
     change, by_distance = np.zeros((2, len(units)))
     for block in calibration.blocks:  # change with the scale of all lengths
@@ -155,7 +155,7 @@ def in_length(calibration: Calibration, words: str) -> Calibration:
     for block, values in length_parts(rig, calibration.blocks, pair):
         by_distance[block.place] += values
     # an error of the distance scales all lengths
-    share = factor / _apart(rig, pair)
+    share = factor / _distance(rig, pair)
     by_old = np.diag(sizes) - share * np.outer(change, by_distance)
     return replace(
         _by_linear(calibration, by_old),

@@ -52,7 +52,7 @@ def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
     for marker in range(len(plan.body)):
         for direction in _directions(26):
             shift = _STEP * plan.body.radius * direction
-            error = error_of(replace(plan, body=_moved(plan.body, marker, shift)))
+            error = error_of(replace(plan, body=_with_marker_moved(plan.body, marker, shift)))
             if error < least:
                 best, least = MarkerMove(marker, shift, error), error
     return best
@@ -70,7 +70,7 @@ def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor 
         kinds.setdefault((type(sensor), plan.noises[k]), k)
     for k in kinds.values():
         for direction in _directions(_PLACES):
-            copy = _placed(plan.sensors[k], middle, direction)
+            copy = _copy_at(plan.sensors[k], middle, direction)
             if copy is None:
                 continue
             extended = replace(
@@ -86,7 +86,7 @@ def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor 
     return best
 
 
-def _moved(body: Body, marker: int, shift: Floats) -> Body:
+def _with_marker_moved(body: Body, marker: int, shift: Floats) -> Body:
     features = list(body.features)
     feature = features[marker]
     assert isinstance(feature, PointFeature), "others are not moved"
@@ -103,7 +103,7 @@ def _directions(count: int) -> Floats:
     return np.array([across * np.cos(around), across * np.sin(around), height]).T
 
 
-def _placed(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
+def _copy_at(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
     """Return a copy of a sensor in a direction from the middle, as far from it as the original."""
     if isinstance(sensor, RangeSensor):
         distance = np.linalg.norm(sensor.position - middle)

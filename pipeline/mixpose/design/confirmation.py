@@ -111,14 +111,14 @@ def _errors_at(recording: _Recording) -> tuple[list[Floats], Counter[str]]:
         for name, sensor, noise in zip(plan.names, plan.sensors, plan.noises, strict=True):
             added = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
             if added > 0:
-                _made_noisier(recorded / f"{name}.csv", added, rng)
+                _add_noise(recorded / f"{name}.csv", added, rng)
         for estimate in run(load_session(recorded / "session.toml")):
             statuses[estimate.status] += 1
             if estimate.T_world_object is None:
                 continue
             twists = twist_between(alike, np.broadcast_to(estimate.T_world_object, alike.shape))
             nearest = int(np.linalg.norm(twists[:, 3:], axis=1).argmin())
-            # the error of a pose that looks the same is that of the pose before the symmetry
+            # an estimate turned by a symmetry is turned back before it is compared
             same = estimate.T_world_object @ inverse(plan.body.symmetries[nearest])
             errors.append(twist_between(T, same))
     return errors, statuses
@@ -186,7 +186,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _made_noisier(table: Path, noise: float, rng: np.random.Generator) -> None:
+def _add_noise(table: Path, noise: float, rng: np.random.Generator) -> None:
     """Add noise to the coordinates of a table, as `simulate` has one noise for all cameras."""
     with table.open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)

@@ -103,7 +103,7 @@ def predict(plan: Plan, poses: Floats) -> Prediction:
         V += noise**2 * (JW @ JW.swapaxes(-1, -2)).sum(axis=1)
         G += JW @ A
     V += (G @ spread @ G.swapaxes(-1, -2)).sum(axis=1)
-    covariances = np.array([_sandwiched(h, v, plan.free) for h, v in zip(H, V)])
+    covariances = np.array([_sandwich(h, v, plan.free) for h, v in zip(H, V)])
     return Prediction(poses, covariances, seen)
 
 
@@ -121,7 +121,7 @@ def at_tip(prediction: Prediction, tip: Floats) -> Floats:
     return np.asarray(result)
 
 
-def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
+def _sandwich(H: Floats, V: Floats, free: Mask) -> Floats:
     inverse = invert_information(H, free)
     is_open = ~np.isfinite(np.diag(inverse))
     inverse[is_open, :] = inverse[:, is_open] = 0.0
