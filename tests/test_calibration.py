@@ -29,11 +29,11 @@ from simulated_rigs import (
 )
 
 from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
-from mixpose.calibration.adjust import _climbed, _weighted
-from mixpose.calibration.bundle import Bundle, solved
+from mixpose.calibration.adjust import _take_step, _weighted_pairs
+from mixpose.calibration.bundle import Bundle, solve_step
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.matching import clock_of, interpolate, match
-from mixpose.calibration.recorded import held_back_with
+from mixpose.calibration.recorded import folds_of
 from mixpose.calibration.result import displacements
 from mixpose.calibration.rig import State, blocks_of
 from mixpose.calibration.searching import Saved
@@ -127,9 +127,9 @@ def test_a_step_is_as_large_as_the_deviations_of_what_it_moves() -> None:
         frames, blocks, known, lambda _: np.zeros((0, 6)), task.sigmas, CalibrationRules()
     )
     state, noise = State(task.rig, poses), np.full(2, 0.02)
-    weighted, _ = _weighted(bundle, state, 4 * noise, noise, last=True)
-    step = solved(bundle, state, weighted, 1e-9)
-    _, size = _climbed(bundle, state, weighted)
+    weighted, _ = _weighted_pairs(bundle, state, 4 * noise, noise, last=True)
+    step = solve_step(bundle, state, weighted, 1e-9)
+    _, size = _take_step(bundle, state, weighted)
     assert size == pytest.approx(np.abs(step.rig / np.sqrt(np.diag(step.covariance))).max())
     # 0.1 mm and 0.01 degrees, known to some hundredths of a mm: it is not yet where it will stay
     assert size > 1
@@ -301,9 +301,9 @@ def test_motion_between_frames_is_cubic() -> None:
 
 def test_every_fifth_frame_is_held_back_together_or_every_fifth_run() -> None:
     rules = CalibrationRules()
-    assert np.bincount(held_back_with(40, rules, runs=False)).tolist() == [8] * 5
-    assert (held_back_with(4, rules, runs=False) == -1).all()
-    in_runs = np.flatnonzero(held_back_with(40, rules, runs=True) == 2)
+    assert np.bincount(folds_of(40, rules, runs=False)).tolist() == [8] * 5
+    assert (folds_of(4, rules, runs=False) == -1).all()
+    in_runs = np.flatnonzero(folds_of(40, rules, runs=True) == 2)
     assert in_runs.tolist() == [8, 9, 10, 11, 28, 29, 30, 31]
 
 

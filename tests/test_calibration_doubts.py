@@ -179,8 +179,8 @@ def test_a_marker_that_lies_elsewhere_is_named_as_deviations_do_not_know_of_it()
     assert away.max() > 2.5  # 0.5 % of cameras whose deviations hold are that far off
     held = found.contradicted
     assert held is not None
-    assert (held.words, held.most) == ("body", f"{BODY.labels[3]}.z")
-    assert held.moves > 2.5
+    assert (held.name, held.parameter) == ("body", f"{BODY.labels[3]}.z")
+    assert held.deviations > 2.5
     assert any("add --free body to what is free" in text for text in doubts_of(found, "mm"))
     freed = task_of(sensors, wrong, body_free=True)
     assert calibrate(freed, NO_FRAME_HELD_BACK, found=alone(sensors, wrong)).contradicted is None
@@ -193,7 +193,7 @@ def test_a_late_camera_whose_delay_is_held_is_named() -> None:
         task_of(sensors, frames), NO_FRAME_HELD_BACK, found=alone(sensors, frames)
     ).contradicted
     assert held is not None
-    assert held.words.endswith(":delay")  # of one or the other: only their difference is told
+    assert held.name.endswith(":delay")  # of one or the other: only their difference is told
 
 
 def test_a_camera_that_was_linked_wrongly_is_placed_by_the_others() -> None:

@@ -12,7 +12,7 @@ from simulated_rigs import BODY, FPS, PLACES, alone, cameras, motion, recording,
 
 from mixpose.calibration import Calibration, calibrate
 from mixpose.calibration.recorded import _profile_peaks
-from mixpose.calibration.result import Sights
+from mixpose.calibration.result import MetDetections
 from mixpose.calibration.telling import lines_of
 from mixpose.fit import EstimatorOptions
 from mixpose.records import GridPattern
@@ -77,19 +77,19 @@ def test_residuals_of_frames_and_features_on_the_page_are_root_mean_squares(
     late: Calibration,
 ) -> None:
     # of frame 3 one detection is left, which is the farthest off of all
-    cut = dict(late.sights)
-    for index, one in late.sights.items():
-        kept = one.frame != 3
+    cut = dict(late.met)
+    for index, met in late.met.items():
+        kept = met.frame != 3
         kept[np.flatnonzero(~kept)[: 1 - index]] = True
-        far = np.where(one.frame == 3, 50.0, 1.0)[:, None] * one.offset
-        cut[index] = Sights(one.y[kept], far[kept], one.frame[kept], one.feature[kept])
-    late = replace(late, sights=cut)
+        far = np.where(met.frame == 3, 50.0, 1.0)[:, None] * met.offset
+        cut[index] = MetDetections(met.y[kept], far[kept], met.frame[kept], met.feature[kept])
+    late = replace(late, met=cut)
     page = render_calibration(late, "two", "mm", "0")
     assert "worst: frame 3, " in page
     for word, kind, first in (("frame", "frame", 0), ("feature", "feature", 1)):
         squares = defaultdict(list)
-        for index, sights in late.sights.items():
-            for key, offset in zip(getattr(sights, kind), sights.offset, strict=True):
+        for index, met in late.met.items():
+            for key, offset in zip(getattr(met, kind), met.offset, strict=True):
                 squares[int(key) + first].append((offset @ offset) / late.noise[index] ** 2)
         means = {key: float(np.sqrt(np.mean(each))) for key, each in squares.items()}
         worst = max(means, key=means.__getitem__)

@@ -15,7 +15,7 @@ from simulated_rigs import NO_FRAME_HELD_BACK, POINTS, alone, cameras, recording
 
 from mixpose.calibration import Calibration, Rig, calibrate
 from mixpose.calibration.recorded import read_frames
-from mixpose.calibration.result import sights_of
+from mixpose.calibration.result import met_detections
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.words import in_length, in_world
@@ -218,4 +218,4 @@ def test_numbers_longer_than_those_of_numpy_are_looked_at(tmp_path: Path) -> Non
     pairs = SimpleNamespace(frame=np.array([0, 1]), feature=np.array([0, 1]), y=np.zeros((2, 2)))
     rows_met: Any = SimpleNamespace(pairs=pairs, residual=np.zeros((2, 2)))
     adjusted: Any = SimpleNamespace(weighted=[(rows_met, np.ones(2))])
-    assert sights_of(adjusted, [10**20, 3])[0].frame.tolist() == [np.iinfo(np.intp).max, 3]
+    assert met_detections(adjusted, [10**20, 3])[0].frame.tolist() == [np.iinfo(np.intp).max, 3]

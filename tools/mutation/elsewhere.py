@@ -187,8 +187,8 @@ MUTANTS = (
     Mutant(
         "calibration-few-agree",
         "calibration/telling.py",
-        "are_told = 2 * len(bumped) < len(told)",
-        "are_told = len(told) > 2",
+        "is_decided = 2 * len(bumped) < len(sensors)",
+        "is_decided = len(sensors) > 2",
         "of three cameras that all disagree two are said to have moved",
         ("test_calibration_doubts.py",),
     ),

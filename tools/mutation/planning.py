@@ -107,8 +107,8 @@ _DESIGN = (
     Mutant(
         "design-weighed-by-sigma-alone",
         "design/prediction.py",
-        "NoiseModel().errors.counted(shown)",
-        "1 + 0 * shown",
+        "NoiseModel().errors.counted(ratios)",
+        "1 + 0 * ratios",
         "the prediction is worse than a run that has seen the noise of its sensors",
     ),
     Mutant(

@@ -72,8 +72,8 @@ MUTANTS = (
     Mutant(
         "calibration-bodies-beside-are-taken-for-it",
         "calibration/calibrate.py",
-        "        best = _as_it_stands(task, rules, progress)\n",
-        "        best = None\n",
+        "        run = _run_from_session(task, rules, progress)\n",
+        "        run = None\n",
         "each camera is searched alone, and may take another body for the one that is sought",
         ("test_calibration.py",),
     ),

@@ -1,8 +1,8 @@
-"""Calibration: the objective maximised over sensors and body, without correspondences.
+"""Calibration: maximise the objective over sensors and body, without correspondences.
 
-detections  →  all sensors together, where they stand about as told  →  start of all poses
-            or each camera alone (hypotheses)  →  links between sensors  →  start of all poses
-→  rig and poses together, through narrowing blurs (least squares with soft pairs)
+detections  →  poses by all sensors together, if they stand about where the session has them
+            or by each camera alone (hypotheses), which link the cameras  →  start of all poses
+→  rig and poses adjusted together, at narrowing blurs (least squares with soft pairs)
 →  what is determined, how well, and whether frames held back agree
 """
 

@@ -1,9 +1,9 @@
 """Maximise the matched objective over rig and poses, through narrowing blurs.
 
 At each blur the objective is climbed by Gauss-Newton; the blurs end at twice the noise that the
-residuals show, which is learnt on the way.  Pairs are known by then, and the last steps weigh them
-as Cauchy errors: where sensors are out of step, a frame that is far off is less wrong than it is
-far, and a Gaussian kernel would drop it.
+residuals show, which is estimated on the way.  Pairs are known by then, and the last steps weigh
+them as Cauchy errors: if sensors are out of step, the errors of a frame far off are smaller than
+they look, and a Gaussian kernel would drop it.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mixpose.calibration.bundle import Bundle, Weighted, rows_of, solved, stepped
+from mixpose.calibration.bundle import Bundle, Weighted, apply_step, rows_of, solve_step
 from mixpose.calibration.matching import feature_spacing, match, nearest_distance
 from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats, Mask
 
 MET = 0.05
-"""Weight of a pair: 5 standard deviations off have 0.2."""
+"""Least weight of a pair that is met: pairs 5 standard deviations off have 0.2."""
 
 _MOST_BLURS = 40
-_UNKNOWN = 0.1  # of a parameter's squared length along directions that are not determined
-_SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
-_BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
-_FARTHEST = 0.3  # rad: the linear model reaches no farther
+_UNKNOWN = 0.1  # of a parameter's squared length along undetermined directions
+_SHARPEST = 1e-3  # of σ_ε: least noise, of data without any
+_BLUNTEST = 2.0  # of σ_ε: largest noise, as σ_ε is the largest error of the extraction
+_FARTHEST = 0.3  # rad: largest turn of a step, as the linear model reaches no farther
 _CLIMBS = 12
-_CLIMBED = 1e-6  # of the squared residuals: less gained, and poses are fitted
+_CLIMBED = 1e-6  # of the squared residuals: with a smaller gain, the fit has converged
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,36 +38,36 @@ class Adjusted:
     state: State
     noise: Floats  # (L,): standard deviation of a detection's coordinate by sensor
     covariance: Floats  # (G, G): of the free parameters, in the gauge
-    unknown: Floats  # (G, u): directions that are not determined, in the parameters' sizes
-    weighted: tuple[Weighted, ...]  # of each sensor; weights are 1 for what agrees
-    inflation: float  # of variances, over what independent errors of detections make of them
+    unknown: Floats  # (G, u): undetermined directions, in the parameters' sizes
+    weighted: tuple[Weighted, ...]  # by sensor; the weight of a pair that agrees is 1
+    inflation: float  # of variances, relative to those by independent errors of detections
 
     @property
     def undetermined(self) -> Mask:
-        """Parameters (G,) of which data tell nothing."""
+        """Return a mask of the parameters (G,) that data do not determine."""
         return np.asarray((self.unknown**2).sum(axis=1) > _UNKNOWN)
 
     @property
     def deviations(self) -> Floats:
-        """Standard deviations of the parameters (G,); infinite where not determined."""
-        told = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return np.where(self.undetermined, np.inf, told)
+        """Return standard deviations of the parameters (G,); infinite if not determined."""
+        deviations = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return np.where(self.undetermined, np.inf, deviations)
 
     @property
     def certainty(self) -> float:
-        """Share of the weight of pairs of which each is the nearest that the other has."""
+        """Return the share of the weight of pairs that are the nearest to each other."""
         nearest = sum(float(weight @ rows.pairs.nearest) for rows, weight in self.weighted)
         return nearest / max(sum(float(weight.sum()) for _, weight in self.weighted), 1e-9)
 
 
 def _first_blurs(bundle: Bundle, state: State) -> Floats:
-    """Blurs (L,) to begin with: wide enough for what the start is off, not for neighbours."""
+    """Return first blurs (L,), wide enough for errors of the start and not for neighbours."""
     rules, blurs = bundle.rules, np.array(bundle.sigmas, dtype=np.float64)
     for sensor, sigma in enumerate(bundle.sigmas):
-        off = nearest_distance(state, bundle.frames, bundle.clock, sensor)
-        if len(off):
+        distances = nearest_distance(state, bundle.frames, bundle.clock, sensor)
+        if len(distances):
             widest = rules.widest * feature_spacing(state, sensor)
-            wanted = rules.first_blur * float(np.median(off))
+            wanted = rules.first_blur * float(np.median(distances))
             blurs[sensor] = max(min(wanted, widest), _SHARPEST * sigma)
     return blurs
 
@@ -77,48 +77,47 @@ def adjust(
 ) -> Adjusted:
     """Climb from a start to the maximum.
 
-    The blurs (L,) to begin with are as the start needs if left out.  Noise (L,) that is given is
-    known, and none is learnt.
+    The first blurs (L,) suit the start if left out.  Noise (L,) is estimated if left out.
     """
     rules = bundle.rules
     blur = _first_blurs(bundle, state) if blurs is None else blurs
     for _ in range(_MOST_BLURS):
         for _ in range(rules.steps):
-            state, _ = _climbed(bundle, state, _weighted(bundle, state, blur, blur)[0])
-        learnt = noise if noise is not None else _noise(bundle, 1.0, state, blur)
-        # features that crowd look like noise at a wide blur, which must not widen it further
-        last = np.minimum(rules.blur * learnt, _widest_alike(state.rig, blur, bundle.sigmas))
+            state, _ = _take_step(bundle, state, _weighted_pairs(bundle, state, blur, blur)[0])
+        estimate = noise if noise is not None else _estimate_noise(bundle, 1.0, state, blur)
+        # crowded features look like noise at a wide blur, which must not widen it further
+        last = np.minimum(rules.blur * estimate, _widest_alike(state.rig, blur, bundle.sigmas))
         if (blur <= last / rules.narrowing).all():
             break
         blur = np.maximum(blur * rules.narrowing, last)
     if noise is not None:
-        return _ended(bundle, state, noise, None)
-    found = _ended(bundle, state, last / rules.blur, 1.0)
-    if found.inflation > 1:
-        return found
-    return _ended(bundle, found.state, found.noise, rules.unlike)
+        return _finish(bundle, state, noise, None)
+    adjusted = _finish(bundle, state, last / rules.blur, 1.0)
+    if adjusted.inflation > 1:
+        return adjusted
+    return _finish(bundle, adjusted.state, adjusted.noise, rules.unlike)
 
 
 def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
-    """Of each sensor (L,) the widest blur, by σ_ε, of sensors of its kind."""
-    units = np.array([eye.unit for eye in rig.sensors])
+    """Return the widest blur, by σ_ε, of sensors of the same kind for each sensor (L,)."""
+    units = np.array([sensor.unit for sensor in rig.sensors])
     return np.array([sigma * (blur / sigmas)[units == u].max() for sigma, u in zip(sigmas, units)])
 
 
-def _ended(bundle: Bundle, state: State, noise: Floats, unlike: float | None) -> Adjusted:
-    """The last steps, at the noise that is learnt as of `_noise`; None: that is known."""
+def _finish(bundle: Bundle, state: State, noise: Floats, unlike: float | None) -> Adjusted:
+    """Take the last steps; estimate noise by `_noise` with `unlike`, unless that is None."""
     rules = bundle.rules
     most = rules.unlike * noise
     for _ in range(rules.last_steps):
-        weighted, _ = weighted_at_the_end(bundle, state, noise)
-        state, size = _climbed(bundle, state, weighted)
+        weighted, _ = final_weights(bundle, state, noise)
+        state, size = _take_step(bundle, state, weighted)
         before = noise
         if unlike is not None:
-            noise = np.minimum(_noise(bundle, unlike, state, rules.blur * noise), most)
+            noise = np.minimum(_estimate_noise(bundle, unlike, state, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
-    weighted, alone = weighted_at_the_end(bundle, state, noise)
-    step = solved(bundle, state, weighted)
+    weighted, alone = final_weights(bundle, state, noise)
+    step = solve_step(bundle, state, weighted)
     scattered = step.covariance * variance_ratio(state.rig, rules)
     inflation = _inflation(bundle, weighted, scattered)
     covariance = scattered * inflation + step.of_held
@@ -126,25 +125,25 @@ def _ended(bundle: Bundle, state: State, noise: Floats, unlike: float | None) ->
     return Adjusted(state, noise, covariance, step.unknown, pairs, inflation)
 
 
-def weighted_at_the_end(
+def final_weights(
     bundle: Bundle, state: State, noise: Floats
 ) -> tuple[list[Weighted], list[Floats]]:
-    """Pairs as the last steps weigh them; and by the objective alone."""
-    return _weighted(bundle, state, bundle.rules.blur * noise, noise, last=True)
+    """Return pairs with weights of the last steps, and weights (n,) of the objective alone."""
+    return _weighted_pairs(bundle, state, bundle.rules.blur * noise, noise, last=True)
 
 
-def moved_by_held(bundle: Bundle, found: Adjusted) -> Floats:
-    """Standard deviations (G,) of the rig's parameters that come of errors of what is held."""
-    weighted, _ = weighted_at_the_end(bundle, found.state, found.noise)
-    return np.asarray(np.sqrt(np.diag(solved(bundle, found.state, weighted).of_held)))
+def deviations_by_held(bundle: Bundle, adjusted: Adjusted) -> Floats:
+    """Return standard deviations (G,) of the rig's parameters by errors of held parameters."""
+    weighted, _ = final_weights(bundle, adjusted.state, adjusted.noise)
+    return np.asarray(np.sqrt(np.diag(solve_step(bundle, adjusted.state, weighted).of_held)))
 
 
-def _weighted(
+def _weighted_pairs(
     bundle: Bundle, state: State, blur: Floats, noise: Floats, *, last: bool = False
 ) -> tuple[list[Weighted], list[Floats]]:
-    """Pairs of all sensors, weighted by the objective and the noise; and by the objective alone."""
+    """Return pairs of all sensors with weights, and their weights by the objective alone."""
     rules = bundle.rules
-    found: list[Weighted] = []
+    weighted: list[Weighted] = []
     alone: list[Floats] = []
     faintest = rules.faintest_last if last else rules.faintest
     for sensor in range(len(state.rig.sensors)):
@@ -156,13 +155,13 @@ def _weighted(
         alone.append(weight)
         if last:
             weight = share / (1 + squared / (rules.tail * noise[sensor]) ** 2)
-        found.append((rows, weight / noise[sensor] ** 2))
-    return found, alone
+        weighted.append((rows, weight / noise[sensor] ** 2))
+    return weighted, alone
 
 
-def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tuple[State, float]:
-    """One step; its size in standard deviations of the rig's parameters."""
-    step = solved(bundle, state, weighted, 1e-9)
+def _take_step(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tuple[State, float]:
+    """Take a step; return the state and the step's size in standard deviations of the rig."""
+    step = solve_step(bundle, state, weighted, 1e-9)
     is_turn = [unit == "rad" for block in bundle.blocks for unit in block.units]
     turns = np.concatenate([step.poses[:, 3:].ravel(), step.rig[is_turn]])
     largest = float(np.abs(turns).max(initial=0.0))
@@ -170,49 +169,49 @@ def _climbed(bundle: Bundle, state: State, weighted: Sequence[Weighted]) -> tupl
         share = _FARTHEST / largest
         step = replace(step, rig=step.rig * share, poses=step.poses * share)
     deviations = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
-    moved = step.rig[deviations > 0] / deviations[deviations > 0]
-    size = float(np.abs(moved).max(initial=0.0))
+    ratios = step.rig[deviations > 0] / deviations[deviations > 0]
+    size = float(np.abs(ratios).max(initial=0.0))
     if not bundle.count:
         size = float(np.abs(step.poses).max(initial=0.0)) * 1e3
-    return stepped(bundle, state, step), size
+    return apply_step(bundle, state, step), size
 
 
-def _noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
-    """Standard deviation of detections (L,) from residuals under a Gaussian weight."""
-    # that of a sensor is like that of others of its kind, within the factor `unlike`. Where frames
-    # err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it
-    # had no noise at all
+def _estimate_noise(bundle: Bundle, unlike: float, state: State, blur: Floats) -> Floats:
+    """Estimate standard deviations of detections (L,) from residuals under a Gaussian weight."""
+    # noise of a sensor is that of its kind, within the factor `unlike`. If whole frames are off the
+    # factor is 1: else poses would be drawn to the sensor that happens to fit best until it had no
+    # noise at all
     rules, sigmas, sensors = bundle.rules, bundle.sigmas, state.rig.sensors
-    count, spent = np.zeros((2, len(sensors)))
-    weighted, alone = _weighted(bundle, state, blur, np.ones(len(blur)))
+    count, squares = np.zeros((2, len(sensors)))
+    weighted, alone = _weighted_pairs(bundle, state, blur, np.ones(len(blur)))
     for s, ((rows, _), weight) in enumerate(zip(weighted, alone, strict=True)):
         near = weight * rows.pairs.nearest
         count[s] = sensors[s].dimension * float(near.sum())
-        spent[s] = near @ (rows.residual**2).sum(axis=1)
+        squares[s] = near @ (rows.residual**2).sum(axis=1)
     unknowns = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
-    used = unknowns / np.maximum(blur**2 * (count / blur**2).sum(), 1.0)
-    left = count * (1 - np.minimum(used, 0.9))
-    found = np.array(sigmas, dtype=np.float64)
-    units = np.array([eye.unit for eye in sensors])
+    used_share = unknowns / np.maximum(blur**2 * (count / blur**2).sum(), 1.0)
+    freedom = count * (1 - np.minimum(used_share, 0.9))
+    noise = np.array(sigmas, dtype=np.float64)
+    units = np.array([sensor.unit for sensor in sensors])
     for unit in sorted(set(units)):
-        alike = units == unit
-        if count[alike].sum() <= 6:
+        is_kind = units == unit
+        if count[is_kind].sum() <= 6:
             continue
-        scaled = spent[alike] / sigmas[alike] ** 2
-        common = scaled.sum() / left[alike].sum()
-        own = (scaled + rules.alike * common) / (left[alike] + rules.alike)
-        tilted = np.clip(own, common / unlike**2, common * unlike**2)
-        # a Gaussian of variance s² under the weight exp(-d²/4b²) has 1/(1/s² + 1/2b²)
-        width = blur[alike] / sigmas[alike]
-        inverse = np.maximum(1 / np.maximum(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
-        found[alike] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
-    return found
+        scaled = squares[is_kind] / sigmas[is_kind] ** 2
+        kind_variance = scaled.sum() / freedom[is_kind].sum()
+        variance = (scaled + rules.alike * kind_variance) / (freedom[is_kind] + rules.alike)
+        bounded = np.clip(variance, kind_variance / unlike**2, kind_variance * unlike**2)
+        # a Gaussian of variance s² under the weight exp(-d²/4b²) has variance 1/(1/s² + 1/2b²)
+        width = blur[is_kind] / sigmas[is_kind]
+        inverse = np.maximum(1 / np.maximum(bounded, 1e-300) - 1 / (2 * width**2), 1e-300)
+        noise[is_kind] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
+    return noise
 
 
 def variance_ratio(rig: Rig, rules: CalibrationRules) -> float:
-    """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations."""
-    dimension, tail = float(np.mean([eye.dimension for eye in rig.sensors])), rules.tail
-    # of Gaussian errors with radius r in their deviations, whose weight is w = 1/(1 + r²/c²):
+    """Return the covariance of an M-estimator with Cauchy weights over its inverse information."""
+    dimension, tail = float(np.mean([sensor.dimension for sensor in rig.sensors])), rules.tail
+    # for Gaussian errors, r standard deviations off, with weights w = 1/(1 + r²/c²):
     # E[w² r²/m] E[w] / E[w + w' r/m]²
     r = np.linspace(0, 10, 2001)
     density = r ** (dimension - 1) * np.exp(-(r**2) / 2)
@@ -224,51 +223,52 @@ def variance_ratio(rig: Rig, rules: CalibrationRules) -> float:
 
 
 def _inflation(bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats) -> float:
-    """By how much frames differ more than independent errors of detections would let them."""
-    # each frame's pull on the rig has the covariance of its information S; a common error of its
-    # detections, as of a sensor out of step, makes it larger. The fit takes S C S of it away
-    rank, seen, spent = float(np.linalg.matrix_rank(covariance)), 0.0, 0.0
+    """Return the factor by which frames vary more than by independent errors of detections."""
+    # the gradient of a frame by the rig has the covariance of its information S, unless a common
+    # error of its detections, as of a sensor out of step, makes it larger. The fit absorbs S C S
+    rank, observed, absorbed = float(np.linalg.matrix_rank(covariance)), 0.0, 0.0
     for frame in range(len(bundle.frames)):
-        r, A, B = _of_frame(bundle, weighted, frame)
+        r, A, B = _frame_equations(bundle, weighted, frame)
         A = A - B @ np.linalg.lstsq(B, A, rcond=None)[0]
-        pull, share = A.T @ r, covariance @ (A.T @ A)
-        seen += float(pull @ covariance @ pull)
-        spent += float((share * share.T).sum())
-    return seen / (rank - spent) if seen > 1.3 * (rank - spent) and spent < rank / 2 else 1.0
+        gradient, share = A.T @ r, covariance @ (A.T @ A)
+        observed += float(gradient @ covariance @ gradient)
+        absorbed += float((share * share.T).sum())
+    expected = rank - absorbed
+    return observed / expected if observed > 1.3 * expected and absorbed < rank / 2 else 1.0
 
 
-def _of_frame(
+def _frame_equations(
     bundle: Bundle, weighted: Sequence[Weighted], frame: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Residuals (n,) of a frame, by the rig (n, G) and by its pose (n, d), in deviations."""
+    """Return residuals (n,) of a frame, Jacobians (n, G) and (n, d), in standard deviations."""
     parts = []
     for rows, weight in weighted:
-        own = rows.pairs.frame == frame
-        root = np.sqrt(weight[own])[:, None, None]
-        by_pose = rows.by_pose[own][:, :, bundle.pose_free]
-        each = (rows.residual[own][..., None], rows.by_rig[own], by_pose)
-        parts.append(np.concatenate([root * one for one in each], axis=2))
-    told = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
-    return told[:, 0], told[:, 1 : 1 + bundle.count], told[:, 1 + bundle.count :]
+        in_frame = rows.pairs.frame == frame
+        root = np.sqrt(weight[in_frame])[:, None, None]
+        by_pose = rows.by_pose[in_frame][:, :, bundle.pose_free]
+        columns = (rows.residual[in_frame][..., None], rows.by_rig[in_frame], by_pose)
+        parts.append(np.concatenate([root * column for column in columns], axis=2))
+    joined = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
+    return joined[:, 0], joined[:, 1 : 1 + bundle.count], joined[:, 1 + bundle.count :]
 
 
-def fitted(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
-    """How far a bundle's parameters go (G,) from a rig to suit pairs best, with poses.
+def fit_pairs(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> tuple[Floats, list[Floats]]:
+    """Fit a bundle's parameters and poses to known pairs; return the parameters' whole step (G,).
 
-    And squared residuals (n,) of each sensor's pairs then; NaN of pairs that are not met.
+    Also return squared residuals (n,) of each sensor's pairs; NaN of pairs that are not met.
     """
-    state, spent, gone = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
+    state, misfit, change = State(rig, adjusted.state.poses), np.inf, np.zeros(bundle.count)
     for _ in range(_CLIMBS):
         rows = list[Weighted]()
-        for s, (seen, weight) in enumerate(adjusted.weighted):
-            found = rows_of(bundle, state, s, seen.pairs)
-            rows.append((found, (weight > MET) * found.known / adjusted.noise[s] ** 2))
-        squared = [(found.residual**2).sum(axis=1) for found, _ in rows]
+        for s, (known, weight) in enumerate(adjusted.weighted):
+            current = rows_of(bundle, state, s, known.pairs)
+            rows.append((current, (weight > MET) * current.known / adjusted.noise[s] ** 2))
+        squared = [(r.residual**2).sum(axis=1) for r, _ in rows]
         weighed = zip(rows, squared, strict=True)
-        before, spent = spent, sum(float(weight @ each) for (_, weight), each in weighed)
-        if before - spent < _CLIMBED * spent or not bundle.pose_free.any():
+        before, misfit = misfit, sum(float(weight @ values) for (_, weight), values in weighed)
+        if before - misfit < _CLIMBED * misfit or not bundle.pose_free.any():
             break
-        step = solved(bundle, state, rows, 1e-6)
-        state, gone = stepped(bundle, state, step), gone + step.rig
+        step = solve_step(bundle, state, rows, 1e-6)
+        state, change = apply_step(bundle, state, step), change + step.rig
     pairs = zip(rows, squared, strict=True)
-    return gone, [np.where(w > 0, each, np.nan) for (_, w), each in pairs]
+    return change, [np.where(w > 0, values, np.nan) for (_, w), values in pairs]

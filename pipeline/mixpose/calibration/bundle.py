@@ -1,8 +1,8 @@
 """Rig and poses together: Gauss-Newton on the matched objective of all frames and sensors.
 
 The unknowns are the free parameters of the rig (G) and a pose per frame.  Poses meet each other
-only where motion between frames is interpolated, so that they are eliminated by sparse factors
-and a dense system of G remains (Schur complement).
+only where motion between frames is interpolated, so that they are eliminated by sparse factors and
+a dense system of G remains (Schur complement).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from mixpose.calibration.matching import Clock, Pairs, clock_of, interpolate
-from mixpose.calibration.rig import Block, Rig, State, by_parameters, moved
+from mixpose.calibration.rig import Block, Rig, State, moved, parameter_jacobian
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame
 from mixpose.objective.projection import pose_jacobian
@@ -28,42 +28,42 @@ from mixpose.sensors import CalibrationError, by_calibration, doubted
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """What stays the same while a rig is adjusted."""
+    """The constants of an adjustment: frames, free parameters, conditions and rules."""
 
     frames: tuple[SeenFrame, ...]
     blocks: tuple[Block, ...]  # free parameters of the rig
-    pose_free: Mask  # (6,): world directions of the poses that are free; none where poses are known
+    pose_free: Mask  # (6,): world directions of poses that are free; none if poses are known
     gauge: Callable[[Rig], Floats]  # conditions (r, G) on a step, in the parameters' sizes
     sigmas: Floats  # (L,): σ_ε by sensor
     rules: CalibrationRules
-    errors: Mapping[int, CalibrationError] = field(default_factory=dict)  # of what is held
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)  # of held parameters
 
     @cached_property
     def clock(self) -> Clock:
-        """When sensors look."""
+        """Return the times of sensors."""
         return clock_of(self.frames, len(self.sigmas), self.rules.gap)
 
     @property
     def count(self) -> int:
-        """Free parameters of the rig, G."""
+        """Return G, the number of free parameters of the rig."""
         return sum(len(block.names) for block in self.blocks)
 
     @property
     def scales(self) -> Floats:
-        """Sizes of the parameters (G,)."""
+        """Return the sizes of the parameters (G,)."""
         return np.array([scale for block in self.blocks for scale in block.scales])
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Residuals of one sensor's pairs with their Jacobians."""
+    """Residuals of a sensor's pairs with their Jacobians."""
 
     pairs: Pairs
     residual: Floats  # (n, m): detected minus predicted
     by_pose: Floats  # (n, m, 6): by the pose at the moment of the sensor
-    shares: Floats  # (n, 4): by how much that pose follows those of the clock's nodes
+    shares: Floats  # (n, 4): weights of the clock's nodes in that pose
     by_rig: Floats  # (n, m, G)
-    by_held: Floats  # (n, m, c): by what is held, of a standard deviation each
+    by_held: Floats  # (n, m, c): by held parameters, per standard deviation
     known: Mask  # (n,): whether the moment of the sensor is known
 
 
@@ -72,68 +72,68 @@ Weighted: TypeAlias = tuple[Rows, Floats]
 
 
 def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
-    """Residuals and Jacobians of one sensor."""
+    """Return residuals and Jacobians of a sensor's pairs."""
     rig, clock, frame = state.rig, bundle.clock, pairs.frame
-    eye, tau = rig.sensors[sensor], clock.tau(rig, sensor, frame, pairs.y)
-    at, n = state.poses[frame], len(tau)
-    timed = any(b.sensor == sensor and b.kind in ("delay", "drift") for b in bundle.blocks)
+    geometry, tau = rig.sensors[sensor], clock.tau(rig, sensor, frame, pairs.y)
+    poses, n = state.poses[frame], len(tau)
+    is_timed = any(b.sensor == sensor and b.kind in ("delay", "drift") for b in bundle.blocks)
     rate, shares, known = np.zeros((n, 6)), np.eye(1, 4).repeat(n, axis=0), np.ones(n, np.bool_)
-    if timed or tau.any():
+    if is_timed or tau.any():
         between = interpolate(clock, state.poses, frame, tau)
-        at, rate, shares = perturb(at, between.twist), between.rate, between.shares
+        poses, rate, shares = perturb(poses, between.twist), between.rate, between.shares
         known = between.known | (np.abs(tau) < 1e-9)
-    arms = np.einsum("nij,nj->ni", at[:, :3, :3], rig.points[pairs.feature])
-    world = arms + at[:, :3, 3]
-    y, by_world, visible = eye.linearise(world)
-    y = y + rig.beside(sensor, state.poses)[frame, pairs.feature]
+    arms = np.einsum("nij,nj->ni", poses[:, :3, :3], rig.points[pairs.feature])
+    world = arms + poses[:, :3, 3]
+    y, by_world, visible = geometry.linearise(world)
+    y = y + rig.centre_offsets(sensor, state.poses)[frame, pairs.feature]
     by_pose = pose_jacobian(by_world, arms)
     by_rig = np.zeros((*y.shape, bundle.count))
     for block in bundle.blocks:
         if block.kind == "body":
             columns = block.start + 3 * pairs.feature[:, None] + np.arange(3)
             columns = np.broadcast_to(columns[:, None], by_world.shape)
-            np.put_along_axis(by_rig, columns, by_world @ at[:, :3, :3], axis=2)
+            np.put_along_axis(by_rig, columns, by_world @ poses[:, :3, :3], axis=2)
         elif block.sensor != sensor:
             continue
         elif block.kind in ("delay", "drift"):
             J = np.einsum("nmk,nk->nm", by_pose, rate)[..., None]
             if block.kind == "drift":
-                J = J * clock.since[sensor, frame][:, None, None]
+                J = J * clock.elapsed[sensor, frame][:, None, None]
             by_rig[:, :, block.place] = J
         else:
-            by_rig[:, :, block.place] = by_parameters(eye, block.kind, world, by_world)
+            by_rig[:, :, block.place] = parameter_jacobian(geometry, block.kind, world, by_world)
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
-        by_held = by_calibration(doubted(eye, bundle.errors[sensor]), world)
+        by_held = by_calibration(doubted(geometry, bundle.errors[sensor]), world)
     return Rows(pairs, pairs.y - y, by_pose, shares, by_rig, by_held, known & visible)
 
 
 def normal_equations(
     bundle: Bundle, weighted: Sequence[Weighted], damping: float
 ) -> tuple[Floats, Floats, Floats, Callable[[Floats], Floats]]:
-    """The normal equations S δ = b of the rig (G, G), poses eliminated."""
-    # beside S there is the information (G, C) between the rig and what is held, beside b the poses'
-    # step that belongs to one of the rig. Weights include the inverse variance; a share of the
-    # diagonal is added to the poses' part
+    """Return the normal equations S δ = b of the rig (G, G), with poses eliminated."""
+    # also the information (G, C) between the rig and held parameters, and a function from a step of
+    # the rig to that of the poses. Weights include the inverse variance; `damping` is the share of
+    # the diagonal that is added to the poses' part
     G, free = bundle.count, np.flatnonzero(bundle.pose_free)
     P = len(free) * len(bundle.frames)
     edges = G + np.cumsum([0] + [rows.by_held.shape[2] for rows, _ in weighted])
-    Q = int(edges[-1])  # parameters that are free and that are held
-    # of all sensors at once: what SciPy does beside the sums takes longer than these
+    Q = int(edges[-1])  # number of free and held parameters
+    # all sensors at once, as overhead of SciPy takes longer than the sums
     A = np.zeros((sum(rows.residual.size for rows, _ in weighted), Q))
     parts, r, done = [], np.zeros(len(A)), 0
     for (rows, weight), start, stop in zip(weighted, edges, edges[1:]):
         root, size = np.sqrt(weight)[:, None, None], rows.residual.size
-        own = slice(done, done + size)
-        A[own, :G] = (rows.by_rig * root).reshape(size, G)
-        A[own, start:stop] = (rows.by_held * root).reshape(size, stop - start)
-        r[own] = (rows.residual * root[:, 0]).ravel()
+        sensor_rows = slice(done, done + size)
+        A[sensor_rows, :G] = (rows.by_rig * root).reshape(size, G)
+        A[sensor_rows, start:stop] = (rows.by_held * root).reshape(size, stop - start)
+        r[sensor_rows] = (rows.residual * root[:, 0]).ravel()
         parts.append(_pose_columns(rows, bundle.clock, root, free))
         done += size
     H_gg, b_g = A.T @ A, A.T @ r
     if not P:
         return H_gg[:G, :G], H_gg[:G, G:], b_g[:G], lambda step: np.zeros(0)
-    values, columns, filled = (np.concatenate(each) for each in zip(*parts, strict=True))
+    values, columns, filled = (np.concatenate(part) for part in zip(*parts, strict=True))
     B = sp.csr_matrix((values, columns, np.append(0, np.cumsum(filled))), shape=(len(A), P))
     H_pp, W, b_p = B.T @ B, B.T @ A, B.T @ r
     diagonal = H_pp.diagonal()
@@ -148,14 +148,14 @@ def normal_equations(
 def _pose_columns(
     rows: Rows, clock: Clock, root: Floats, free: Indices
 ) -> tuple[Floats, Indices, Indices]:
-    """Weighted residuals (n m,) by the free directions of poses: values, where, and how many."""
+    """Return weighted Jacobians (n m,) by free directions of poses: values, columns, and counts."""
     n, m = rows.residual.shape
     d = len(free)
-    used = [0] if not rows.shares[:, 1:].any() else [0, 1, 2, 3]
-    J = (rows.by_pose[:, :, free] * root)[:, :, None] * rows.shares[:, None, used, None]
-    place = clock.nodes[rows.pairs.frame][:, used, None] * d + np.arange(d)
-    columns = np.repeat(place.reshape(n, 1, d * len(used)), m, axis=1)
-    return J.ravel(), columns.ravel(), np.full(n * m, d * len(used))
+    nodes = [0] if not rows.shares[:, 1:].any() else [0, 1, 2, 3]
+    J = (rows.by_pose[:, :, free] * root)[:, :, None] * rows.shares[:, None, nodes, None]
+    columns = clock.nodes[rows.pairs.frame][:, nodes, None] * d + np.arange(d)
+    repeated = np.repeat(columns.reshape(n, 1, d * len(nodes)), m, axis=1)
+    return J.ravel(), repeated.ravel(), np.full(n * m, d * len(nodes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,26 +164,26 @@ class Step:
 
     rig: Floats  # (G,)
     poses: Floats  # (K, 6)
-    covariance: Floats  # (G, G): of the rig, in the gauge, without what is not determined
-    of_held: Floats  # (G, G): what errors of the held parameters add to it
-    unknown: Floats  # (G, u): directions that are not determined, in units of the parameters' sizes
+    covariance: Floats  # (G, G): of the rig, in the gauge, without undetermined directions
+    of_held: Floats  # (G, G): added to it by errors of held parameters
+    unknown: Floats  # (G, u): undetermined directions, in units of the parameters' sizes
 
 
-def solved(
+def solve_step(
     bundle: Bundle, state: State, weighted: Sequence[Weighted], damping: float = 0.0
 ) -> Step:
-    """Solve within the gauge, leaving alone what the data do not determine."""
+    """Solve for a step within the gauge that leaves undetermined directions alone."""
     S, held, b, poses_step = normal_equations(bundle, weighted, damping)
     scales = bundle.scales
     S = S * np.outer(scales, scales)
     basis = _complement(bundle.gauge(state.rig), len(scales))
     inner = basis.T @ S @ basis
-    pulls = scales[:, None] * held  # of held parameters that are a standard deviation off
-    # where held parameters are off, a solution x = I⁻¹ b has the covariance I⁻¹ (I + P Pᵀ) I⁻¹
-    told, off = inner, basis.T @ pulls
-    if off.any():
-        told = inner @ np.linalg.pinv(inner + off @ off.T) @ inner
-    values, vectors = np.linalg.eigh(told)
+    pulls = scales[:, None] * held  # by held parameters that are a standard deviation off
+    # with errors of held parameters, a solution x = I⁻¹ b has the covariance I⁻¹ (I + P Pᵀ) I⁻¹
+    information, P = inner, basis.T @ pulls
+    if P.any():
+        information = inner @ np.linalg.pinv(inner + P @ P.T) @ inner
+    values, vectors = np.linalg.eigh(information)
     known = values > 1.0 / bundle.rules.undetermined**2
     V = basis @ vectors[:, known]
     covariance = V @ np.linalg.inv(V.T @ S @ V) @ V.T
@@ -201,7 +201,7 @@ def solved(
 
 
 def _complement(gauge: Floats, count: int) -> Floats:
-    """Orthonormal columns (G, G − r) across the rows of the gauge."""
+    """Return orthonormal columns (G, G − r) across the rows (r, G) of the gauge."""
     if not len(gauge):
         return np.eye(count)
     _, s, Vt = np.linalg.svd(gauge)
@@ -209,7 +209,7 @@ def _complement(gauge: Floats, count: int) -> Floats:
     return np.asarray(Vt[rank:].T)
 
 
-def stepped(bundle: Bundle, state: State, step: Step) -> State:
-    """Rig and poses after a step."""
+def apply_step(bundle: Bundle, state: State, step: Step) -> State:
+    """Return rig and poses after a step."""
     rig, poses = moved(state.rig, bundle.blocks, step.rig), state.poses
     return State(rig, perturb(poses, step.poses) if bundle.pose_free.any() else poses)

@@ -1,8 +1,8 @@
-"""What a calibration found, how closely it meets what was seen, and which sensor was bumped.
+"""The result of a calibration, its residuals, and which sensors were bumped.
 
-A new calibration from the recording says by how much every sensor is off, relative to the others,
-and how sure that is.  Moving all sensors together is no matter: what counts is each sensor against
-the consensus of the rest.
+A new calibration from the recording shows how far each sensor is off, relative to the others, and
+how sure that is.  A motion of all sensors together does not matter: each sensor is compared with
+the consensus of all.
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError
 
 HELD_LENS = CalibrationError(focal=1e-3, principal_point=1.0)
-"""What a lens that was calibrated by itself is easily off by."""
+"""Usual error of a lens that was calibrated by itself."""
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Root mean square residuals of one sensor, sensor units; NaN without any."""
+    """Root mean square residuals of a sensor, in its units; NaN without any."""
 
-    before: float  # with the calibration before
+    before: float  # with the calibration of the session
     after: float
-    held: float  # of every frame, with the calibration that the others tell: that of new data
+    held: float  # of frames held back, with the calibration from the others: that of new data
 
 
 @dataclass(frozen=True, eq=False)
-class Sights:
-    """All that one sensor saw and met, for pictures and lists."""
+class MetDetections:
+    """Detections of a sensor that features met, for pictures and lists."""
 
-    y: Floats  # (n, m): detections that were met
-    offset: Floats  # (n, m): detected minus predicted, after
+    y: Floats  # (n, m): places of the detections
+    offset: Floats  # (n, m): detected minus predicted, after the calibration
     frame: Indices  # (n,): frame numbers
     feature: Indices  # (n,)
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration with all that tells whether to trust it."""
+    """A calibration, its covariance, and the evidence for or against it."""
 
     before: Rig
     after: Rig
@@ -60,169 +60,167 @@ class Calibration:
     gauge: tuple[str, ...]  # freedoms of the rig that were removed
     through: Mapping[int, tuple[int | None, int]]  # as of `Start`
     unlinked: tuple[int, ...]
-    used: tuple[int, ...]  # numbers of the frames that are calibrated from
-    bad: tuple[int, ...]  # and of those left out
+    used: tuple[int, ...]  # numbers of the frames that were used
+    bad: tuple[int, ...]  # numbers of the frames that were left out as bad
     recorded: int  # frames of the recording with detections
     residuals: Mapping[int, Residual]
     noise: Floats  # (L,)
     inflation: float
-    certainty: float  # as of `Adjusted`: near 1, or detections cannot be told apart
-    # (G,): standard deviations that come of what is held of sensors of which nothing is stated:
-    # biases of ranges as large as σ_ε, and lenses that are off by `HELD_LENS`
+    certainty: float  # as of `Adjusted`: near 1, unless features cannot be told apart
+    # (G,): standard deviations by held parameters whose errors are not stated: biases of ranges as
+    # large as σ_ε, and lenses that are off by `HELD_LENS`
     moved_by_biases: Floats
     moved_by_lenses: Floats
-    explained: Floats  # (L,): share of what each could show that the objective has met; NaN without
-    sights: Mapping[int, Sights]
+    explained: Floats  # (L,): share of detections met, as of `explained_share`
+    met: Mapping[int, MetDetections]  # by sensor
     poses: Mapping[int, Floats]  # (4, 4), by frame number
-    contradicted: Contradiction | None = None  # what is held, and the recording says otherwise
-    T_new_old: Floats | None = None  # (4, 4): to the world of `after`, where it is another one
+    contradicted: Contradiction | None = None  # held parameters that the recording contradicts
+    T_new_old: Floats | None = None  # (4, 4): to the world of `after`, if it was changed
 
     @property
     def are_linked(self) -> bool:
-        """Whether frames that sensors share link all of them."""
-        parts = list[set[int]]()  # frames of sensors that are linked
-        for one in self.sights.values():
-            own = set(one.frame.tolist())
-            shared = [part for part in parts if part & own]
-            parts = [part for part in parts if not part & own] + [own.union(*shared)]
-        return len(parts) == 1
+        """Test whether shared frames link all sensors."""
+        groups = list[set[int]]()  # frames of linked sensors
+        for met in self.met.values():
+            frames = set(met.frame.tolist())
+            shared = [group for group in groups if group & frames]
+            groups = [group for group in groups if not group & frames] + [frames.union(*shared)]
+        return len(groups) == 1
 
     def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
-        """Sensors that most likely stand elsewhere: what they saw is not explained."""
+        """Return sensors that probably stand elsewhere, as their detections are not explained."""
         return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))
 
 
 def rms(squared: Sequence[Floats]) -> float:
-    """Root mean square of what is not NaN; NaN of nothing."""
+    """Return the root mean square of all values but NaN; NaN of none."""
     flat = np.concatenate([np.zeros(0), *squared])
     known = np.isfinite(flat)
     return float(np.sqrt(flat[known].mean())) if known.any() else float("nan")
 
 
-def _could_show(frames: Sequence[SeenFrame], task: Task) -> Floats:
-    """Features (K, L) that each sensor could show."""
-    most, sensors = len(task.rig.points), range(len(task.rig.sensors))
-    return np.array([[min(len(f.points.get(s, ())), most) for s in sensors] for f in frames])
+def _matchable_counts(frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Count detections (K, L) by frame and sensor, up to the number of features."""
+    features, sensors = len(task.rig.points), range(len(task.rig.sensors))
+    return np.array([[min(len(f.points.get(s, ())), features) for s in sensors] for f in frames])
 
 
 def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
-    """Share (K,) of the features that frames could show which were met, all sensors together."""
-    met = sum(
-        np.bincount(rows.pairs.frame, weight > MET, len(frames))
-        for rows, weight in adjusted.weighted
-    )
-    return np.asarray(met / np.maximum(_could_show(frames, task).sum(axis=1), 1))
+    """Return the share (K,) of matchable detections met in each frame, by all sensors together."""
+    met = sum(np.bincount(r.pairs.frame, w > MET, len(frames)) for r, w in adjusted.weighted)
+    return np.asarray(met / np.maximum(_matchable_counts(frames, task).sum(axis=1), 1))
 
 
 def explained_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
-    """Share (L,) of what each sensor could show that is met, by the objective; NaN without any."""
-    could = _could_show(frames, task).sum(axis=0)
+    """Return the share (L,) of matchable detections that the objective has met; NaN without any."""
+    matchable = _matchable_counts(frames, task).sum(axis=0)
     met = np.array([weight.sum() for _, weight in adjusted.weighted])
-    return np.asarray(np.where(could > 0, met / np.maximum(could, 1), np.nan))
+    return np.asarray(np.where(matchable > 0, met / np.maximum(matchable, 1), np.nan))
 
 
-def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
-    """What each sensor saw and met."""
-    found, largest = {}, np.iinfo(np.intp).max
+def met_detections(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, MetDetections]:
+    """Return the met detections of each sensor; `numbers` are those of the frames."""
+    met, largest = {}, np.iinfo(np.intp).max
     for s, (rows, weight) in enumerate(adjusted.weighted):
         pairs, kept = rows.pairs, weight > MET
-        # of longer numbers the first digits are enough for people
-        named = np.array([min(n, largest) for n in numbers], dtype=np.intp)[pairs.frame[kept]]
-        found[s] = Sights(pairs.y[kept], rows.residual[kept], named, pairs.feature[kept])
-    return found
+        # longer numbers than NumPy's only serve for display
+        frames = np.array([min(n, largest) for n in numbers], dtype=np.intp)[pairs.frame[kept]]
+        met[s] = MetDetections(pairs.y[kept], rows.residual[kept], frames, pairs.feature[kept])
+    return met
 
 
-def residuals_by(found: Calibration, kind: Literal["frame", "feature"]) -> tuple[Indices, Floats]:
-    """Numbers (n,) of frames or of features, and RMS residuals (n,), in standard deviations."""
+def residuals_by(
+    calibration: Calibration, kind: Literal["frame", "feature"]
+) -> tuple[Indices, Floats]:
+    """Return numbers (n,) of frames or features, and their RMS residuals in standard deviations."""
     keys, squares = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
-    for sensor, sights in found.sights.items():
-        keys.append(getattr(sights, kind))
-        squares.append((sights.offset**2).sum(axis=1) / found.noise[sensor] ** 2)
-    numbers, which = np.unique(np.concatenate(keys), return_inverse=True)
-    return numbers, np.sqrt(np.bincount(which, np.concatenate(squares)) / np.bincount(which))
+    for sensor, met in calibration.met.items():
+        keys.append(getattr(met, kind))
+        squares.append((met.offset**2).sum(axis=1) / calibration.noise[sensor] ** 2)
+    numbers, owners = np.unique(np.concatenate(keys), return_inverse=True)
+    return numbers, np.sqrt(np.bincount(owners, np.concatenate(squares)) / np.bincount(owners))
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far one sensor is from where the old calibration has it."""
+    """How far a sensor is from its pose in the old calibration."""
 
     sensor: int  # its number in the rig
     name: str
-    turn_deg: float  # against the consensus of the sensors, like the shift
+    turn_deg: float  # relative to the consensus of the sensors, like the shift
     shift: float
     turn_deviation_deg: float
     shift_deviation: float
-    residual_before: float  # sensor units; NaN where it met nothing
-    residual_after: float  # of frames that are held back where there are enough
+    residual_before: float  # sensor units; NaN if nothing was met
+    residual_after: float  # of frames held back, if there are enough
     moved: bool
 
 
-def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displacement, ...]:
-    """Compare a calibration with the one it began from: all sensors that share views."""
-    linked = [k for k in range(len(found.after.names)) if k not in found.unlinked]
-    G = _consensus(found.before, found.after, linked)
-    deviations = _deviations(found)
-    told = []
+def displacements(calibration: Calibration, rules: CalibrationRules) -> tuple[Displacement, ...]:
+    """Compare a calibration with the one it began from, for all sensors that share views."""
+    rigs, names = (calibration.before, calibration.after), calibration.after.names
+    linked = [k for k in range(len(names)) if k not in calibration.unlinked]
+    G, deviations, displaced = _consensus(*rigs, linked), _deviations(calibration), []
     for index in linked:
-        turn, shift = _apart(found.before, found.after, index, G)
+        turn, shift = _displacement_of(*rigs, index, G)
         sd_turn, sd_shift = deviations[index]
-        each = found.residuals[index]
-        before, after = each.before, each.held if np.isfinite(each.held) else each.after
-        # where it meets nothing as it was, but does now, it surely stands elsewhere
-        worse = bool(np.isfinite(after) and not before <= rules.worse * max(after, 1e-12))
-        far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
-        moved = worse and far
-        of = index, found.after.names[index]
-        told.append(Displacement(*of, turn, shift, sd_turn, sd_shift, before, after, moved))
-    return tuple(told)
+        residual = calibration.residuals[index]
+        before, after = residual.before, residual.held
+        after = after if np.isfinite(after) else residual.after
+        # a sensor that meets nothing at its old pose, but does now, surely stands elsewhere
+        is_worse = bool(np.isfinite(after) and not before <= rules.worse * max(after, 1e-12))
+        is_far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
+        values = turn, shift, sd_turn, sd_shift, before, after
+        displaced.append(Displacement(index, names[index], *values, is_worse and is_far))
+    return tuple(displaced)
 
 
 def before_and_after(before: Rig, after: Rig, index: int) -> tuple[Floats, Floats] | None:
-    """T_sensor_world of a sensor before and after; None of a range sensor."""
+    """Return T_sensor_world of a sensor before and after; None of a range sensor."""
     old, new = (getattr(rig.sensors[index], "T_sensor_world", None) for rig in (before, after))
     return None if old is None or new is None else (old, new)
 
 
 def _consensus(before: Rig, after: Rig, linked: Sequence[int]) -> Floats:
-    """The motion of the world (4, 4) after which most of some sensors stand where they stood."""
-    # that of the sensor from which the others differ least: the bumped ones are outvoted
+    """Return the motion (4, 4) of the world after which most linked sensors stand as before."""
+    # the motion of the sensor from which the others differ least, so that bumped ones are outvoted
     poses = [before_and_after(before, after, k) for k in linked]
-    told = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
-    if not told:  # range sensors alone
+    motions_of_world = [inverse(pair[0]) @ pair[1] for pair in poses if pair is not None]
+    if not motions_of_world:  # range sensors alone
         a, b = (np.array([centre_of(rig.sensors[k]) for k in linked]) for rig in (after, before))
         if len(a) < 3:
             return from_parts(np.eye(3), (b - a).mean(axis=0))
         return motions(a, b[None])[0]  # type: ignore[no-any-return]
-    if len(told) < 3:  # of two, none is outvoted: the first is believed
-        return told[0]
+    if len(motions_of_world) < 3:  # none of two can be outvoted
+        return motions_of_world[0]
     worth = []
-    for G in told:
-        apart = [_apart(before, after, k, G) for k in linked]
+    for G in motions_of_world:
+        apart = [_displacement_of(before, after, k, G) for k in linked]
         worth.append((np.median([t for t, _ in apart]), np.median([s for _, s in apart])))
-    return told[int(np.lexsort(np.array(worth).T[::-1])[0])]
+    return motions_of_world[int(np.lexsort(np.array(worth).T[::-1])[0])]
 
 
-def _apart(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
-    """Turn in degrees and shift of a sensor, the new world moved into the old one by G."""
+def _displacement_of(before: Rig, after: Rig, index: int, G: Floats) -> tuple[float, float]:
+    """Return turn (degrees) and shift of a sensor, after G moves the new world into the old one."""
     poses = before_and_after(before, after, index)
     if poses is None:
-        place = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
-        return 0.0, float(np.linalg.norm(place - centre_of(before.sensors[index])))
+        centre = G[:3, :3] @ centre_of(after.sensors[index]) + G[:3, 3]
+        return 0.0, float(np.linalg.norm(centre - centre_of(before.sensors[index])))
     old, moved = poses[0], poses[1] @ inverse(G)
     turn = Rotation.from_matrix(moved[:3, :3] @ old[:3, :3].T).magnitude()
     shift = np.linalg.norm(inverse(moved)[:3, 3] - inverse(old)[:3, 3])
     return float(np.degrees(turn)), float(shift)
 
 
-def _deviations(found: Calibration) -> list[tuple[float, float]]:
-    """Standard deviations of turn (degrees) and shift of each sensor; those held have the least."""
-    # a sensor that is held is as uncertain against the others as they are against it
-    own: dict[int, tuple[float, float]] = {}
-    for block in found.blocks:
+def _deviations(calibration: Calibration) -> list[tuple[float, float]]:
+    """Return standard deviations of turn (degrees) and shift of each sensor."""
+    # a held sensor is as uncertain relative to the others as they are relative to it: the least
+    deviations: dict[int, tuple[float, float]] = {}
+    for block in calibration.blocks:
         if block.kind in ("pose", "position") and block.sensor is not None:
-            part = found.deviations[block.place]
-            turn = float(np.degrees(np.sqrt((part[3:] ** 2).sum())))  # none of a range sensor
-            own[block.sensor] = (turn, float(np.sqrt((part[:3] ** 2).sum())))
-    known = [(np.inf, np.inf), *own.values()]
+            values = calibration.deviations[block.place]
+            turn = float(np.degrees(np.sqrt((values[3:] ** 2).sum())))  # 0 of a range sensor
+            deviations[block.sensor] = (turn, float(np.sqrt((values[:3] ** 2).sum())))
+    known = [(np.inf, np.inf), *deviations.values()]
     least = min(turn for turn, _ in known), min(shift for _, shift in known)
-    return [own.get(index, least) for index in range(len(found.after.names))]
+    return [deviations.get(index, least) for index in range(len(calibration.after.names))]

@@ -1,4 +1,4 @@
-"""The rig: everything that a calibration may change, and its parameters in blocks."""
+"""The rig: all sensors and the body, which a calibration changes, and its blocks of parameters."""
 
 from __future__ import annotations
 
@@ -36,59 +36,59 @@ _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Sensors and body as they are believed to be."""
+    """Sensors and body, as the session has them or as calibrated."""
 
     names: tuple[str, ...]
     sensors: tuple[Sensor, ...]
     points: Floats  # (N, 3): features of the body, in its frame
-    delays: Floats  # (L,): seconds by which a sensor's frames are taken later than their times say
-    drifts: Floats  # (L,): seconds per second by which that grows
+    delays: Floats  # (L,): seconds from the time stamp of a frame to its exposure
+    drifts: Floats  # (L,): seconds per second by which delays grow
     readouts: Floats  # (L,): seconds from a sensor's first row to its last
-    body: Body  # as the session has it: its features' names, normals and sizes
-    scale: float = 1.0  # of all lengths, against those that the session says
+    body: Body  # as the session has it: names, normals and sizes of features
+    scale: float = 1.0  # of all lengths, relative to those of the session
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:
-        """The rig as a session has it."""
-        none = np.zeros(len(names))
-        return cls(tuple(names), tuple(sensors), body.means, none, none, none, body)
+        """Return the rig of a session, without delays."""
+        zeros = np.zeros(len(names))
+        return cls(tuple(names), tuple(sensors), body.means, zeros, zeros, zeros, body)
 
     @property
     def is_late(self) -> bool:
-        """Whether sensors look at other moments than the times of their frames."""
+        """Test whether sensors take frames at other moments than their time stamps."""
         return bool(np.any([self.delays, self.drifts, self.readouts]))
 
     def placed(self, index: int, T_sensor_world: Floats) -> Rig:
-        """The rig with a camera elsewhere."""
+        """Return the rig with a camera at another pose."""
         sensor: Any = self.sensors[index]
         return self.exchanged(index, replace(sensor, T_sensor_world=T_sensor_world))
 
     def exchanged(self, index: int, sensor: Sensor) -> Rig:
-        """The rig with another sensor in the place of one."""
+        """Return the rig with the sensor of an index replaced."""
         sensors = list(self.sensors)
         sensors[index] = sensor
         return replace(self, sensors=tuple(sensors))
 
-    def seen(self, sensor: int, poses: Floats) -> tuple[Floats, Mask]:
-        """Where a sensor sees the features (K, N, m) at poses (K, 4, 4), and which are in view."""
-        eye, world = self.sensors[sensor], transform(poses, self.points)
-        y, visible = eye.project(world)
-        return y + self.beside(sensor, poses), visible & facing(
-            eye, poses, world, self.body.normals, self.body.edge_on
+    def project(self, sensor: int, poses: Floats) -> tuple[Floats, Mask]:
+        """Project features at poses (K, 4, 4) to a sensor (K, N, m), and test which are in view."""
+        geometry, world = self.sensors[sensor], transform(poses, self.points)
+        y, visible = geometry.project(world)
+        return y + self.centre_offsets(sensor, poses), visible & facing(
+            geometry, poses, world, self.body.normals, self.body.edge_on
         )
 
-    def beside(self, sensor: int, poses: Floats) -> Floats:
-        """How far images of spheres and disks (K, N, m) are beside those of their centres."""
-        eye, body = self.sensors[sensor], self.body
-        if body.radii is None or eye.dimension == 1:
-            return np.zeros((len(poses), len(self.points), eye.dimension))
-        shown = BodyProjection((eye,), (body,)).project(poses)
-        centres, _ = eye.project(transform(poses, body.means))
-        return np.where(shown.seen[0, ..., None], shown.y[0] - centres, 0.0)
+    def centre_offsets(self, sensor: int, poses: Floats) -> Floats:
+        """Return offsets (K, N, m) of images of spheres and disks from those of their centres."""
+        geometry, body = self.sensors[sensor], self.body
+        if body.radii is None or geometry.dimension == 1:
+            return np.zeros((len(poses), len(self.points), geometry.dimension))
+        match = BodyProjection((geometry,), (body,)).project(poses)
+        centres, _ = geometry.project(transform(poses, body.means))
+        return np.where(match.seen[0, ..., None], match.y[0] - centres, 0.0)
 
 
 class State(NamedTuple):
-    """All that a calibration seeks."""
+    """The unknowns of a calibration."""
 
     rig: Rig
     poses: Floats  # (K, 4, 4): of the body, in each frame
@@ -96,30 +96,30 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """Parameters of one kind, of one sensor or of the body."""
+    """The parameters of one kind of a sensor or of the body."""
 
     kind: Kind
     sensor: int | None  # None for the body
-    start: int  # of the block among all parameters
+    start: int  # index of the first among all parameters
     names: tuple[str, ...]
     units: tuple[str, ...]  # of "length", "rad", "px", "s" and ""
-    scales: tuple[float, ...]  # in `units`: by these standard deviations are large or small
+    scales: tuple[float, ...]  # sizes, in `units`, to which standard deviations are compared
 
     @property
     def place(self) -> slice:
-        """Where the block stands among all parameters."""
+        """Return the slice of the block among all parameters."""
         return slice(self.start, self.start + len(self.names))
 
 
 def centre_of(sensor: Any) -> Floats:
-    """Where a sensor stands in the world (3,)."""
+    """Return the position (3,) of a sensor in the world."""
     if isinstance(sensor, RangeSensor):
         return sensor.position
     return np.asarray(inverse(sensor.T_sensor_world)[:3, 3])
 
 
 def kinds_of(sensor: Sensor) -> tuple[Kind, ...]:
-    """Kinds of parameters that a sensor has."""
+    """Return the kinds of parameters that a sensor has."""
     if isinstance(sensor, RangeSensor):
         return ("position", "range_bias", "delay", "drift")
     if not hasattr(sensor, "T_sensor_world"):
@@ -134,15 +134,15 @@ def kinds_of(sensor: Sensor) -> tuple[Kind, ...]:
 def blocks_of(
     rig: Rig, free: Mapping[int, Sequence[Kind]], *, body: bool, length: float, interval: float
 ) -> tuple[Block, ...]:
-    """Lay out the free parameters, one after the other.
+    """Lay out the free parameters in blocks, one after the other.
 
-    Their sizes go by that of the rig, `length`, and the seconds from frame to frame, `interval`.
+    `length`, the size of the rig, and `interval`, the seconds from frame to frame, scale them.
     """
     blocks: list[Block] = []
-    wanted = [(s, kind) for s in sorted(free) for kind in KINDS if kind in free[s]]
+    sensor_kinds = [(s, kind) for s in sorted(free) for kind in KINDS if kind in free[s]]
     start = 0
-    for index, kind in wanted:
-        names, units, scales = _laid_out(rig.sensors[index], kind, length, interval)
+    for index, kind in sensor_kinds:
+        names, units, scales = _parameters_of(rig.sensors[index], kind, length, interval)
         blocks.append(Block(kind, index, start, names, units, scales))
         start += len(names)
     if body:
@@ -153,10 +153,10 @@ def blocks_of(
     return tuple(blocks)
 
 
-def _laid_out(
+def _parameters_of(
     sensor: Any, kind: Kind, length: float, interval: float
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[float, ...]]:
-    """Names, units and scales of a sensor's parameters of one kind."""
+    """Return names, units and scales of a sensor's parameters of one kind."""
     if kind == "pose":
         return TWIST_NAMES, ("length",) * 3 + ("rad",) * 3, (length,) * 3 + (1.0,) * 3
     names, unit = _NAMES.get(kind, (kind,)), _UNITS.get(kind, "")
@@ -168,7 +168,7 @@ def _laid_out(
     elif kind == "principal_point":
         size = sensor.resolution
         unit, scale = "px", 1000.0 if size is None else float(max(size)) / 2
-    elif kind == "distortion":  # of rational and tilted models the first five are sought
+    elif kind == "distortion":  # of rational and tilted models only the first five are free
         most = max(4, min(5, len(sensor.distortion)))
         names = _FISHEYE_LENS if isinstance(sensor, FisheyeCamera) else _LENS[:most]
     elif kind == "drift":
@@ -177,7 +177,7 @@ def _laid_out(
 
 
 def moved(rig: Rig, blocks: Sequence[Block], step: Floats) -> Rig:
-    """The rig after a step of its parameters (G,).
+    """Return the rig after a step (G,) of its parameters.
 
     Cameras turn about their own centre: x_sensor <- exp(r) x_sensor + t.
     """
@@ -197,7 +197,7 @@ def moved(rig: Rig, blocks: Sequence[Block], step: Floats) -> Rig:
 
 
 def values_of(rig: Rig, block: Block) -> Floats:
-    """Values of a sensor's parameters, other than a pose."""
+    """Return the values of a sensor's parameters of any kind but a pose."""
     assert block.sensor is not None, "features of the body are in rig.points"
     if block.kind in ("delay", "drift"):
         return getattr(rig, f"{block.kind}s")[[block.sensor]]  # type: ignore[no-any-return]
@@ -205,7 +205,7 @@ def values_of(rig: Rig, block: Block) -> Floats:
 
 
 def _values(sensor: Any, kind: Kind) -> Floats:
-    """Values of all parameters of one kind, of a lens four or more."""
+    """Return the values of all parameters of one kind; at least four of a lens."""
     if kind in _IN_MATRIX and hasattr(sensor, "camera_matrix"):
         return sensor.camera_matrix[_IN_MATRIX[kind]]  # type: ignore[no-any-return]
     if kind == "distortion":
@@ -214,12 +214,12 @@ def _values(sensor: Any, kind: Kind) -> Floats:
 
 
 def _changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
-    """A sensor after a step of its parameters of one kind."""
+    """Return a sensor after a step of its parameters of one kind."""
     if kind == "pose":
         T = from_rotation_vector(delta[3:], delta[:3]) @ sensor.T_sensor_world
         return replace(sensor, T_sensor_world=T)
     values = _values(sensor, kind).copy()
-    if kind == "focal":  # one number may stand for both
+    if kind == "focal":  # one step may change fx and fy alike
         values += delta
     else:
         values[: len(delta)] += delta
@@ -233,10 +233,10 @@ def _changed(sensor: Any, kind: Kind, delta: Floats) -> Any:
 _STEPS = {"focal": 1e-2, "principal_point": 1e-2, "distortion": 1e-5}
 
 
-def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
-    """Jacobian (n, m, k) of what a sensor sees of points (n, 3) by its own parameters.
+def parameter_jacobian(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> Floats:
+    """Return the Jacobian (n, m, k) of images of points (n, 3) by a sensor's own parameters.
 
-    `by_world` is that by the points (n, m, 3).
+    `by_world` is the Jacobian by the points (n, m, 3).
     """
     if kind == "pose":
         T = sensor.T_sensor_world
@@ -245,7 +245,7 @@ def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> F
         return -by_world
     if kind == "range_bias":
         return np.ones((len(world), 1, 1))
-    count = len(_laid_out(sensor, kind, 1.0, 1.0)[0])
+    count = len(_parameters_of(sensor, kind, 1.0, 1.0)[0])
     unbounded = replace(sensor, resolution=None)
     J = np.empty((len(world), 2, count))
     for k, step in enumerate(_STEPS[kind] * np.eye(count)):

@@ -1,8 +1,7 @@
-"""Where the body is, before anything is adjusted: for one camera alone, or for all together.
+"""Search the body before anything is adjusted: by one camera alone, or by all sensors together.
 
-Of sensors none of which knows a pose alone, ranges or parallel beams, all are believed to stand
-about where the session has them.  Blurs wider than σ_ε forgive what they are off, until the rig can
-be adjusted to what was found.
+Sensors that determine no pose alone, ranges or parallel beams, are taken to stand about where the
+session has them.  Blurs wider than σ_ε allow for their errors until the rig can be adjusted.
 """
 
 from __future__ import annotations
@@ -27,92 +26,92 @@ _LEAST = 4  # detections: three leave four poses of any triangle
 MARK = '{"mixpose-calibration": '
 
 
-class Posed(NamedTuple):
-    """A frame and where the body is."""
+class PosedFrame(NamedTuple):
+    """A frame and the pose of the body."""
 
     frame: SeenFrame
     T_world_object: Floats  # (4, 4)
-    is_sure: bool = True  # whether that is believed
+    is_sure: bool = True  # whether the pose is ok
 
 
-def searched(task: Task, rules: CalibrationRules, progress: Progress, found: Known) -> Known:
-    """Hypotheses of every camera for every frame; those in `found` are not made again."""
+def search_cameras(task: Task, rules: CalibrationRules, progress: Progress, known: Known) -> Known:
+    """Return hypotheses of every camera and frame; those in `known` are kept, others added."""
     wanted = [(f, sensor) for f in task.frames for sensor in task.cameras if sensor in f.points]
     for done, (frame, sensor) in enumerate(wanted):
         progress("searching the body in each camera alone", done, len(wanted))
-        if (frame.number, sensor) not in found:
-            found[frame.number, sensor] = _hypotheses(task, sensor, frame.points[sensor], rules)
-    return found
+        if (frame.number, sensor) not in known:
+            known[frame.number, sensor] = _hypotheses(task, sensor, frame.points[sensor], rules)
+    return known
 
 
 def _hypotheses(task: Task, sensor: int, points: Floats, rules: CalibrationRules) -> Hypotheses:
-    """Search for the body in one camera's frame."""
+    """Search the body in a camera's detections (M, m)."""
     if len(points) < _LEAST:
         return NOTHING
     view = _view(task, sensor, points, 1.0)
     # the world is put where the camera is, so that poses are relative to it
-    own = view.sensor.moved(inverse(view.sensor.T_sensor_world))  # type: ignore[attr-defined]
-    views = plane_views(View(view.name, own, view.observation))
+    camera = view.sensor.moved(inverse(view.sensor.T_sensor_world))  # type: ignore[attr-defined]
+    views = plane_views(View(view.name, camera, view.observation))
     tracker = Tracker.create(task.rig.body, EstimatorOptions())
     ranked = tracker.explain(tracker.data(tracker.begin(), 0, None, views))
-    best = ranked[0].log_evidence if ranked else 0.0
-    kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
-    kept = kept[: rules.hypotheses]
-    poses = np.array([one.T_world_object for one in kept]).reshape(-1, 4, 4)
-    return Hypotheses(poses, np.array([one.log_evidence for one in kept]))
+    strongest = ranked[0].log_evidence if ranked else 0.0
+    likely = [pose for pose in ranked if pose.log_evidence > max(strongest - rules.margin, 0.0)]
+    likely = likely[: rules.hypotheses]
+    poses = np.array([pose.T_world_object for pose in likely]).reshape(-1, 4, 4)
+    return Hypotheses(poses, np.array([pose.log_evidence for pose in likely]))
 
 
-def posed(task: Task, factor: float = 1.0, progress: Progress = silent) -> list[Posed]:
-    """Frames of which all sensors together know a pose, at a factor times σ_ε."""
+def posed_frames(task: Task, factor: float = 1.0, progress: Progress = silent) -> list[PosedFrame]:
+    """Return frames with poses of all sensors together, at a blur of `factor` times σ_ε."""
     free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
     turn, distance = task.around
     options = EstimatorOptions(free=free, fuse=task.fuse)
     tracker = Tracker.create(
         task.rig.body, options, task.T_held, rotation_deg=turn, distance=distance
     )
-    track, found = tracker.begin(), list[Posed]()
+    track, posed = tracker.begin(), list[PosedFrame]()
     for done, frame in enumerate(task.frames):
         seen = [_view(task, s, y, factor) for s, y in frame.points.items() if len(y)]
-        views = [own for view in seen for own in plane_views(view)]
+        views = [view for sensor_view in seen for view in plane_views(sensor_view)]
         track, estimate = tracker.advance(track, frame.number, frame.time_s, views)
         progress("searching the body with all sensors", done, len(task.frames))
         if estimate.T_world_object is not None:
-            found.append(Posed(frame, estimate.T_world_object, estimate.status == "ok"))
-    return found
+            posed.append(PosedFrame(frame, estimate.T_world_object, estimate.status == "ok"))
+    return posed
 
 
 def _view(task: Task, sensor: int, points: Floats, factor: float) -> View:
-    seen = Observation(PointPattern(points, np.ones(len(points))), factor * task.sigmas[sensor])
-    return View(task.rig.names[sensor], task.rig.sensors[sensor], seen)
+    observed = Observation(PointPattern(points, np.ones(len(points))), factor * task.sigmas[sensor])
+    return View(task.rig.names[sensor], task.rig.sensors[sensor], observed)
 
 
 class Saved(Known):
-    """Hypotheses that are written to a file as they are found, a line of JSON each.
+    """Hypotheses that are appended to a file when they are set, a line of JSON each.
 
-    What a calibration that was interrupted had found is taken from the file, if it has the same
-    key, which names session, recording and version.
+    Hypotheses of an interrupted calibration are read from the file, if it has the same key, which
+    stands for session, recording and version.
     """
 
-    def __init__(self, path: Path, key: str) -> None:
+    def __init__(self, path: Path, session_key: str) -> None:
         super().__init__()
-        self._path, first = path, f"{MARK}{json.dumps(key)}}}"
+        self._path, first = path, f"{MARK}{json.dumps(session_key)}}}"
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
         known = Known()
         for line in lines[1:] if lines and lines[0] == first else []:
             with suppress(ValueError):  # the last line was cut off
                 frame, sensor, poses, evidence = json.loads(line)
                 T = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-                one = Hypotheses(T, np.array(evidence, dtype=np.float64))
-                known[int(frame), int(sensor)] = one
+                hypotheses = Hypotheses(T, np.array(evidence, dtype=np.float64))
+                known[int(frame), int(sensor)] = hypotheses
         self.resumed = len(known)
         self._stream = path.open("w", encoding="utf-8", newline="\n")
         self._stream.write(first + "\n")
-        for place, one in known.items():
-            self[place] = one
+        for key, hypotheses in known.items():
+            self[key] = hypotheses
 
-    def __setitem__(self, key: tuple[int, int], one: Hypotheses) -> None:
-        super().__setitem__(key, one)
-        self._stream.write(json.dumps([*key, one.poses.tolist(), one.evidence.tolist()]) + "\n")
+    def __setitem__(self, key: tuple[int, int], new: Hypotheses) -> None:
+        super().__setitem__(key, new)
+        self._stream.write(json.dumps([*key, new.poses.tolist(), new.evidence.tolist()]) + "\n")
         self._stream.flush()
 
     def __enter__(self) -> Saved:

@@ -1,6 +1,6 @@
-"""What a user's words say: what is free, a known length, and in whose frame to tell.
+"""Options in a user's words: free parameters, a known length, and the frame of the result.
 
-What is free is ``SENSOR:WHAT``, ``WHAT`` for all sensors, or ``body``.
+A free parameter is ``SENSOR:WHAT``, ``WHAT`` for all sensors, or ``body``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError, RangeSensor
 from mixpose.session.values import LARGEST, as_number
 
-_FREES: dict[Kind, tuple[str, ...]] = {
+_ERROR_FIELDS: dict[Kind, tuple[str, ...]] = {
     "pose": ("rotation_deg", "position"),
     "position": ("position",),
     "focal": ("focal",),
@@ -33,15 +33,15 @@ _FREES: dict[Kind, tuple[str, ...]] = {
 def free_parameters(
     rig: Rig, words: Sequence[str], *, poses_known: bool, world: str | None = None
 ) -> tuple[dict[int, tuple[Kind, ...]], bool]:
-    """Kinds that are free, by sensor, and whether the body is.
+    """Return the kinds that are free, by sensor, and whether the body is.
 
-    Without words: where all cameras but the first, or that of the world, stand, or all where poses
-    are known, and positions of range sensors.  Raises a SessionError if a word names no sensor, or
-    nothing that the sensor has.
+    Without words: poses of all cameras but the first, or that of the world, or of all if poses are
+    known, and positions of range sensors.  Raises a SessionError if a word names no sensor, or no
+    parameter of the sensor.
     """
     if not words:
         return _default(rig, poses_known, world), False
-    found: dict[int, list[Kind]] = {}
+    free: dict[int, list[Kind]] = {}
     body = False
     for word in words:
         sensor, colon, kinds = word.rpartition(":")
@@ -51,10 +51,10 @@ def free_parameters(
                 continue
             kind = _kind(word, what)
             for index in _sensors(rig, word, sensor, kind, every=not colon):
-                own = found.setdefault(index, [])
-                if kind not in own:
-                    own.append(kind)
-    return {index: tuple(kinds) for index, kinds in sorted(found.items())}, body
+                sensor_kinds = free.setdefault(index, [])
+                if kind not in sensor_kinds:
+                    sensor_kinds.append(kind)
+    return {index: tuple(kinds) for index, kinds in sorted(free.items())}, body
 
 
 def _default(rig: Rig, poses_known: bool, world: str | None) -> dict[int, tuple[Kind, ...]]:
@@ -79,37 +79,37 @@ def _kind(word: str, what: str) -> Kind:
 
 def _sensors(rig: Rig, word: str, name: str, kind: Kind, *, every: bool) -> list[int]:
     if every or name == "*":
-        found = [k for k, sensor in enumerate(rig.sensors) if kind in kinds_of(sensor)]
-        if not found:
+        indices = [k for k, sensor in enumerate(rig.sensors) if kind in kinds_of(sensor)]
+        if not indices:
             raise SessionError(f"--free {word}: no sensor of the session has a {kind}")
-        return found
+        return indices
     if name not in rig.names:
         raise SessionError(
             f"--free {word}: no such sensor; allowed: {', '.join(rig.names)}, or no name for all"
         )
     index = rig.names.index(name)
-    has = kinds_of(rig.sensors[index])
-    if kind not in has:
-        raise SessionError(f"--free {word}: sensor {name!r} has none; it has {', '.join(has)}")
+    kinds = kinds_of(rig.sensors[index])
+    if kind not in kinds:
+        raise SessionError(f"--free {word}: sensor {name!r} has none; it has {', '.join(kinds)}")
     return [index]
 
 
 def error_of_held(error: CalibrationError, kinds: Sequence[Kind]) -> CalibrationError:
-    """How far a sensor may be off in what is not free."""
-    free = {name: 0.0 for kind in kinds for name in _FREES.get(kind, ())}
+    """Return the error of a sensor's calibration without parameters that are free."""
+    free = {name: 0.0 for kind in kinds for name in _ERROR_FIELDS.get(kind, ())}
     return replace(error, **free)
 
 
 def words_of(names: Sequence[str], free: Mapping[int, Sequence[Kind]], body: bool) -> str:
-    """What is free, for people."""
+    """Say what is free."""
     parts = [f"{names[k]}:{','.join(kinds)}" for k, kinds in free.items()]
     return " ".join(parts + ["body"] * body) or "nothing"
 
 
 def known_length(rig: Rig, words: str) -> tuple[tuple[int, int], float]:
-    """Two sensors and how far they are apart, as ``SENSOR:SENSOR=LENGTH`` says.
+    """Return two sensors and their distance, from ``SENSOR:SENSOR=LENGTH``.
 
-    Raises a SessionError if the words are no two sensors and a length, or a sensor tells scale.
+    Raises a SessionError if the words are no two sensors and a length, or a sensor gives the scale.
     """
     names, _, value = words.partition("=")
     first, _, second = names.partition(":")
@@ -127,55 +127,55 @@ def known_length(rig: Rig, words: str) -> tuple[tuple[int, int], float]:
                 "allowed: a session of cameras alone"
             )
     pair = (rig.names.index(first), rig.names.index(second))
-    if _apart(rig, pair) == 0:
+    if _distance(rig, pair) == 0:
         raise SessionError(f"--length {words}: the session has both at one place")
     return pair, length
 
 
-def _apart(rig: Rig, pair: tuple[int, int]) -> float:
+def _distance(rig: Rig, pair: tuple[int, int]) -> float:
     first, second = (centre_of(rig.sensors[k]) for k in pair)
     return float(np.linalg.norm(second - first))
 
 
-def in_length(found: Calibration, words: str) -> Calibration:
-    """The calibration of cameras, all lengths scaled by what `known_length` reads.
+def in_length(calibration: Calibration, words: str) -> Calibration:
+    """Scale a calibration of cameras to the distance of two of them that `known_length` reads.
 
-    The body and the poses as well: no image changes.
+    The body and the poses are scaled as well, so that no image changes.
     """
-    pair, length = known_length(found.after, words)
-    factor = length / _apart(found.after, pair)
-    units = [unit for block in found.blocks for unit in block.units]
+    rig, units = calibration.after, [u for block in calibration.blocks for u in block.units]
+    pair, length = known_length(rig, words)
+    factor = length / _distance(rig, pair)
     sizes = [factor if unit == "length" else 1.0 for unit in units]
-    change, along = np.zeros((2, len(units)))
-    for block in found.blocks:  # how each changes with the scale of all lengths
+    change, by_distance = np.zeros((2, len(units)))
+    for block in calibration.blocks:  # change with the scale of all lengths
         if block.kind == "body":
-            change[block.place] = body_change(found.after.points)[:, -1]
+            change[block.place] = body_change(rig.points)[:, -1]
         elif block.kind == "pose" and block.sensor is not None:
-            change[block.place] = sensor_change(found.after.sensors[block.sensor])[:, -1]
-    for block, values in length_parts(found.after, found.blocks, pair):
-        along[block.place] += values
-    # what the distance errs by scales all
-    share = factor / _apart(found.after, pair)
-    by_old = np.diag(sizes) - share * np.outer(change, along)
+            change[block.place] = sensor_change(rig.sensors[block.sensor])[:, -1]
+    for block, values in length_parts(rig, calibration.blocks, pair):
+        by_distance[block.place] += values
+    # an error of the distance scales all lengths
+    share = factor / _distance(rig, pair)
+    by_old = np.diag(sizes) - share * np.outer(change, by_distance)
     return replace(
-        _by_linear(found, by_old),
-        before=_scaled(found.before, factor),
-        after=_scaled(found.after, factor),
-        poses={number: _shifted(T, factor) for number, T in found.poses.items()},
+        _by_linear(calibration, by_old),
+        before=_scaled(calibration.before, factor),
+        after=_scaled(rig, factor),
+        poses={number: _shifted(T, factor) for number, T in calibration.poses.items()},
     )
 
 
-def _by_linear(found: Calibration, by_old: Floats) -> Calibration:
-    """The calibration with the deviations of parameters that depend linearly (G, G) on the old."""
-    covariance = by_old @ found.covariance @ by_old.T
-    told = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
-    told = np.where(np.isfinite(found.deviations), told, np.inf)
-    return replace(found, covariance=covariance, deviations=told)
+def _by_linear(calibration: Calibration, by_old: Floats) -> Calibration:
+    """Return the calibration with deviations of parameters linear (G, G) in the old ones."""
+    covariance = by_old @ calibration.covariance @ by_old.T
+    deviations = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    deviations = np.where(np.isfinite(calibration.deviations), deviations, np.inf)
+    return replace(calibration, covariance=covariance, deviations=deviations)
 
 
 def _scaled(rig: Rig, factor: float) -> Rig:
     cameras: list[Any] = list(rig.sensors)
-    moved = [replace(one, T_sensor_world=_shifted(one.T_sensor_world, factor)) for one in cameras]
+    moved = [replace(c, T_sensor_world=_shifted(c.T_sensor_world, factor)) for c in cameras]
     points, scale = rig.points * factor, rig.scale * factor
     return replace(rig, sensors=tuple(moved), points=points, scale=scale)
 
@@ -185,9 +185,9 @@ def _shifted(T: Floats, factor: float) -> Floats:
 
 
 def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
-    """Refuse words that name no frame: a sensor's, or ``body@FRAME`` of a frame of the recording.
+    """Raise a SessionError if words name no frame: a sensor, or ``body@FRAME`` of the recording.
 
-    So that nothing is searched in vain.  Raises a SessionError.
+    It is checked before the search, which takes long.
     """
     if _frame_number(words, numbers) is None and words not in _with_a_frame(rig):
         frames = ", ".join(f"body@{n}" for n in sorted(numbers)[:3])
@@ -197,41 +197,41 @@ def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
         )
 
 
-def in_world(found: Calibration, words: str) -> Calibration:
-    """The calibration in another frame, named as for `check_world`."""
-    check_world(found.after, words, found.poses)
-    number = _frame_number(words, found.poses)
+def in_world(calibration: Calibration, words: str) -> Calibration:
+    """Return the calibration in another frame, named as for `check_world`."""
+    check_world(calibration.after, words, calibration.poses)
+    number = _frame_number(words, calibration.poses)
     if number is None:
-        T_new_world = _with_a_frame(found.after)[words]
+        T_new_world = _with_a_frame(calibration.after)[words]
     else:
-        T_new_world = inverse(found.poses[number])
-    moved = tuple(sensor.moved(inverse(T_new_world)) for sensor in found.after.sensors)
-    by_old, names = np.eye(len(found.deviations)), found.after.names
-    placed = [(b.sensor, b) for b in found.blocks if b.kind in ("pose", "position")]
-    own = next((b for s, b in placed if s is not None and names[s] == words), None)
-    for sensor, block in placed:
+        T_new_world = inverse(calibration.poses[number])
+    sensors = tuple(sensor.moved(inverse(T_new_world)) for sensor in calibration.after.sensors)
+    by_old, names = np.eye(len(calibration.deviations)), calibration.after.names
+    placed = [(b.sensor, b) for b in calibration.blocks if b.kind in ("pose", "position")]
+    reference = next((b for s, b in placed if s is not None and names[s] == words), None)
+    for index, block in placed:
         if block.kind == "position":
             by_old[block.place, block.place] = T_new_world[:3, :3]
-        if own is not None and sensor is not None:  # the others move as this one errs
-            change = sensor_change(moved[sensor])[:, :6]
-            by_old[block.place, own.place] = change if block is not own else 0.0
+        if reference is not None and index is not None:  # others move by the reference's errors
+            change = sensor_change(sensors[index])[:, :6]
+            by_old[block.place, reference.place] = change if block is not reference else 0.0
     return replace(
-        _by_linear(found, by_old),
-        after=replace(found.after, sensors=moved),
-        poses={number: T_new_world @ T for number, T in found.poses.items()},
-        gauge=(*found.gauge, f"the world is that of {words}"),
+        _by_linear(calibration, by_old),
+        after=replace(calibration.after, sensors=sensors),
+        poses={number: T_new_world @ T for number, T in calibration.poses.items()},
+        gauge=(*calibration.gauge, f"the world is that of {words}"),
         T_new_old=T_new_world,
     )
 
 
 def _frame_number(words: str, numbers: Collection[int]) -> int | None:
-    """The frame of ``body@FRAME``; None where the words are no frame of the recording."""
+    """Return the frame number of ``body@FRAME``; None if it is no frame of the recording."""
     body, _, number = words.partition("@")
-    known = {str(each): each for each in numbers} if body == "body" else {}
+    known = {str(n): n for n in numbers} if body == "body" else {}
     return known.get(number.lstrip("0") or number[-1:])
 
 
 def _with_a_frame(rig: Rig) -> dict[str, Floats]:
-    """T_sensor_world of sensors that have a frame of their own, by name."""
+    """Return T_sensor_world by name of the sensors that have one."""
     both = zip(rig.names, rig.sensors, strict=True)
     return {n: s.T_sensor_world for n, s in both if hasattr(s, "T_sensor_world")}

@@ -1,4 +1,4 @@
-"""What would help: a marker that is moved, one more sensor, or detections that err by less."""
+"""Changes that would improve a system: a moved marker, one more sensor, or less noise."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ErrorOf: TypeAlias = Callable[[Plan], float]
 
 _STEP = 0.25  # of the body's radius
 _PLACES = 60  # for one more sensor, all around
-_WIDEST = 1e4  # times the noise: beyond it nobody would build the system
+_WIDEST = 1e4  # largest factor on the noise: nobody would build a system beyond it
 
 
 @dataclass(frozen=True)
@@ -28,22 +28,22 @@ class MarkerMove:
 
     marker: int  # from 0
     shift: Floats  # (3,): in the object's frame
-    error: float  # what is left then
+    error: float  # with the marker moved
 
 
 @dataclass(frozen=True)
 class NewSensor:
-    """One more sensor, of a kind that is there."""
+    """One more sensor, a copy of an existing one."""
 
-    like: str  # the sensor that it is a copy of
+    like: str  # name of the sensor that it copies
     sensor: Sensor
-    error: float  # what is left then
+    error: float  # with the new sensor
 
 
 def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
-    """The marker whose move by a quarter of the body's radius leaves the least error.
+    """Find the marker whose move by a quarter of the body's radius leaves the least error.
 
-    Returns None where no move helps, or features are no points.
+    Returns None if no move helps, or features are no points.
     """
     if not all(isinstance(feature, PointFeature) for feature in plan.body.features):
         return None
@@ -52,16 +52,16 @@ def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
     for marker in range(len(plan.body)):
         for direction in _directions(26):
             shift = _STEP * plan.body.radius * direction
-            error = error_of(replace(plan, body=_moved(plan.body, marker, shift)))
+            error = error_of(replace(plan, body=_with_marker_moved(plan.body, marker, shift)))
             if error < least:
                 best, least = MarkerMove(marker, shift, error), error
     return best
 
 
 def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor | None:
-    """Where a copy of one of the sensors leaves the least error: all around, as far away as it.
+    """Find the place around the body where a copy of a sensor leaves the least error.
 
-    It looks at the middle (3,) of the volume.  None where no place helps.
+    It looks at the middle (3,) of the volume from its original's distance.  None if no place helps.
     """
     best: NewSensor | None = None
     least = error_of(plan)
@@ -70,23 +70,23 @@ def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor 
         kinds.setdefault((type(sensor), plan.noises[k]), k)
     for k in kinds.values():
         for direction in _directions(_PLACES):
-            copy = _placed(plan.sensors[k], middle, direction)
+            copy = _copy_at(plan.sensors[k], middle, direction)
             if copy is None:
                 continue
-            more = replace(
+            extended = replace(
                 plan,
                 names=(*plan.names, "new"),
                 sensors=(*plan.sensors, copy),
                 noises=(*plan.noises, plan.noises[k]),
                 sigmas=(*plan.sigmas, plan.sigmas[k]),
             )
-            error = error_of(more)
+            error = error_of(extended)
             if error < least:
                 best, least = NewSensor(plan.names[k], copy, error), error
     return best
 
 
-def _moved(body: Body, marker: int, shift: Floats) -> Body:
+def _with_marker_moved(body: Body, marker: int, shift: Floats) -> Body:
     features = list(body.features)
     feature = features[marker]
     assert isinstance(feature, PointFeature), "others are not moved"
@@ -95,7 +95,7 @@ def _moved(body: Body, marker: int, shift: Floats) -> Body:
 
 
 def _directions(count: int) -> Floats:
-    """Unit vectors (count, 3) evenly around, by the golden angle."""
+    """Return unit vectors (count, 3) spread evenly over the sphere, by the golden angle."""
     k = np.arange(count) + 0.5
     height = 1 - 2 * k / count
     around = np.pi * (1 + np.sqrt(5)) * k
@@ -103,11 +103,11 @@ def _directions(count: int) -> Floats:
     return np.array([across * np.cos(around), across * np.sin(around), height]).T
 
 
-def _placed(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
-    """A copy that stands in a direction from the middle, as far from it as the original."""
+def _copy_at(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
+    """Return a copy of a sensor in a direction from the middle, as far from it as the original."""
     if isinstance(sensor, RangeSensor):
-        away = np.linalg.norm(sensor.position - middle)
-        return replace(sensor, position=middle + away * direction)
+        distance = np.linalg.norm(sensor.position - middle)
+        return replace(sensor, position=middle + distance * direction)
     if not isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
         return None
     depth = float(sensor.T_sensor_world[2, :3] @ middle + sensor.T_sensor_world[2, 3])
@@ -123,9 +123,9 @@ def _placed(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
 
 
 def noise_to_equal(plan: Plan, wanted: float, error_of: ErrorOf) -> float | None:
-    """Factor on all noises of a plan with which an error, which grows with them, is as wanted.
+    """Return the factor on all noises of a plan with which its error, which grows, is as wanted.
 
-    None where the errors of markers alone are too large, or no factor is large enough.
+    None if errors of markers alone are too large, or no factor is large enough.
     """
 
     def excess(log_factor: float) -> float:
@@ -140,6 +140,6 @@ def noise_to_equal(plan: Plan, wanted: float, error_of: ErrorOf) -> float | None
 
 
 def scaled(plan: Plan, factor: float) -> Plan:
-    """The plan with all noises times a factor, and the widths that go with them."""
-    noises, sigmas = (tuple(each * factor for each in all_) for all_ in (plan.noises, plan.sigmas))
+    """Return the plan with noises and sigmas multiplied by a factor."""
+    noises, sigmas = (tuple(factor * x for x in values) for values in (plan.noises, plan.sigmas))
     return replace(plan, noises=noises, sigmas=sigmas)

@@ -1,4 +1,4 @@
-"""A prediction held against simulated recordings that are estimated as any other."""
+"""Compare a prediction with simulated recordings that are estimated like any other."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSen
 from mixpose.session import Session, load_session
 from mixpose.simulation import SimulationOptions, simulate
 
-_FEWEST_FRAMES = 50  # at a pose, which takes a session and a recording of its own
+_FEWEST_FRAMES = 50  # at a pose, as each pose takes a session and a recording
 _MOST_POSES = 8
 
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Errors of simulated frames beside those that were predicted."""
+    """Errors of simulated frames, compared with predicted ones."""
 
-    frames: int  # estimated, lost ones included
+    frames: int  # estimated, with lost ones
     poses: int  # at which they were simulated
     statuses: dict[str, int]
     ratios: Floats  # (6,): RMS error over the predicted one, by direction; NaN where held or open
-    overall: float  # the same over all directions at once: of errors in units of their covariance
-    chance: float  # what `overall` is off 1 by through chance alone, one standard deviation
+    overall: float  # the same over all directions at once, by errors in units of their covariance
+    chance: float  # standard deviation of `overall` about 1 by chance
     predicted: Floats  # (3,): position, rotation (radians) and tip: RMS over the frames
-    found: Floats  # (3,)
+    found: Floats  # (3,): the same, of simulated frames
 
 
-_Place: TypeAlias = tuple[Session, Plan, Floats, int, int]
-"""Where to simulate how many frames of what: T_world_object, and a seed at the end."""
+_Recording: TypeAlias = tuple[Session, Plan, Floats, int, int]
+"""Session, plan, T_world_object, number of frames, and seed of a simulated recording."""
 
 
 def confirm(
@@ -57,37 +57,37 @@ def confirm(
     seed: int = 0,
     executor: Executor | None = None,
 ) -> Confirmation:
-    """Simulate so many frames of a body that stands still at some of the poses, and estimate them.
+    """Simulate `runs` frames of a body at rest at some of the poses, estimate them, compare errors.
 
-    The plan is of the session's system, perhaps with other noises, and everything is determined at
-    the poses (P, 4, 4), which an executor does; one after the other if it is left out.
+    The plan is of the session's system, perhaps with other noises; all poses (P, 4, 4) are
+    determined. Without an executor the simulated poses follow one after the other.
     """
     count = min(len(poses), _MOST_POSES, max(1, runs // _FEWEST_FRAMES))
-    chosen = poses[np.linspace(0, len(poses) - 1, count).astype(int)]
-    prediction = predict(plan, chosen)
-    places = [
-        # a seed of its own for each pose and each study
+    selected = poses[np.linspace(0, len(poses) - 1, count).astype(int)]
+    prediction = predict(plan, selected)
+    recordings = [
+        # a different seed for each pose and each study
         (session, plan, T, frames, int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
-        for k, T in enumerate(chosen)
+        for k, T in enumerate(selected)
         if (frames := runs // count + (k < runs % count))
     ]
     done: dict[int, tuple[list[Floats], Counter[str]]] = {}
     with nullcontext(executor) if executor is not None else in_threads(1) as workers:
-        for k, result in workers.run(_errors_at, places):
+        for k, result in workers.run(_errors_at, recordings):
             if isinstance(result, Exception):
                 raise result
             done[k] = result
     errors = [error for k in sorted(done) for error in done[k][0]]
-    which = [k for k in sorted(done) for _ in done[k][0]]
-    statuses = sum((told for _, told in done.values()), Counter[str]())
-    return _compared(plan, prediction, np.array(errors).reshape(-1, 6), which, tip, statuses)
+    owners = [k for k in sorted(done) for _ in done[k][0]]
+    statuses = sum((counts for _, counts in done.values()), Counter[str]())
+    return _compared(plan, prediction, np.array(errors).reshape(-1, 6), owners, tip, statuses)
 
 
-def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
-    """Twists (6,) from the truth to the estimate, modulo the body's symmetries; and statuses."""
-    session, plan, T, frames, seed = place
+def _errors_at(recording: _Recording) -> tuple[list[Floats], Counter[str]]:
+    """Return twists (6,) from truth to estimates, modulo the body's symmetries, and statuses."""
+    session, plan, T, frames, seed = recording
     least = {
-        m: min((n for n, one in zip(plan.noises, plan.sensors) if one.dimension == m), default=0.0)
+        m: min((n for n, s in zip(plan.noises, plan.sensors) if s.dimension == m), default=0.0)
         for m in (1, 2)
     }
     options = SimulationOptions(
@@ -105,34 +105,34 @@ def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.toml"
         path.write_text(_plan_text(session, plan, T), encoding="utf-8")
-        recording = Path(folder) / "recording"
-        simulate(load_session(path), recording, options)
+        recorded = Path(folder) / "recording"
+        simulate(load_session(path), recorded, options)
         rng = np.random.default_rng([seed, frames])
         for name, sensor, noise in zip(plan.names, plan.sensors, plan.noises, strict=True):
-            more = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
-            if more > 0:
-                _made_noisier(recording / f"{name}.csv", more, rng)
-        for estimate in run(load_session(recording / "session.toml")):
+            added = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
+            if added > 0:
+                _add_noise(recorded / f"{name}.csv", added, rng)
+        for estimate in run(load_session(recorded / "session.toml")):
             statuses[estimate.status] += 1
             if estimate.T_world_object is None:
                 continue
             twists = twist_between(alike, np.broadcast_to(estimate.T_world_object, alike.shape))
             nearest = int(np.linalg.norm(twists[:, 3:], axis=1).argmin())
-            # errors of a pose that looks the same, taken back to the pose itself
+            # an estimate turned by a symmetry is turned back before it is compared
             same = estimate.T_world_object @ inverse(plan.body.symmetries[nearest])
             errors.append(twist_between(T, same))
     return errors, statuses
 
 
 def _plan_text(session: Session, plan: Plan, T_world_object: Floats) -> str:
-    """A session of a plan's body at a pose, with tables of detections, exact to the last bit."""
+    """Return a session of a plan's body at a pose, with exact tables of detections."""
     rows = zip(plan.names, plan.sensors, plan.sigmas, strict=True)
     free = [name for name, is_free in zip(TWIST_NAMES, plan.free, strict=True) if is_free]
     tables = {
         "unit": session.unit,
         "object": _body(plan.body),
         "start": {"T_world_object": T_world_object},
-        # every frame stands for itself: none is to profit from the one before
+        # each frame is estimated by itself, without the one before as a prior
         "estimator": {"fuse": False, "free": free},
         "sensor": [_sensor(name, sensor, sigma) for name, sensor, sigma in rows],
     }
@@ -176,18 +176,18 @@ def _sensor(name: str, sensor: Sensor, width: float) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """The same of lists and Python's own numbers; None for what is not finite."""
+    """Return lists and Python's own numbers in place of arrays; None for infinite and NaN."""
     if isinstance(value, dict):
-        return {key: plain(each) for key, each in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _made_noisier(table: Path, noise: float, rng: np.random.Generator) -> None:
-    """Add noise to the coordinates of a table; `simulate` has one noise for all cameras."""
+def _add_noise(table: Path, noise: float, rng: np.random.Generator) -> None:
+    """Add noise to the coordinates of a table, as `simulate` has one noise for all cameras."""
     with table.open(encoding="utf-8", newline="") as stream:
         header, *rows = csv.reader(stream)
     columns = [header.index(name) for name in ("u", "v", "range") if name in header]
@@ -202,11 +202,11 @@ def _compared(
     plan: Plan,
     prediction: Prediction,
     errors: Floats,
-    which: list[int],
+    owners: list[int],  # number of the pose of each error
     tip: Floats,
     statuses: Counter[str],
 ) -> Confirmation:
-    covariances = prediction.covariances[which]
+    covariances = prediction.covariances[owners]
     free = np.flatnonzero(plan.free)
     variances = np.einsum("nii->ni", covariances)
     summed = variances.reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
@@ -216,8 +216,8 @@ def _compared(
     inner = covariances[:, free][:, :, free]
     solved = np.linalg.solve(inner, errors[:, free, None])[..., 0]
     squares = np.einsum("ni,ni->n", errors[:, free], solved)
-    tips = np.einsum("nii->n", at_tip(prediction, tip)[which])
-    arms = (prediction.poses[:, :3, :3] @ tip)[which]
+    tips = np.einsum("nii->n", at_tip(prediction, tip)[owners])
+    arms = (prediction.poses[:, :3, :3] @ tip)[owners]
     parts = errors[:, :3], errors[:, 3:], errors[:, :3] + np.cross(errors[:, 3:], arms)
     return Confirmation(
         frames=sum(statuses.values()),

@@ -1,4 +1,4 @@
-"""A study in one picture: deviations side by side, and where in the volume errors are large."""
+"""Draw a study: deviations of systems side by side, and errors over the volume."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def require_plots(path: Path) -> None:
-    """See that a picture can be drawn, before anything is computed for it.
+    """Check that a picture can be drawn, before anything is computed for it.
 
     Raises a SessionError if matplotlib is not installed, or does not write such files.
     """
@@ -65,11 +65,11 @@ def _bars(axes: list[Axes], study: Study) -> None:
             values = np.where(np.isfinite(values), values, np.nan)
             if np.isnan(values).all():
                 continue
-            middle = np.nanmedian(values, axis=0)
+            medians = np.nanmedian(values, axis=0)
             worst = np.nanmax(values, axis=0)
-            places = np.arange(3) + (k - (len(study.systems) - 1) / 2) * width
-            axis.bar(places, middle, width, label=system.name, color=f"C{k}")
-            axis.plot(places, worst, "_", color="black", markersize=12)
+            positions = np.arange(3) + (k - (len(study.systems) - 1) / 2) * width
+            axis.bar(positions, medians, width, label=system.name, color=f"C{k}")
+            axis.plot(positions, worst, "_", color="black", markersize=12)
         axis.set_xticks(range(3), [TWIST_NAMES[d] for d in directions])
         axis.set_ylabel(f"deviation, {unit}: median, worst")
     for name in axes[0].legend().get_texts():
@@ -77,12 +77,12 @@ def _bars(axes: list[Axes], study: Study) -> None:
 
 
 def _maps(axes: list[Axes], study: Study, errors: Floats, largest: float) -> None:
-    places = study.request.poses[:, :3, 3]
+    positions = study.request.poses[:, :3, 3]
     known = np.isfinite(errors)
     for axis, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
-        axis.plot(places[~known, i], places[~known, j], "x", color="0.5")
+        axis.plot(positions[~known, i], positions[~known, j], "x", color="0.5")
         points = axis.scatter(
-            places[known, i], places[known, j], c=errors[known], vmin=0, vmax=largest or 1.0
+            positions[known, i], positions[known, j], c=errors[known], vmin=0, vmax=largest or 1.0
         )
         axis.set_xlabel(f"{TWIST_NAMES[i]}, {study.unit}")
         axis.set_ylabel(f"{TWIST_NAMES[j]}, {study.unit}")

@@ -1,4 +1,4 @@
-"""Poses to judge a planned system at: a box of positions, orientations around a first one."""
+"""Poses at which a planned system is judged: positions in a box, turns around a first pose."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mixpose.session import Session
 from mixpose.simulation.central_pose import central_pose, pivot_of
 
 ALL_TURNS = 180.0
-TURN_AROUND_START = 20.0  # degrees, where the session says how the body is turned
+TURN_AROUND_START = 20.0  # degrees, if the session gives the body's orientation
 
 
 def spread_poses(
@@ -24,13 +24,13 @@ def spread_poses(
     turn_deg: float | None = None,
     seed: int = 0,
 ) -> Floats:
-    """Poses T_world_object (P, 4, 4) spread evenly over a volume; the first is its middle.
+    """Return poses T_world_object (P, 4, 4) spread evenly over a volume; the first is its middle.
 
-    Cameras must have a resolution.  The middle is the session's ``[start]``, else where its sensors
-    look together.  `volume` (3,) are the sides of the box that the body's middle is in, along the
-    world's axes; left out, twice the body's radius.  `turn_deg` is the largest angle from the
-    orientation of the middle, up to 180; left out, 20 around a ``[start]`` and else 180.  Raises
-    SessionError if no place is in view of a sensor.
+    Cameras must have a resolution.  The middle is the session's ``[start]``, or else where its
+    sensors look together.  `volume` (3,) are the sides of the box, along the world's axes, that
+    contains the body's middle; the default is twice the body's radius.  `turn_deg`, up to 180, is
+    the largest angle from the orientation of the middle; the default is 20 around a ``[start]``,
+    else 180.  Raises SessionError if no place is in view of a sensor.
     """
     centre = central_pose(session, seed)
     body = session.body
@@ -42,15 +42,15 @@ def spread_poses(
     drawn = qmc.Halton(6, rng=np.random.default_rng(seed)).random(count)
     pivot = pivot_of(body)
     middle = centre[:3, :3] @ pivot + centre[:3, 3]
-    places = middle + (drawn[:, :3] - 0.5) * sides
+    positions = middle + (drawn[:, :3] - 0.5) * sides
     rotations = _turns(drawn[:, 3:], turn_deg) @ centre[:3, :3]
-    poses = from_parts(rotations, places - rotations @ pivot)
+    poses = from_parts(rotations, positions - rotations @ pivot)
     poses[0] = centre
     return poses
 
 
 def _turns(drawn: Floats, turn_deg: float) -> Floats:
-    """Rotations (P, 3, 3) out of numbers (P, 3) from 0 to 1, evenly over all within an angle."""
+    """Return evenly spread rotations (P, 3, 3) up to an angle, from numbers (P, 3) from 0 to 1."""
     if turn_deg >= ALL_TURNS:
         u, v, w = drawn[:, 0], 2 * np.pi * drawn[:, 1], 2 * np.pi * drawn[:, 2]
         a, b = np.sqrt(1 - u), np.sqrt(u)

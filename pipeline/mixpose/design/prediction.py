@@ -1,18 +1,18 @@
-"""Covariance of poses before anything is measured: detections and markers that err.
+"""Predict covariances of poses before anything is measured, by errors of detections and markers.
 
 With the Jacobian J_li of feature i in sensor l by the pose, its Jacobian A_li by the feature's own
-place, and the weights W_li that a run gives it, a least-squares fit errs by
+place, and the weights W_li of a run, a least-squares fit has the covariance
 
     H⁻¹ (Σ_l Σ_i J_liᵀ W_li σ_l² W_li J_li + Σ_i G_i Σ_i G_iᵀ) H⁻¹,
     H = Σ_l Σ_i J_liᵀ W_li J_li,    G_i = Σ_l J_liᵀ W_li A_li .
 
-W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹, with s_l between the sensor's `sigma` and what features err by,
-σ_l (`Plan.weighed`).  A marker that is off its place is off in all sensors alike, which is why its
-terms are summed over sensors before they are squared.  Where s_l is in proportion to σ_l and
-markers are exact it is the inverse information.  For points that are measured in three directions
-alike it is the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
+W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹, with s_l between the sensor's `sigma` and the noise of its
+features, σ_l (`Plan.weighed`).  A marker that is off its place is off in all sensors alike, which
+is why its terms are summed over sensors before they are squared.  If s_l is proportional to σ_l and
+markers are exact, it is the inverse information.  For points measured alike in three directions it
+is the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
 
-Over many poses a prediction is summed up as few numbers: how accurate, where weak, what is seen.
+A prediction over many poses is summarised: how accurate, where weak, what is seen.
 """
 
 from __future__ import annotations
@@ -31,50 +31,50 @@ from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
 from mixpose.session import SensorSetup, Session
 
-_TRIED = 3  # poses at which others that look alike are searched for: a second each
-_NEAR = 4.0  # standard deviations between features whose labels are then mixed up now and then
+_TRIED = 3  # poses at which look-alikes are searched for, a second each
+_NEAR = 4.0  # standard deviations between features whose labels are sometimes mixed up
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A system: sensors with what each of their features errs by, and a body."""
+    """A system: sensors with the noise of their features, and a body."""
 
     names: tuple[str, ...]  # of the sensors
     sensors: tuple[Sensor, ...]
-    noises: tuple[float, ...]  # deviation of a feature along each coordinate, px or length units
-    sigmas: tuple[float, ...]  # σ_ε, by which a run weighs sensors against each other at first
+    noises: tuple[float, ...]  # by sensor: deviation of a feature's coordinates, px or length units
+    sigmas: tuple[float, ...]  # by sensor: σ_ε, by which a run weighs sensors at first
     body: Body  # spreads of its features are errors of markers
     free: Mask  # (6,): directions that are estimated
 
     def weighed(self) -> Floats:
-        """Variances s_l² (L,) by which a run weighs sensors once frames have shown their noise.
+        """Return variances s_l² (L,) by which a run weighs sensors once it has seen their noise.
 
         Single ranges alone are weighed by `sigma`.
         """
         stated = np.square(self.sigmas)
-        shown = np.square(self.noises) / stated
-        if not shown.all() or all(sensor.dimension == 1 for sensor in self.sensors):
+        ratios = np.square(self.noises) / stated
+        if not ratios.all() or all(sensor.dimension == 1 for sensor in self.sensors):
             return stated
-        own = NoiseModel().errors.counted(shown)
-        return np.asarray(stated * own * (1 / own).mean())
+        counted = NoiseModel().errors.counted(ratios)
+        return np.asarray(stated * counted * (1 / counted).mean())
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is expected at P poses."""
+    """Covariances expected at P poses."""
 
     poses: Floats  # (P, 4, 4): T_world_object
-    covariances: Floats  # (P, 6, 6), world axes: infinite on the diagonal where open, 0 where held
-    seen: Mask  # (P, L, N): features that are in view of a sensor and face it
+    covariances: Floats  # (P, 6, 6), world axes: infinite on the diagonal if open, 0 if held
+    seen: Mask  # (P, L, N): features in view of a sensor that face it
 
 
 def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
-    """The system of a session; noises by sensor stand in place of those of its `sigma`."""
-    given = noises or {}
+    """Return the system of a session; `noises` by sensor replace those by its `sigma`."""
+    changed = noises or {}
     return Plan(
         names=tuple(setup.name for setup in session.sensors),
         sensors=tuple(setup.sensor for setup in session.sensors),
-        noises=tuple(given.get(setup.name, noise_of(setup)) for setup in session.sensors),
+        noises=tuple(changed.get(setup.name, noise_of(setup)) for setup in session.sensors),
         sigmas=tuple(setup.extract.sigma for setup in session.sensors),
         body=session.body,
         free=free_mask(session.estimator),
@@ -103,25 +103,25 @@ def predict(plan: Plan, poses: Floats) -> Prediction:
         V += noise**2 * (JW @ JW.swapaxes(-1, -2)).sum(axis=1)
         G += JW @ A
     V += (G @ spread @ G.swapaxes(-1, -2)).sum(axis=1)
-    covariances = np.array([_sandwiched(h, v, plan.free) for h, v in zip(H, V)])
+    covariances = np.array([_sandwich(h, v, plan.free) for h, v in zip(H, V)])
     return Prediction(poses, covariances, seen)
 
 
 def at_tip(prediction: Prediction, tip: Floats) -> Floats:
-    """Covariance (P, 3, 3) of a point (3,) of the body, in world axes; infinite where open."""
+    """Return the covariance (P, 3, 3) of a body's point (3,), in world axes; infinite if open."""
     arms = prediction.poses[:, :3, :3] @ tip
     J = pose_jacobian(np.broadcast_to(np.eye(3), (len(arms), 3, 3)), arms)
     known = np.isfinite(prediction.covariances)
     result = J @ np.where(known, prediction.covariances, 0.0) @ J.swapaxes(1, 2)
-    unknown = ~np.isfinite(np.einsum("pii->pi", prediction.covariances))
+    is_open = ~np.isfinite(np.einsum("pii->pi", prediction.covariances))
     reach = np.abs(J) > 1e-9 * max(1.0, float(np.abs(tip).max()))
-    touched = (reach & unknown[:, None, :]).any(axis=2)
-    for p, axis in np.argwhere(touched):
+    is_affected = (reach & is_open[:, None, :]).any(axis=2)
+    for p, axis in np.argwhere(is_affected):
         result[p, axis, axis] = np.inf
     return np.asarray(result)
 
 
-def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
+def _sandwich(H: Floats, V: Floats, free: Mask) -> Floats:
     inverse = invert_information(H, free)
     is_open = ~np.isfinite(np.diag(inverse))
     inverse[is_open, :] = inverse[:, is_open] = 0.0
@@ -132,49 +132,49 @@ def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
 
 @dataclass(frozen=True)
 class Weakness:
-    """Where a system is weakest, and in which direction."""
+    """The pose and direction in which a system is weakest."""
 
     pose: int  # number of the pose, from 0
     deviation: float  # along the worst direction
-    direction: Floats  # (3,): in world axes: of the position, or the axis of the turn
-    ratio: float  # to the deviation along the best direction there
+    direction: Floats  # (3,): of the position, or the axis of the turn, in world axes
+    ratio: float  # to the deviation along the best direction at that pose
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a system achieves over P poses."""
+    """The accuracy of a system over P poses, and what limits it."""
 
-    deviations: Floats  # (P, 6): x y z rx ry rz, lengths and radians; infinite where not determined
+    deviations: Floats  # (P, 6): x y z rx ry rz, lengths and radians; infinite if not determined
     position: Floats  # (P,): root mean square error of the origin
     rotation: Floats  # (P,): of the turn, radians
     tip: Floats  # (P,)
-    weakest_position: Weakness | None  # None where a direction is not determined at any pose
+    weakest_position: Weakness | None  # None if no pose is determined
     weakest_rotation: Weakness | None
     seen: Floats  # (L,): share of the features that each sensor sees, on average
     fewest: Floats  # (L,): features that each sensor sees at its worst pose
-    undetermined: tuple[int, ...]  # poses at which a free direction is open
-    # (L,): what a sensor's features err by, markers included, over its `sigma`.  From a third on
-    # some of them are given up as false, and errors are larger than predicted.
+    undetermined: tuple[int, ...]  # poses at which a free direction is not determined
+    # (L,): noise of a sensor's features, with that of markers, over its `sigma`.  From a third on
+    # some features are given up as false, and errors are larger than predicted.
     narrow: Floats
-    # (L,): share of the features with another nearer than four standard deviations in a sensor:
-    # there detections are mixed up, and errors larger than predicted
+    # (L,): share of features nearer than four standard deviations to another in a sensor, whose
+    # detections are sometimes mixed up, so that errors are larger than predicted
     crowded: Floats
     symmetries: int  # orientations that look the same
-    alike: tuple[LookAlike, ...]  # poses that look nearly like one of the first; the most first
+    alike: tuple[LookAlike, ...]  # look-alikes of the first poses, the most similar first
 
 
 def summarise(
     plan: Plan, setups: tuple[SensorSetup, ...], prediction: Prediction, tip: Floats
 ) -> Summary:
-    """Sum a prediction up; the setups are those of the plan's sensors."""
+    """Summarise a prediction; the setups are those of the plan's sensors."""
     variances = np.einsum("pii->pi", prediction.covariances)
     tips = at_tip(prediction, tip)
-    closed = np.isfinite(variances).all(axis=1)
+    is_determined = np.isfinite(variances).all(axis=1)
     narrow, crowded = _doubts(plan, prediction)
     alike = [
-        other
-        for T in prediction.poses[closed][:_TRIED]
-        for other in look_alikes(setups, plan.body, T, plan.free)
+        look_alike
+        for T in prediction.poses[is_determined][:_TRIED]
+        for look_alike in look_alikes(setups, plan.body, T, plan.free)
     ]
     return Summary(
         deviations=np.sqrt(variances),
@@ -185,26 +185,26 @@ def summarise(
         weakest_rotation=_weakest(prediction.covariances[:, 3:, 3:]),
         seen=prediction.seen.mean(axis=(0, 2)),
         fewest=prediction.seen.sum(axis=2).min(axis=0),
-        undetermined=tuple(np.flatnonzero(~closed).tolist()),
+        undetermined=tuple(np.flatnonzero(~is_determined).tolist()),
         narrow=narrow,
         crowded=crowded,
         symmetries=len(plan.body.symmetries),
-        alike=tuple(sorted(alike, key=lambda other: other.difference)),
+        alike=tuple(sorted(alike, key=lambda look_alike: look_alike.difference)),
     )
 
 
 def pooled(errors: Floats) -> float:
-    """Root mean square over the poses at which it is determined; infinite where there are none."""
+    """Return the root mean square of errors at determined poses; infinite if there are none."""
     known = errors[np.isfinite(errors)]
     return float(np.sqrt((known**2).mean())) if known.size else float("inf")
 
 
 def _weakest(covariances: Floats) -> Weakness | None:
-    """Of (P, 3, 3), the largest deviation."""
-    known = np.isfinite(np.einsum("pii->p", covariances))
-    if not known.any():
+    """Return the largest deviation of covariances (P, 3, 3), if any is determined."""
+    is_known = np.isfinite(np.einsum("pii->p", covariances))
+    if not is_known.any():
         return None
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
+    values, vectors = np.linalg.eigh(np.where(is_known[:, None, None], covariances, 0.0))
     pose = int(values[:, 2].argmax())
     direction = vectors[pose, :, 2]
     direction = direction * np.sign(direction[np.abs(direction).argmax()])
@@ -215,19 +215,19 @@ def _weakest(covariances: Floats) -> Weakness | None:
 
 
 def _doubts(plan: Plan, prediction: Prediction) -> tuple[Floats, Floats]:
-    """What features err by over `sigma`, and the share of those that are near others, by sensor."""
+    """Return, by sensor, noise of features over `sigma`, and the share of features near others."""
     narrow, shares = np.zeros(len(plan.sensors)), np.zeros(len(plan.sensors))
     world = transform(prediction.poses, plan.body.means)
     for k, (sensor, noise) in enumerate(zip(plan.sensors, plan.noises, strict=True)):
         y, A, _ = sensor.linearise(world)
-        # of markers, as the sensor shows them
-        shown = plan.body.spread * np.linalg.norm(A, axis=-1).max(axis=-1)
-        errs = np.sqrt(noise**2 + shown**2)
+        # errors of markers in the sensor, along the axis on which they are largest
+        marker_noise = plan.body.spread * np.linalg.norm(A, axis=-1).max(axis=-1)
+        feature_noise = np.sqrt(noise**2 + marker_noise**2)
         seen = prediction.seen[:, k]
-        narrow[k] = np.median(errs[seen]) / plan.sigmas[k] if seen.any() else 0.0
-        apart = np.linalg.norm(y[:, :, None] - y[:, None], axis=-1)
-        apart[~(seen[:, :, None] & seen[:, None])] = np.inf
-        apart[:, np.arange(len(plan.body)), np.arange(len(plan.body))] = np.inf
-        crowded = apart.min(axis=2) < _NEAR * errs
+        narrow[k] = np.median(feature_noise[seen]) / plan.sigmas[k] if seen.any() else 0.0
+        distances = np.linalg.norm(y[:, :, None] - y[:, None], axis=-1)
+        distances[~(seen[:, :, None] & seen[:, None])] = np.inf
+        distances[:, np.arange(len(plan.body)), np.arange(len(plan.body))] = np.inf
+        crowded = distances.min(axis=2) < _NEAR * feature_noise
         shares[k] = crowded.sum() / max(int(seen.sum()), 1)
     return narrow, shares

@@ -1,4 +1,4 @@
-"""A whole study: systems side by side, what equals what, and what would help."""
+"""Study systems side by side: accuracy, the noise at which one equals another, and advice."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mixpose.records import Floats
 from mixpose.session import Session
 
 SHARE_OF_RADIUS = 0.1
-"""Bodies whose markers lie alike to within this share of the smaller one's radius are told: two of
-a motion capture recording that are taken for each other, rigid to 2 to 5 mm, have 0.08."""
+"""Bodies whose markers are congruent to this share of the smaller radius are reported: two of a
+motion capture recording that are taken for each other, rigid to 2 to 5 mm, have 0.08."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study."""
+    """Options of a study."""
 
     poses: Floats  # (P, 4, 4)
     tip: Floats | None = None  # (3,): in the object's frame; None for its origin
@@ -33,24 +33,24 @@ class Request:
     noises: Mapping[tuple[int | None, str], float] = field(default_factory=dict)
     runs: int = 0  # frames to simulate for each system; 0 for none
     seed: int = 0
-    tolerance: float | None = None  # of markers that lie alike; None for a share of the radius
+    tolerance: float | None = None  # of congruent markers; None for a share of the radius
 
     @property
     def point(self) -> Floats:
-        """The tip (3,), or the origin."""
+        """Return the tip (3,), or the origin."""
         return np.zeros(3) if self.tip is None else self.tip
 
     def error_of(self, plan: Plan) -> float:
-        """Error of the point with a plan, pooled over the poses."""
+        """Return the error of the point with a plan, pooled over the poses."""
         variances = np.einsum("pii->p", at_tip(predict(plan, self.poses), self.point))
         return pooled(np.sqrt(variances))
 
 
 @dataclass(frozen=True)
 class Equal:
-    """What a system's detections must err by to be as accurate as the first system."""
+    """The noise with which a system is as accurate as the first system."""
 
-    factor: float | None  # on all its noises; None where nothing makes it so
+    factor: float | None  # on all its noises; None if no factor suffices
     noises: tuple[float, ...]  # the noises with that factor
     wanted: float  # error of the first system
     confirmation: Confirmation | None = None  # of the system with these noises
@@ -58,14 +58,14 @@ class Equal:
 
 @dataclass(frozen=True)
 class System:
-    """One system of a study."""
+    """A system of a study."""
 
     name: str
     session: Session
     plan: Plan
     summary: Summary
-    error: float  # as of the request
-    weighed: float  # the same with sigmas in proportion to what features err by
+    error: float  # as of `Request.error_of`
+    weighed: float  # the same with sigmas in proportion to the noise of features
     confirmation: Confirmation | None = None
     equal: Equal | None = None
     move: MarkerMove | None = None
@@ -74,7 +74,7 @@ class System:
 
 @dataclass(frozen=True)
 class Study:
-    """Systems, and what their bodies have in common."""
+    """Systems, and congruent parts of their bodies."""
 
     request: Request
     unit: str
@@ -88,15 +88,15 @@ def study(
     say: Callable[[str], None] = lambda text: None,
     executor: Executor | None = None,
 ) -> Study:
-    """Study systems of one unit, the first being what the others are compared with.
+    """Study systems of one unit and compare them with the first.
 
-    Their cameras have resolutions.  `say` is told what is being done; an executor does the
+    Their cameras have resolutions.  `say` is called with each step; an executor estimates the
     simulated frames.
     """
     systems: list[System] = []
     for k, (name, session) in enumerate(named):
         say(f"{name}: prediction and advice")
-        noises = {s: v for (which, s), v in request.noises.items() if which in (None, k)}
+        noises = {s: v for (index, s), v in request.noises.items() if index in (None, k)}
         systems.append(_system(name, session, plan_of(session, noises), request))
     confirmed = partial(_confirmed, request=request, executor=executor)
     for k, system in enumerate(systems):
@@ -106,7 +106,7 @@ def study(
         if k > 0:
             equal = _equal(system, systems[0], request, say, confirmed)
             systems[k] = replace(systems[k], equal=equal)
-    bodies = [each.body for _, session in named for each in session.objects]
+    bodies = [body_setup.body for _, session in named for body_setup in session.objects]
     congruences = tuple(_congruences(bodies, request))
     return Study(request, named[0][1].unit, tuple(systems), congruences)
 
@@ -114,7 +114,7 @@ def study(
 def _system(name: str, session: Session, plan: Plan, request: Request) -> System:
     error_of = request.error_of
     prediction = predict(plan, request.poses)
-    setups = []  # whose `sigma` stands for the noise: look-alikes go by it
+    setups = []  # with `sigma` in proportion to the noise, by which look-alikes are judged
     for setup, noise in zip(session.sensors, plan.noises, strict=True):
         sigma = setup.extract.sigma * noise / noise_of(setup)
         setups.append(replace(setup, extract=replace(setup.extract, sigma=sigma)))
@@ -136,13 +136,13 @@ def _system(name: str, session: Session, plan: Plan, request: Request) -> System
 def _confirmed(
     system: System, plan: Plan, *, request: Request, executor: Executor | None
 ) -> Confirmation | None:
-    closed = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
-    if not len(closed):
+    determined = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
+    if not len(determined):
         return None
     return confirm(
         system.session,
         plan,
-        request.poses[closed],
+        request.poses[determined],
         request.runs,
         tip=request.point,
         seed=request.seed,
@@ -161,15 +161,15 @@ def _equal(
     if factor is None:
         return Equal(None, (), first.error)
     plan = advice.scaled(system.plan, factor)
-    found = None
+    confirmation = None
     if request.runs:
         say(f"{system.name}: {request.runs} simulated frames with what equals {first.name}")
-        found = confirmed(system, plan)
-    return Equal(factor, plan.noises, first.error, found)
+        confirmation = confirmed(system, plan)
+    return Equal(factor, plan.noises, first.error, confirmation)
 
 
 def _congruences(bodies: Sequence[Body], request: Request) -> list[LookAlike]:
-    found: list[LookAlike] = []
+    congruences: list[LookAlike] = []
     known: list[Body] = []
     for body in bodies:
         if any(body.name == o.name and np.array_equal(body.means, o.means) for o in known):
@@ -177,6 +177,6 @@ def _congruences(bodies: Sequence[Body], request: Request) -> list[LookAlike]:
         for other in known:
             share = SHARE_OF_RADIUS * min(body.radius, other.radius)
             tolerance = share if request.tolerance is None else request.tolerance
-            found += congruent_parts(other, body, tolerance)[:1]
+            congruences += congruent_parts(other, body, tolerance)[:1]
         known.append(body)
-    return found
+    return congruences

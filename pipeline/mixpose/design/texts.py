@@ -18,31 +18,30 @@ from mixpose.rigid import TWIST_NAMES, inverse
 from mixpose.sensors import RangeSensor, Sensor
 
 _DEGREES = 180 / np.pi
-_CROWDED = 0.05  # of the features: fewer hardly show in the errors
-_NARROW, _FILLED = 0.4, 1.1  # of sigma: for cameras, and for ranges, which err by sigma
-_WORTHWHILE = 0.05  # of an error, to be told
+_CROWDED = 0.05  # of the features: a smaller share hardly shows in the errors
+_NARROW, _FILLED = 0.4, 1.1  # of sigma: for cameras, and for ranges, whose noise is sigma
+_WORTHWHILE = 0.05  # least gain of an error that is reported
 _NOTED = 3  # look-alikes and poses that are listed
 
 
 def study_text(study: Study) -> str:
-    """Lines for people."""
-    count = len(study.request.poses)
-    tip = study.request.tip
+    """Return a study as lines for people."""
+    count, tip = len(study.request.poses), study.request.tip
     point = "the origin" if tip is None else f"the tip {_vector(tip)} {study.unit}"
     lines = [f"{count} pose{'s' * (count != 1)}; errors of {point} are root mean squares"]
     for system in study.systems:
-        errors = _errs_text(system.plan, system.plan.noises, study.unit)
-        lines += ["", f"{system.name}: {errors}"]
-        lines += [f"  {title:<10}{text}" for title, text in _told(system, study)]
+        noises = _noise_text(system.plan, system.plan.noises, study.unit)
+        lines += ["", f"{system.name}: {noises}"]
+        lines += [f"  {title:<10}{text}" for title, text in _system_lines(system, study)]
     if len(study.systems) > 1:
         lines += ["", *_comparison(study)]
-    for alike in study.congruences:
-        lines += ["", _congruence_text(alike, study.unit)]
+    for congruence in study.congruences:
+        lines += ["", _congruence_text(congruence, study.unit)]
     return "\n".join(lines) + "\n"
 
 
-def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:
-    """Titles and texts."""
+def _system_lines(system: System, study: Study) -> Iterator[tuple[str, str]]:
+    """Yield titles and texts of a system's lines."""
     summary, plan, unit = system.summary, system.plan, study.unit
     yield "deviation", _deviations_text(summary, plan, unit)
     yield "error", _errors_text(summary, unit, with_tip=study.request.tip is not None)
@@ -55,7 +54,7 @@ def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:
         more = ", ..." if len(summary.undetermined) > _NOTED else ""
         count = len(summary.undetermined)
         yield "open", f"not determined at {count} pose{'s' * (count != 1)}: {listed}{more}"
-    yield from _told_of_sensors(system)
+    yield from _sensor_lines(system)
     yield "alike", _alike_text(summary)
     if system.confirmation is not None:
         yield "simulated", _confirmation_text(system.confirmation, plan)
@@ -70,29 +69,29 @@ def _told(system: System, study: Study) -> Iterator[tuple[str, str]]:
         yield "sensor", f"one more like {like} {place} gains {gain}"
 
 
-def _told_of_sensors(system: System) -> Iterator[tuple[str, str]]:
-    """What is seen by which sensor, and what is odd about it."""
+def _sensor_lines(system: System) -> Iterator[tuple[str, str]]:
+    """Yield titles and texts on views of sensors, crowded features, and `sigma`."""
     summary, plan = system.summary, system.plan
-    rows = zip(plan.names, summary.seen, summary.fewest, strict=True)
-    yield "in view", ", ".join(f"{n} {s:.0%} (least {f} of {len(plan.body)})" for n, s, f in rows)
+    seen = zip(plan.names, summary.seen, summary.fewest, strict=True)
+    yield "in view", ", ".join(f"{n} {s:.0%} (least {f} of {len(plan.body)})" for n, s, f in seen)
     crowded = [f"{n} {c:.0%}" for n, c in zip(plan.names, summary.crowded) if c > _CROWDED]
     if crowded:
-        told = f"{', '.join(crowded)}; expect larger errors"
-        yield "crowded", f"features nearer than 4 deviations to another: {told}"
+        shares = f"{', '.join(crowded)}; expect larger errors"
+        yield "crowded", f"features nearer than 4 deviations to another: {shares}"
     most = [_FILLED if sensor.unit == "length" else _NARROW for sensor in plan.sensors]
-    shares = zip(plan.names, summary.narrow, most, strict=True)
-    narrow = [f"{name} {share:.2g}" for name, share, limit in shares if share > limit]
+    rows = zip(plan.names, summary.narrow, most, strict=True)
+    narrow = [f"{name} {share:.2g}" for name, share, limit in rows if share > limit]
     if narrow:
-        told = f"{', '.join(narrow)} of it; raise sigma in [extract]"
-        yield "sigma", f"features err by much of sigma: {told}"
+        shares = f"{', '.join(narrow)} of it; raise sigma in [extract]"
+        yield "sigma", f"features err by much of sigma: {shares}"
     if system.weighed < (1 - _WORTHWHILE) * system.error:
         largest = max(plan.noises)
-        told = ", ".join(f"{n} {e / largest:.2g}" for n, e in zip(plan.names, plan.noises))
+        shares = ", ".join(f"{n} {e / largest:.2g}" for n, e in zip(plan.names, plan.noises))
         gain = _gain(system.weighed, system.error)
-        yield "weights", f"sigma in proportion to what features err by ({told}) gains {gain}"
+        yield "weights", f"sigma in proportion to what features err by ({shares}) gains {gain}"
 
 
-def _errs_text(plan: Plan, noises: tuple[float, ...], unit: str) -> str:
+def _noise_text(plan: Plan, noises: tuple[float, ...], unit: str) -> str:
     parts = [
         f"{name} {noise:.3g} {'px' if sensor.unit == 'px' else unit}"
         for name, noise, sensor in zip(plan.names, noises, plan.sensors, strict=True)
@@ -104,10 +103,10 @@ def _errs_text(plan: Plan, noises: tuple[float, ...], unit: str) -> str:
 def _deviations_text(summary: Summary, plan: Plan, unit: str) -> str:
     parts = []
     for k in np.flatnonzero(plan.free):
-        scale, each = (1.0, unit) if k < 3 else (_DEGREES, "deg")
+        scale, own_unit = (1.0, unit) if k < 3 else (_DEGREES, "deg")
         values = summary.deviations[:, k] * scale
         parts.append(
-            f"{TWIST_NAMES[k]} {_number(np.median(values))}/{_number(values.max())} {each}"
+            f"{TWIST_NAMES[k]} {_number(np.median(values))}/{_number(values.max())} {own_unit}"
         )
     return f"median/worst: {', '.join(parts)}"
 
@@ -133,22 +132,23 @@ def _weakness_text(weakness: Weakness, unit: str, scale: float) -> str:
 
 
 def _alike_text(summary: Summary) -> str:
-    same = f"{summary.symmetries} orientations look the same"
-    others = [
+    symmetry = f"{summary.symmetries} orientations look the same"
+    look_alikes = [
         f"another pose turned by {other.turn_deg:.0f} deg looks nearly the same, "
         f"{other.difference:.1f} deviations apart"
         for other in summary.alike[:_NOTED]
     ]
-    return "; ".join([same if summary.symmetries > 1 else "no symmetry", *others])
+    return "; ".join([symmetry if summary.symmetries > 1 else "no symmetry", *look_alikes])
 
 
-def _confirmation_text(found: Confirmation, plan: Plan) -> str:
-    statuses = ", ".join(f"{n} {status}" for status, n in sorted(found.statuses.items()))
-    ratios = ", ".join(f"{TWIST_NAMES[k]} {found.ratios[k]:.3f}" for k in np.flatnonzero(plan.free))
-    poses = f"{found.poses} pose{'s' * (found.poses != 1)}"
+def _confirmation_text(result: Confirmation, plan: Plan) -> str:
+    statuses = ", ".join(f"{n} {status}" for status, n in sorted(result.statuses.items()))
+    free = np.flatnonzero(plan.free)
+    ratios = ", ".join(f"{TWIST_NAMES[k]} {result.ratios[k]:.3f}" for k in free)
+    poses = f"{result.poses} pose{'s' * (result.poses != 1)}"
     return (
-        f"{found.frames} frames at {poses} ({statuses}): errors are {found.overall:.3f} times the "
-        f"predicted (by chance 1 ± {found.chance:.3f}); {ratios}"
+        f"{result.frames} frames at {poses} ({statuses}): errors are {result.overall:.3f} "
+        f"times the predicted (by chance 1 ± {result.chance:.3f}); {ratios}"
     )
 
 
@@ -156,11 +156,11 @@ def _comparison(study: Study) -> list[str]:
     systems = study.systems
     summaries = [system.summary for system in systems]
     rows = [
-        (f"position, {study.unit}", [one.position for one in summaries]),
-        ("rotation, deg", [one.rotation * _DEGREES for one in summaries]),
+        (f"position, {study.unit}", [summary.position for summary in summaries]),
+        ("rotation, deg", [summary.rotation * _DEGREES for summary in summaries]),
     ]
     if study.request.tip is not None:
-        rows.append((f"tip, {study.unit}", [one.tip for one in summaries]))
+        rows.append((f"tip, {study.unit}", [summary.tip for summary in summaries]))
     width = max(12, *(len(system.name) + 2 for system in systems))
     cells = [("", [system.name for system in systems])]
     cells += [(title, [_number(pooled(error)) for error in errors]) for title, errors in rows]
@@ -176,19 +176,19 @@ def _equal_text(system: System, equal: Equal, first: str, unit: str) -> str:
         return f"{system.name} cannot equal {first}, whatever its detections err by"
     text = (
         f"{system.name} equals {first} ({_number(equal.wanted)} {unit}) with "
-        f"{_errs_text(system.plan, equal.noises, unit)}: {equal.factor:.3g} times its noise"
+        f"{_noise_text(system.plan, equal.noises, unit)}: {equal.factor:.3g} times its noise"
     )
     if equal.confirmation is not None:
         text += f"; simulated: {_number(equal.confirmation.found[2])} {unit}"
     return text
 
 
-def _congruence_text(alike: LookAlike, unit: str) -> str:
-    ours = ", ".join(alike.body.labels[i] for i in alike.features)
-    theirs = ", ".join(alike.other.labels[j] for j in alike.partners)
+def _congruence_text(shared: LookAlike, unit: str) -> str:
+    ours = ", ".join(shared.body.labels[i] for i in shared.features)
+    theirs = ", ".join(shared.other.labels[j] for j in shared.partners)
     return (
-        f"{len(alike.features)} markers of {alike.body.name} ({ours}) lie like those of "
-        f"{alike.other.name} ({theirs}), to {_number(alike.off)} {unit}: one body may be taken "
+        f"{len(shared.features)} markers of {shared.body.name} ({ours}) lie like those of "
+        f"{shared.other.name} ({theirs}), to {_number(shared.off)} {unit}: one body may be taken "
         "for the other; move one of them"
     )
 
@@ -215,11 +215,11 @@ def _vector(values: Floats) -> str:
 
 
 JSON_MARK = '"type": "design"'
-"""What the numbers of a study begin with, by which mixpose knows its own files."""
+"""The beginning of a study's JSON, by which mixpose knows its own files."""
 
 
 def study_json(study: Study) -> dict[str, Any]:
-    """The same as JSON; what is not determined is null."""
+    """Return a study as JSON; what is not determined is null."""
     congruent = [
         {
             "bodies": [alike.body.name, alike.other.name],
@@ -228,7 +228,7 @@ def study_json(study: Study) -> dict[str, Any]:
         }
         for alike in study.congruences
     ]
-    told: dict[str, Any] = plain(
+    document: dict[str, Any] = plain(
         {
             "type": "design",
             "unit": study.unit,
@@ -238,7 +238,7 @@ def study_json(study: Study) -> dict[str, Any]:
             "congruent": congruent,
         }
     )
-    return told
+    return document
 
 
 def _system_json(system: System) -> dict[str, Any]:
@@ -279,10 +279,10 @@ def _by_sensor(plan: Plan, values: Iterable[float]) -> dict[str, float]:
     return dict(zip(plan.names, values, strict=True))
 
 
-def _confirmation_json(found: Confirmation) -> dict[str, Any]:
+def _confirmation_json(result: Confirmation) -> dict[str, Any]:
     names = ("position", "rotation", "tip")
-    both = (dict(zip(names, part, strict=True)) for part in (found.predicted, found.found))
-    return asdict(found) | dict(zip(("predicted", "found"), both, strict=True))
+    errors = (dict(zip(names, part, strict=True)) for part in (result.predicted, result.found))
+    return asdict(result) | dict(zip(("predicted", "found"), errors, strict=True))
 
 
 def _equal_json(equal: Equal, plan: Plan) -> dict[str, Any]:

@@ -39,28 +39,28 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
 
 
 def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
-    sights = found.sights[index]
+    met = found.met[index]
     eye: Any = found.after.sensors[index]
-    if not len(sights.y):
+    if not len(met.y):
         return None
     if eye.dimension == 1:
         figure, axes = blank()
-        axes.plot(sights.y[:, 0], sights.offset[:, 0], ".", markersize=2.5, **POSE)
+        axes.plot(met.y[:, 0], met.offset[:, 0], ".", markersize=2.5, **POSE)
         axes.set(xlabel=f"range, {unit}", ylabel=f"residual, {unit}")
     else:
         figure, axes = blank(height=3.2)
-        low, high = sights.y.min(axis=0), sights.y.max(axis=0)
+        low, high = met.y.min(axis=0), met.y.max(axis=0)
         if getattr(eye, "resolution", None) is not None:
             low, high = np.zeros(2), np.array(eye.resolution, dtype=float)
         axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal")
         width = float(np.ptp(axes.get_xlim()))
         scale = max(3 * found.noise[index] / (_LONG * width), 1e-12)
         look: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "width": 0.003, **POSE}
-        axes.quiver(*sights.y.T, *sights.offset.T, scale=scale, **look)
+        axes.quiver(*met.y.T, *met.offset.T, scale=scale, **look)
         axes.set_xlabel(f"px; residuals are drawn {1 / scale:.2g} times as long")
-    rms = float(np.sqrt((sights.offset**2).sum(axis=1).mean()))
+    rms = float(np.sqrt((met.offset**2).sum(axis=1).mean()))
     title = f"{found.after.names[index]}: what was met, and by how much it is off"
-    alt = f"{len(sights.y)} detections, residual {rms:.3g} RMS"
+    alt = f"{len(met.y)} detections, residual {rms:.3g} RMS"
     return Chart(title, alt, drawn(figure))
 
 
