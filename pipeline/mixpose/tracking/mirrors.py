@@ -36,8 +36,9 @@ _STEP = 1e-6  # of differences, radii and radians
 
 
 def is_flat(data: Setup) -> bool:
-    """Test whether a turn brings the body onto its mirror image."""
-    return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
+    """Test whether the body is flat and a turn brings it, with its faces, onto its mirror image."""
+    body, alike = data.body, data.rules.look_alikes.alike
+    return body.is_exact and thickness(body) < alike and bool(_improper_symmetries(body, alike))
 
 
 def mirror_odds(data: Frame, first: ScoredPose, second: ScoredPose) -> tuple[float, bool]:
@@ -72,7 +73,8 @@ def _improper_symmetries(body: Body, alike: float) -> tuple[Floats, ...]:
     """
     everything = frozenset(range(len(body)))
     image, M = mirror_image(body, everything), reflection(body.means)
-    if thickness(body) < alike:  # map each feature onto itself
+    # each feature of a flat body maps onto itself; a normal would point to the other side
+    if thickness(body) < alike and body.normals is None:
         onto = [*motions(body.means, image.means[None])]
     else:
         parts = like_features(image, everything, body, tolerance_of(body, body, alike))
