@@ -94,6 +94,7 @@ def adjust_bodies(
             is_kept &= are_unique(adjusted.state.rig.points, frames_seen, near)
             if is_kept.all():
                 rig, blocks = adjusted.state.rig, adjusted.covariance.reshape(len(points), 3, -1, 3)
+                met = zip(rig.names, _pairs_met(adjusted), strict=True)
                 learnt_body = LearntBody(
                     names=rig.body.labels,
                     points=rig.points,
@@ -104,10 +105,7 @@ def adjust_bodies(
                     count=body.count,
                     residual=float(np.sqrt(np.mean((adjusted.noise / sensor_set.sigmas) ** 2))),
                     spread=_spread(body, clouds),
-                    met={
-                        name: len(pairs) / len(frames)
-                        for name, pairs in zip(rig.names, _pairs_met(adjusted), strict=True)
-                    },
+                    met={name: len(pairs) / len(frames) for name, pairs in met},
                 )
                 learnt_bodies.append(as_symmetric(learnt_body, sigma))
                 break

@@ -1,7 +1,7 @@
 """Shapes, a few points at known distances: find them in frames, and grow them to bodies.
 
-Frames in which a body is where it was before do not show what belongs to it: whatever rests next to
-it would.  Only different poses count.
+Only frames at different poses show what belongs to a body: at one pose, anything at rest near it
+seems to.
 """
 
 from __future__ import annotations
@@ -217,10 +217,7 @@ def find_placements(
 
 
 def grow_body(shape: Shape, clouds: Sequence[Cloud]) -> PlacedBody | None:
-    """Find a shape of three points or more in all frames, and add points that move along with it.
-
-    None if it is not found in enough frames at different poses.
-    """
+    """Find a shape in all frames and add points that move along; None if it does not recur."""
     for turn in range(RULES.rounds):
         placements = find_placements(shape, clouds)
         if len(placements) < RULES.least_frames:
@@ -262,10 +259,7 @@ def _pose_ids(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> 
 
 
 def averaged(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> tuple[Shape, Mask]:
-    """Average a shape over its placements; drop points that are rarely seen or are duplicates.
-
-    Also return which of its points (N,) are kept.
-    """
+    """Average a shape without rarely seen points and duplicates; also return which points stay."""
     weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
     counts, sigma = np.zeros(len(shape)), np.zeros(len(shape))
     number, different = _pose_ids(shape, placements, clouds)
