@@ -40,7 +40,7 @@ class LearntBody:
 
     names: tuple[str, ...]  # of the markers
     points: Floats  # (N, 3)
-    covariances: Floats  # (N, 3, 3): in the frame that keeps the markers' mean pose
+    covariances: Floats  # (N, 3, 3): in the frame that is fixed by the markers' mean
     frames: Indices  # (N,): number of frames in which two cameras or more, or a cloud, saw a marker
     poses: Floats  # (K, 4, 4): T_world_object in the frames that were adjusted
     numbers: Indices  # (K,): of these frames, which repeat if congruent bodies have a pose each
@@ -48,7 +48,7 @@ class LearntBody:
     residual: float  # deviation of detections, as a share of σ_ε
     # standard deviation of markers from their places, per axis, beyond triangulation errors; or 0
     spread: float
-    met: Mapping[str, float] = field(default_factory=dict)  # by sensor, mean markers in a frame
+    met: Mapping[str, float] = field(default_factory=dict)  # by sensor, markers per frame
 
     @property
     def deviations(self) -> Floats:
@@ -114,7 +114,7 @@ def adjust_bodies(
 
 
 def as_symmetric(learnt: LearntBody, tolerance: float) -> LearntBody:
-    """Return the body made symmetric, if a frame that errs by `tolerance` cannot show its turn.
+    """Return the body made symmetric, if frames that err by `tolerance` cannot show its turns.
 
     In each frame the turn that suits the noise best was taken, so that the learnt shape contains
     noise.  Offsets of markers from their mean over all turns are added to their covariances, as
@@ -138,7 +138,7 @@ def as_symmetric(learnt: LearntBody, tolerance: float) -> LearntBody:
 def _frames_of(
     body: PlacedBody, bodies: Sequence[PlacedBody], clouds: Sequence[Cloud], sensor_set: SensorSet
 ) -> tuple[tuple[SeenFrame, ...], Floats]:
-    """Return the frames that tell most of a body, without detections of others, and its poses."""
+    """Return the most informative frames of a body, without detections of others, and its poses."""
     claimed: dict[int, list[tuple[object, Indices]]] = {}
     for other in bodies:
         for k, placement in other.placements:
@@ -150,14 +150,13 @@ def _frames_of(
         frame = _unclaimed(clouds[k].frame, others, is_timed=body.count == 1)
         frames.append(frame)
         poses[id(frame)] = placement.T_world_shape
-    count, is_late = len(sensor_set.sigmas), sensor_set.rig.is_late
-    chosen = informative(frames, count, RULES.adjusted, runs=is_late)
-    return chosen, np.array([poses[id(frame)] for frame in chosen])
+    best = informative(frames, len(sensor_set.sigmas), RULES.adjusted, runs=sensor_set.rig.is_late)
+    return best, np.array([poses[id(frame)] for frame in best])
 
 
 def _unambiguous(body: PlacedBody, clouds: Sequence[Cloud]) -> Placements:
     """Return placements whose points lie like no others of the shape, or all if these are few."""
-    model = body_of("", body.shape.points)  # points like others may be met by a turned body
+    model = body_of("", body.shape.points)  # points that lie like others do not fix its turn
     tolerance = RULES.gate * usual_sigma(body.placements, clouds)
     unambiguous = [
         (k, placement)

@@ -37,8 +37,7 @@ def find_bodies(
     unclaimed, bodies = list(clouds), list[PlacedBody]()
     while len(bodies) < RULES.most_bodies:
         progress("looking for bodies", len(bodies), RULES.most_bodies)
-        body = _next(unclaimed, rng)
-        if body is None:
+        if (body := _next(unclaimed, rng)) is None:
             break
         # a frame with few points of a body may show none of the triples by which it is searched
         least = shapes.least_met(len(body.shape))
@@ -61,8 +60,7 @@ def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> PlacedBody | Non
     for looseness in RULES.looser[:2]:
         loosened = [cloud.loosened(looseness) for cloud in clouds]
         for shape in _shapes(loosened, rng)[:_TRIED]:
-            body = _tightest_body(shape, looseness, clouds)
-            if body is not None:
+            if (body := _tightest_body(shape, looseness, clouds)) is not None:
                 return body
     return None
 
@@ -109,8 +107,7 @@ def _shapes(clouds: Sequence[Cloud], rng: np.random.Generator) -> list[Shape]:
         reference = clouds[group[np.argmax(sizes[group])]]
         others = _PaddedClouds.of([clouds[k] for k in compared if clouds[k] is not reference])
         for triple in _reference_triples(reference, rng):
-            scored = _scored(reference, triple, others)
-            if scored is not None:
+            if (scored := _scored(reference, triple, others)) is not None:
                 candidates.append(scored)
     return [shape for _, shape in sorted(candidates, key=lambda scored: -scored[0])]
 

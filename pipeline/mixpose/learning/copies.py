@@ -81,7 +81,7 @@ def without_bodies(placements: Placements, clouds: Sequence[Cloud]) -> list[Clou
 
 
 def frames_needed(frames: int) -> float:
-    """Return the number of frames, of so many, in which a thing must be seen to be no accident."""
+    """Return how many of some frames must show a thing so that it is not there by accident."""
     return max(RULES.least_frames, 2 * RULES.least_share * frames)
 
 
@@ -113,8 +113,8 @@ def _of_copy(shape: Shape) -> int:
 
 
 def _count(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> int:
-    """Count placements per frame that occur in enough frames."""
-    # half as often all must show more than the three points that a mirror image has in common
+    """Return how many placements there are at the same time in enough frames."""
+    # half as often each must meet more than the three points that a mirror image has in common
     full = [(k, p) for k, p in placements if p.count > min(FEWEST, len(shape) - 1)]
     per_frame, full_per_frame = _per_frame(placements, clouds), _per_frame(full, clouds)
     often = frames_needed(int((per_frame > 0).sum()))
@@ -137,8 +137,7 @@ def _are_exclusive(shape: Shape, placements: Placements, count: int) -> Mask:
     seen = np.array(met, dtype=np.bool_).reshape(-1, count, len(shape))
     expected = len(seen) * _share(seen.reshape(-1, len(shape))) ** count
     all_show = seen.all(axis=1).sum(axis=0)
-    is_exclusive = (pdtr(all_show, expected) < _ACCIDENT) & (all_show < _SELDOM * expected)
-    return np.asarray(is_exclusive)
+    return np.asarray((pdtr(all_show, expected) < _ACCIDENT) & (all_show < _SELDOM * expected))
 
 
 def _are_foreign(shape: Shape, placements: Placements, is_exclusive: Mask) -> Mask:

@@ -214,7 +214,7 @@ def gathered_places(
 
     Points may be off by their reach (n,), standard deviations times the gate.  Frames (n,) with the
     same information share a number, and `least` different ones must show a place.  A place has at
-    most one point of a frame, the nearest; points within three gates are not used for later places.
+    most one point of a frame, the nearest; points within three gates of it start no later place.
     """
     gathered: list[tuple[Floats, Indices]] = []
     if len(points) < least:
@@ -259,8 +259,7 @@ def without_still(clouds: Sequence[Cloud]) -> tuple[list[Cloud], list[Floats]]:
     points = np.concatenate([cloud.points for cloud in clouds])
     reach = RULES.gate * np.concatenate([cloud.sigma for cloud in clouds])
     frame = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
-    filled = sum(len(cloud) > 0 for cloud in clouds)
-    least = max(RULES.still_share * filled, RULES.least_frames)
+    least = max(RULES.still_share * sum(len(cloud) > 0 for cloud in clouds), RULES.least_frames)
     still = gathered_places(points, reach, frame, least)
     detections = np.concatenate([cloud.detections for cloud in clouds])
     taken = np.concatenate([np.zeros(0, dtype=np.intp), *(chosen for _, chosen in still)])

@@ -24,11 +24,11 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, inverse, transform
 
 FEWEST = 3
-_HEIGHT = 4.0  # deviations: height of a triangle above its longest side that fixes its turn
+_HEIGHT = 4.0  # deviations: least height of a triangle above its longest side that fixes its turn
 # gates within which points are met before and after each fit to the points met; the first fits
 # extrapolate from three points
 _WIDE = (2.0, 2.0, 1.0, 1.0)
-_COMMON = 0.15  # of a point's deviation: errors that all frames have in common
+_COMMON = 0.15  # of a point's deviation: errors that many frames have in common
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,18 +218,18 @@ def find_placements(
 
 def grow_body(shape: Shape, clouds: Sequence[Cloud]) -> PlacedBody | None:
     """Find a shape in all frames and add points that move along; None if it does not recur."""
-    for turn in range(RULES.rounds):
+    for n in range(RULES.rounds):
         placements = find_placements(shape, clouds)
         if len(placements) < RULES.least_frames:
             return None
         shape, _ = averaged(shape, placements, clouds)
         if len(shape) < FEWEST:
             return None
-        if turn + 1 == RULES.rounds:
+        if n + 1 == RULES.rounds:
             break
         before = len(shape)
-        shape = _with_hidden(shape, placements, clouds)
-        if len(shape) == before and turn:
+        shape = _with_further_points(shape, placements, clouds)
+        if len(shape) == before and n:
             break
     if not len(wide_triples(shape.points, shape.sigma, 1)):
         return None
@@ -296,7 +296,7 @@ def _averaged_sigma(sigma: Floats, counts: Floats) -> Floats:
     return np.asarray(sigma * np.maximum(1 / np.sqrt(counts), _COMMON))
 
 
-def _with_hidden(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> Shape:
+def _with_further_points(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> Shape:
     """Return the shape with further points that are at one place of it at many poses."""
     points, radius, pose_number = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
     number, different = _pose_ids(shape, placements, clouds)

@@ -126,8 +126,7 @@ def look_alikes(bodies: Sequence[LearntBody], names: Sequence[str]) -> list[str]
     models = [body_of(name, body.points) for name, body in zip(names, bodies, strict=True)]
     for k, first in enumerate(models):
         for other, second in enumerate(models[:k]):
-            parts = congruent_parts(first, second, tolerance_of(first, second, _ALIKE))
-            if parts:
+            if parts := congruent_parts(first, second, tolerance_of(first, second, _ALIKE)):
                 a = ", ".join(bodies[k].names[n] for n in parts[0].features)
                 b = ", ".join(bodies[other].names[n] for n in parts[0].partners)
                 hint = "where no others are seen the two cannot be told apart"

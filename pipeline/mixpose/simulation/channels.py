@@ -22,7 +22,7 @@ from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.visible_spots import View, brightness_levels
 
 _LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
-_CLOUD_NOISE = 0.2  # of sigma, which is a tolerance of clouds
+_CLOUD_NOISE = 0.2  # of sigma, which is a tolerance and not the noise
 _TABLE_SPACING_PX = 2.0
 _SPOT_SIGMA_PX = 1.6
 _OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size
@@ -71,8 +71,8 @@ class Planner:
     def channel(self, setup: SensorSetup, files: SourceFiles, index: int, step_s: float) -> Channel:
         """Return the channel of a sensor, or raise a `SessionError` if it cannot be simulated.
 
-        Random numbers are keyed by its `index` in the session; its times are `step_s` later than
-        those of the first sensor.
+        Random numbers are keyed by its `index` in the session; it is `step_s` later than the first
+        sensor, and so are its times.
         """
         shutter = shutter_of(setup, self.options, step_s)
         is_image = setup.sensor.dimension == 2

@@ -28,7 +28,7 @@ _FIRST = 0.07
 PoseAt: TypeAlias = Callable[[float], Floats]
 """Function from seconds, of the recording or after a frame, to a pose (4, 4)."""
 
-_ROUNDS = 6  # each reduces the error to the share of rows crossed in a readout: a thousandth
+_ROUNDS = 6  # each multiplies the error by the share of rows crossed in a readout: 0.001
 _BLUR_STEPS = 9  # positions of a moving marker that are summed in an exposure
 
 

@@ -48,7 +48,7 @@ class SourceFiles:
 
     @property
     def may_lack_frames(self) -> bool:
-        """Whether a frame may be missing: the files or rows of others have their numbers."""
+        """Whether a frame may be missing, as the others state their own numbers."""
         if self.kind == "images":
             return not self.listed and self.ending == PurePosixPath(f"0{self.ending}").suffix
         return self.kind == "detections"
@@ -94,10 +94,10 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
     ]
     numbers = _frame_numbers(single, frames)
     files = tuple(_source_files(setup, source, numbers) for setup, source in single)
-    for plan in files:
-        if plan.counts_from_zero and numbers[-1] != frames - 1:
+    for target in files:
+        if target.counts_from_zero and numbers[-1] != frames - 1:
             raise SessionError(
-                f"{_where(plan.sensor)}: counts frames from 0, while a list of images of another "
+                f"{_where(target.sensor)}: counts frames from 0, while a list of images of another "
                 f"sensor has the numbers {numbers[0]} to {numbers[-1]}; use numbered images"
             )
     for first, other in permutations(files, 2):
@@ -211,10 +211,10 @@ def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> Source
         concrete = f"{pattern}.png"
     elif _WILD.search(suffix):
         concrete = f"{head}.png"
-    before, after, places = _split_at_number(concrete, sensor)
-    digits = places or max(_FEWEST_DIGITS, len(str(numbers[-1])))
+    before, after, width = _split_at_number(concrete, sensor)
+    digits = width or max(_FEWEST_DIGITS, len(str(numbers[-1])))
     if before[-1:].isdigit():  # otherwise frame 0001 of cam2 would be read as frame 20001
-        before, digits = f"{before}_", places - 1 if places else digits
+        before, digits = f"{before}_", width - 1 if width else digits
     files = SourceFiles(sensor, "images", before, after, digits, pattern=pattern)
     ends = [numbers[0], numbers[-1]] if len(numbers) > 1 else [numbers[0]]
     names = [files.name(number) for number in ends]

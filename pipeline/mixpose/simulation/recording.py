@@ -153,7 +153,7 @@ def _frames_per_second(session: Session, options: SimulationOptions) -> float:
 
 
 def _clear_folder(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
-    """Make the folder, and remove the files of an earlier recording."""
+    """Make the folder, and remove an earlier recording if it may be overwritten."""
     if folder.resolve() == plan.session.folder.resolve():
         raise SessionError(
             f"simulate: {folder}: is the folder of {plan.session.path.name} itself; choose "

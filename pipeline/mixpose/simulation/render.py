@@ -26,7 +26,7 @@ from mixpose.simulation.visible_spots import VisibleSpots, coverage
 _REACH = 5.0  # standard deviations up to which a spot is drawn: it is below 1e-6 beyond
 _WHITE = 255.0
 _RED, _GREEN, _BLUE = 1.0, 0.8, 0.6
-# Run lengths without a filter: smallest for noise, and fast.
+# Run lengths without a filter: best for noise, and fast.
 _PNG = (
     cv2.IMWRITE_PNG_STRATEGY,
     cv2.IMWRITE_PNG_STRATEGY_RLE,
@@ -201,7 +201,7 @@ class VideoWriter:
     ) -> None:
         self._options, self._form = options, form
         path = _with_folder(folder / files.path)
-        # only OpenCV's own writer of MJPEG has an adjustable quality
+        # the quality of OpenCV's own MJPEG writer can be set
         is_mjpeg = path.suffix.casefold() == ".avi"
         self._video = cv2.VideoWriter(
             str(path),

@@ -1,7 +1,7 @@
 """What cameras see besides the body: lamps, a reflecting table, other bodies' markers, an arm.
 
-Everything is placed around the centre of the body's motion, before or behind it, and drawn from a
-seed.  Range sensors do not see it.
+It is placed around the centre of the body's motion, and drawn from a seed.  Range sensors do not
+see it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ARM_PERIOD = 0.8  # of the period of the body
 
 @dataclass(frozen=True)
 class Actor:
-    """Markers in view: those of the body, of others, or mirror images."""
+    """Features in view: markers of a body, lamps, or mirror images of markers."""
 
     body: Body
     pose: PoseAt  # T_world_object (4, 4) by seconds
