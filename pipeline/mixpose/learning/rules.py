@@ -14,11 +14,12 @@ class LearningRules:
     widest: float = constant(3.0, "σ_ε that rays may miss each other by while the noise is unknown")
     gate: float = constant(3.5, "standard deviations within which two points are the same")
     unlike: float = constant(
-        2.0, "times the noise of all: with larger noise of moving points these are learnt anew"
+        2.0,
+        "times the noise of all points: if moving ones have more, they are also learnt by theirs",
     )
     quietest: float = constant(0.02, "of σ_ε: noise that is at least assumed")
     of_clouds: float = constant(
-        0.2, "of σ_ε: noise of points of clouds, which do not show it; usual for detections"
+        0.2, "of σ_ε: noise of points of clouds, which do not show it; that of most detections"
     )
     probes: int = constant(60, "frames from which the noise of detections is estimated")
     still_share: float = constant(

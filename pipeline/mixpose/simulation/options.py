@@ -67,9 +67,9 @@ class SimulationOptions:
     brightness_spread: float = _option(0.1, _NOT_NEGATIVE, ("images", "profiles"))
     # false features per frame and sensor: the integer part always, the fraction by chance
     clutter: float = _option(0.0, _FALSE)
-    hidden: float = _option(0.0, _PROBABILITY)  # of a feature, in each view anew
+    hidden: float = _option(0.0, _PROBABILITY)  # that a feature is hidden, in each view anew
     hidden_count: int = _option(0, _COUNT)  # features hidden in each view, drawn by chance
-    # of a sensor to have no frame; in a video or profiles, to have a frame without features
+    # that a sensor has no frame; in a video or profiles, that its frame has no features
     missing: float = _option(0.0, _PROBABILITY)
     # displace features, in each frame anew, by the spread that the object states; the truth is the
     # pose of the undeformed body
@@ -101,7 +101,7 @@ class SimulationOptions:
     occluder: int = _option(0, _FEW, _CAMERAS)  # dark bars that swing before the body
     # share of the brightness that a table below the body reflects; 0 without a table
     mirror: float = _option(0.0, _PROBABILITY, _CAMERAS)
-    jpeg: int | None = _option(None, _QUALITY, _IMAGES)  # of the compression of images
+    jpeg: int | None = _option(None, _QUALITY, _IMAGES)  # quality of compressed images
     bayer: bool = _option(False, None, _IMAGES)  # images of a colour sensor, interpolated
     turned_camera_deg: float = _option(0.0, _ANY, _CAMERAS)  # of the last one since calibration
     away_from: int | None = _option(None, _COUNT)  # number of frames after which the body is gone
