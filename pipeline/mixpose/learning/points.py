@@ -73,7 +73,7 @@ def are_points(sensors: Sequence[Sensor]) -> Mask:
 
 
 def _with_rays(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[int, Rays]]:
-    """Return a frame with only detections that have a line of sight or are points; and these lines."""
+    """Return the frame with detections that have lines of sight or are points, and these lines."""
     rays, detections = dict[int, Rays](), dict[int, Floats]()
     for sensor, points in sorted(frame.points.items()):
         lines = sensors[sensor].rays(points) if len(points) else None

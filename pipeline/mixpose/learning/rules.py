@@ -14,8 +14,7 @@ class LearningRules:
     widest: float = constant(3.0, "σ_ε that rays may miss each other by while the noise is unknown")
     gate: float = constant(3.5, "standard deviations within which two points are the same")
     unlike: float = constant(
-        2.0,
-        "times the noise of all points: if moving ones have more, they are also learnt by theirs",
+        2.0, "times the noise of all points: if moving ones have more, theirs is also tried"
     )
     quietest: float = constant(0.02, "of σ_ε: noise that is at least assumed")
     of_clouds: float = constant(
