@@ -176,7 +176,7 @@ class _PaddedClouds:
 def _matches_of(
     reference: Cloud, base: list[int], others: _PaddedClouds
 ) -> Iterator[tuple[Mask, Floats]]:
-    """Yield for each cloud the points (P,) met at the best pose of a triple, and its points (3, 3)."""
+    """Yield, by cloud, the points (P,) met at the best pose of a triple, and its points (3, 3)."""
     points = reference.points[base]
     slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.sigma[base].max())
     cloud, triples = congruent_triples_of_each(points, others.distances, slack)
