@@ -24,7 +24,14 @@ from moving_bodies import (
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame
 from mixpose.errors import RecordingError, SessionError
-from mixpose.learning import Eyes, Lesson, by_markers, learn, learn_from, like
+from mixpose.learning import (
+    LearningResult,
+    SensorSet,
+    in_axes_of,
+    in_marker_axes,
+    learn,
+    learn_from,
+)
 from mixpose.learning.telling import doubts_of
 from mixpose.rigid import rotation_angle_deg
 from mixpose.sensors import CalibrationError, PinholeCamera
@@ -32,11 +39,15 @@ from mixpose.session import load_scene, load_session
 
 CAMERAS = [camera(20.0), camera(85.0)]
 SENSORS = [PinholeCamera(CAMERA_MATRIX, np.zeros(0), RESOLUTION, T) for T in CAMERAS]
-EYES = Eyes(Rig.of(("a", "b"), SENSORS, Body("none", (PointFeature(np.zeros(3)),))), np.ones(2))
+EYES = SensorSet(
+    Rig.of(("a", "b"), SENSORS, Body("none", (PointFeature(np.zeros(3)),))), np.ones(2)
+)
 SHORT = Scene(frames=40)
 
 
-def lesson_of(bodies: list[tuple[Array, Array]], scene: Scene = SHORT, seed: int = 1) -> Lesson:
+def lesson_of(
+    bodies: list[tuple[Array, Array]], scene: Scene = SHORT, seed: int = 1
+) -> LearningResult:
     frames = detections(bodies, CAMERAS, scene, seed)
     seen = [SeenFrame(k, None, dict(enumerate(views)), {}) for k, views in enumerate(frames)]
     return learn_from(seen, EYES)
@@ -48,13 +59,15 @@ def moving(markers: int, seed: int, scene: Scene = SHORT) -> tuple[Array, Array]
 
 
 @pytest.fixture(scope="module")
-def five() -> tuple[Array, Lesson]:
+def five() -> tuple[Array, LearningResult]:
     """Five markers with hidden ones, false detections and four others that stand still."""
     points, poses = moving(5, 3)
     return points, lesson_of([(points, poses)])
 
 
-def test_a_body_among_clutter_is_learnt_within_its_deviations(five: tuple[Array, Lesson]) -> None:
+def test_a_body_among_clutter_is_learnt_within_its_deviations(
+    five: tuple[Array, LearningResult],
+) -> None:
     points, lesson = five
     (found,) = lesson.bodies
     errors = aligned_errors(found.points, points)
@@ -65,19 +78,19 @@ def test_a_body_among_clutter_is_learnt_within_its_deviations(five: tuple[Array,
     assert 0.01 < deviations.mean() < 0.05
 
 
-def test_what_stands_still_is_counted_and_is_no_body(five: tuple[Array, Lesson]) -> None:
+def test_what_stands_still_is_counted_and_is_no_body(five: tuple[Array, LearningResult]) -> None:
     assert five[1].still == SHORT.still
     assert [one.count for one in five[1].bodies] == [1]
 
 
 def test_the_noise_of_detections_is_told_by_how_closely_rays_meet(
-    five: tuple[Array, Lesson],
+    five: tuple[Array, LearningResult],
 ) -> None:
     # of about 200 gaps between rays, whose deviation errs by 5 %; false meetings make it worse
     assert five[1].noise == pytest.approx(SHORT.noise, rel=0.25)
 
 
-def test_the_frame_is_that_of_the_principal_axes(five: tuple[Array, Lesson]) -> None:
+def test_the_frame_is_that_of_the_principal_axes(five: tuple[Array, LearningResult]) -> None:
     found = five[1].bodies[0].points
     second = found.T @ found
     assert np.abs(found.mean(axis=0)).max() < 1e-9
@@ -86,27 +99,27 @@ def test_the_frame_is_that_of_the_principal_axes(five: tuple[Array, Lesson]) -> 
     assert (np.diff(found[:, 0]) < 0).all()
 
 
-def test_axes_by_markers_put_them_there(five: tuple[Array, Lesson]) -> None:
-    found = by_markers(five[1].bodies[0], "2,5,1")
+def test_axes_by_markers_put_them_there(five: tuple[Array, LearningResult]) -> None:
+    found = in_marker_axes(five[1].bodies[0], "2,5,1")
     at = dict(zip(found.names, found.points, strict=True))
     assert np.abs(at["2"]).max() < 1e-9
     assert np.abs(at["5"][1:]).max() < 1e-9 < at["5"][0]
     assert abs(at["1"][2]) < 1e-9 < at["1"][1]
     for words in ("1,2,9", "1,1,2", "1,2,3,1"):
         with pytest.raises(SessionError, match="allowed: ORIGIN,X,Y, three of the markers 1, 2, 3"):
-            by_markers(five[1].bodies[0], words)
+            in_marker_axes(five[1].bodies[0], words)
 
 
-def test_an_older_table_gives_axes_names_and_order(five: tuple[Array, Lesson]) -> None:
+def test_an_older_table_gives_axes_names_and_order(five: tuple[Array, LearningResult]) -> None:
     points, lesson = five
     ruler = points.round()  # measured to a millimetre, one marker not at all
     names = ["tip", "left", "right", "top"]
-    likeness = like(lesson.bodies[0], ruler[:4], names)
+    likeness = in_axes_of(lesson.bodies[0], ruler[:4], names)
     assert likeness is not None
-    assert likeness.learnt.names == (*names, "5")
+    assert likeness.body.names == (*names, "5")
     # the ruler's errors of 0.5 mm turn and shift the frame by as much at most
-    assert np.abs(likeness.learnt.points - points).max() < 1.5
-    assert like(lesson.bodies[0], 1.5 * ruler, []) is None
+    assert np.abs(likeness.body.points - points).max() < 1.5
+    assert in_axes_of(lesson.bodies[0], 1.5 * ruler, []) is None
 
 
 def test_a_body_before_late_cameras_that_may_be_off_is_within_its_deviations() -> None:
@@ -312,12 +325,12 @@ def test_a_board_before_web_cams_is_learnt_from_tables_without_identities(
 ) -> None:
     (found,) = learn(load_scene(recordings / "webcams4_a" / "session_reference.toml")).bodies
     grid = np.array([[x, y, 0.0] for x in range(3) for y in range(4)]) * 0.054
-    likeness = like(found, grid, [])
+    likeness = in_axes_of(found, grid, [])
     assert likeness is not None
     assert likeness.shared == len(found.points) == 12
     # cameras out of step by up to 20 ms, and a printed board
-    assert likeness.off < 1e-3
-    assert np.linalg.norm(likeness.learnt.points - grid, axis=1).max() < 1e-3
+    assert likeness.max_distance < 1e-3
+    assert np.linalg.norm(likeness.body.points - grid, axis=1).max() < 1e-3
 
 
 @pytest.mark.parametrize("is_real", [False, True])

@@ -22,8 +22,8 @@ from moving_bodies import (
 
 from mixpose.body import Body, PointFeature
 from mixpose.calibration import Rig, SeenFrame
-from mixpose.learning import Eyes, learn_from
-from mixpose.learning.copies import _averaged
+from mixpose.learning import SensorSet, learn_from
+from mixpose.learning.copies import _mean_body
 from mixpose.learning.points import Cloud
 from mixpose.learning.shapes import Placement, Shape
 from mixpose.rigid import from_rotation_vector, inverse, transform
@@ -50,10 +50,10 @@ def points_seen(bodies: list[tuple[Array, Array]], seed: int) -> list[Array]:
     return frames
 
 
-def eyes_of(*sensors: CloudSensor | PinholeCamera) -> Eyes:
+def eyes_of(*sensors: CloudSensor | PinholeCamera) -> SensorSet:
     names = [f"s{k}" for k in range(len(sensors))]
     nothing = Body("none", (PointFeature(np.zeros(3)),))
-    return Eyes(Rig.of(names, sensors, nothing), np.ones(len(sensors)))
+    return SensorSet(Rig.of(names, sensors, nothing), np.ones(len(sensors)))
 
 
 def test_two_bodies_are_learnt_from_points_in_space() -> None:
@@ -129,9 +129,9 @@ def test_places_of_a_shape_name_the_points_that_are_left_of_it(seldom: int) -> N
         numbers = np.arange(5)
         clouds.append(Cloud(transform(T, points), np.full(5, 0.1), numbers[:, None], numbers, seen))
         places.append((k, Placement(T, met, 0.1)))
-    found = _averaged(shape, places, clouds)
+    found = _mean_body(shape, places, clouds)
     left = np.delete(np.arange(5), seldom)
     np.testing.assert_allclose(found.shape.points, points[left], atol=1e-9)
-    for k, one in found.places:
-        there = transform(inverse(one.T_world_shape), clouds[k].points[one.there])
-        np.testing.assert_allclose(found.shape.points[one.own], there, atol=1e-9)
+    for k, one in found.placements:
+        there = transform(inverse(one.T_world_shape), clouds[k].points[one.cloud_rows])
+        np.testing.assert_allclose(found.shape.points[one.shape_rows], there, atol=1e-9)

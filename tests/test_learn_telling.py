@@ -10,12 +10,12 @@ import pytest
 from scipy.linalg import null_space
 
 from mixpose.calibration import SeenFrame
-from mixpose.learning import like
-from mixpose.learning.adjusting import Learnt, _spread
-from mixpose.learning.copies import _never_with, is_chance
+from mixpose.learning import in_axes_of
+from mixpose.learning.adjusting import LearntBody, _spread
+from mixpose.learning.copies import _are_foreign, is_chance
 from mixpose.learning.points import Cloud, _supported
 from mixpose.learning.rules import RULES
-from mixpose.learning.shapes import Found, Placement, Shape, least_met
+from mixpose.learning.shapes import PlacedBody, Placement, Shape, least_met
 from mixpose.learning.telling import _digits_of, doubts_of, lines_of, look_alikes
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector
@@ -26,9 +26,9 @@ POINTS = np.array([[0, 0, 0], [60, 5, 0], [-15, 70, 10], [20, -30, 45], [-40, 10
 
 def learnt(
     turns_deg: Floats, points: Floats = POINTS, *, deviation: float = 0.01, spread: float = 0.0
-) -> Learnt:
+) -> LearntBody:
     poses = [from_rotation_vector(np.radians(turn), [0.0, 0.0, 0.0]) for turn in turns_deg]
-    return Learnt(
+    return LearntBody(
         tuple(f"m{k}" for k in range(len(points))),
         points,
         np.tile(deviation**2 * np.eye(3), (len(points), 1, 1)),
@@ -78,7 +78,7 @@ def test_the_spread_of_markers_is_what_poses_leave_and_triangulation_does_not_ex
     numbers = np.arange(5)
     cloud = Cloud(seen, np.full(5, 0.4), numbers[:, None], numbers, SeenFrame(0, None, {}, {}))
     places = ((0, Placement(np.eye(4), numbers, 0.5)),)
-    loose = Found(Shape(POINTS, np.full(5, 0.1)), places, loose=4.0)
+    loose = PlacedBody(Shape(POINTS, np.full(5, 0.1)), places, looseness=4.0)
     assert _spread(loose, [cloud]) == pytest.approx(np.sqrt(0.5**2 - 5 * 0.4**2 / 9), rel=1e-9)
 
 
@@ -131,10 +131,10 @@ def test_bodies_alike_that_are_never_seen_at_a_time_may_be_one() -> None:
 
 def test_markers_that_an_older_body_has_not_get_numbers_that_are_no_names_of_it() -> None:
     older = POINTS + np.array([5.0, 6.0, 7.0])
-    found = like(learnt(turning(40.0, 20.0)), older[:4], ("1", "2", "3", "5"))
+    found = in_axes_of(learnt(turning(40.0, 20.0)), older[:4], ("1", "2", "3", "5"))
     assert found is not None
-    assert (found.learnt.names, found.shared) == (("1", "2", "3", "5", "6"), 4)
-    np.testing.assert_allclose(found.learnt.points, older, atol=1e-9)
+    assert (found.body.names, found.shared) == (("1", "2", "3", "5", "6"), 4)
+    np.testing.assert_allclose(found.body.points, older, atol=1e-9)
 
 
 def test_three_of_four_points_and_four_of_more_tell_a_shape_from_chance() -> None:
@@ -148,7 +148,7 @@ def test_four_points_that_no_other_size_has_are_a_body_from_twice_the_least_fram
     points = np.vstack([np.zeros(3), 50 * np.eye(3)])
     one = Placement(np.eye(4), np.arange(4), 0.5)
     places = [(k, one) for k in range(2 * RULES.least_frames + more)]
-    body = Found(Shape(points, np.full(4, 0.1)), tuple(places))
+    body = PlacedBody(Shape(points, np.full(4, 0.1)), tuple(places))
     assert is_chance(body, []) == expected
 
 
@@ -158,8 +158,8 @@ def test_of_points_that_are_hardly_ever_seen_together_the_one_seen_less_goes() -
         seen = np.array([True, True, k % 2 == 0, k == 0 or (k % 2 == 1 and k > 3)])
         places.append((k, Placement(np.eye(4), np.where(seen, np.arange(4), -1), 0.5)))
     strange = np.array([False, False, True, True])
-    assert _never_with(shape, places, strange).tolist() == [False, False, False, True]
-    assert not _never_with(shape, places[:1], strange).any()
+    assert _are_foreign(shape, places, strange).tolist() == [False, False, False, True]
+    assert not _are_foreign(shape, places[:1], strange).any()
 
 
 def test_points_of_two_sensors_that_share_a_detection_are_both_kept() -> None:

@@ -17,7 +17,7 @@ from mixpose.rigid import (
     twist_between,
 )
 from mixpose.session import load_session
-from mixpose.simulation.central_pose import swinging
+from mixpose.simulation.central_pose import motion_about
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.options import SimulationOptions
 
@@ -54,7 +54,7 @@ def test_the_pivot_moves_within_the_amplitude_and_makes_use_of_it(seed: int) -> 
 
 def test_a_body_swings_by_four_tenths_of_its_radius_where_nothing_else_is_said() -> None:
     session = load_session(TWO_CAMERAS)
-    away = np.abs(swinging(session, CENTRE, SimulationOptions(frames=1), 0).shift.at(TIMES))
+    away = np.abs(motion_about(session, CENTRE, SimulationOptions(frames=1), 0).shift.at(TIMES))
     shares = away.max(axis=0) / session.body.radius
     assert (shares > 2 / 3 * 0.4).all()
     assert (shares <= 0.4 + 1e-9).all()

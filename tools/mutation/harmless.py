@@ -86,14 +86,14 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "learning/bodies.py",
-        "slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())",
-        "slack = RULES.gate * np.sqrt(4.0) * np.hypot(others.typical, reference.reach[base].max())",
+        "slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.sigma[base].max())",
+        "slack = RULES.gate * np.sqrt(4.0) * np.hypot(others.typical, reference.sigma[base].max())",
         "only speed: more triples are tried, of which those count whose points are met",
     ),
     Harmless(
         "learning/points.py",
-        "if likely > best:",
-        "if likely >= best:",
+        "if log_likelihood > largest:",
+        "if log_likelihood >= largest:",
         "likelihoods that are equal to the last bit",
     ),
     Harmless(

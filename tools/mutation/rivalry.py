@@ -90,8 +90,8 @@ MUTANTS = (
     Mutant(
         "learning-frames-turned-over-count",
         "learning/adjusting.py",
-        "return told if len(told) >= RULES.least_frames else body.places",
-        "return body.places",
+        "return unambiguous if len(unambiguous) >= RULES.least_frames else body.placements",
+        "return body.placements",
         "a tool that turns about one axis seems to turn over",
         ("test_learn.py",),
     ),

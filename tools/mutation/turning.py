@@ -176,8 +176,8 @@ MUTANTS = (
     Mutant(
         "simulation-idle-options-are-said-to-be-used",
         "simulation/options.py",
-        'if not {*one.metadata.get("of", _ALL)} & {*given}]',
-        "if not given]",
+        'if not {*item.metadata.get("of", _ALL)} & {*outputs}]',
+        "if not outputs]",
         "options that this session has nothing of are taken in silence",
         (_OPTIONS,),
     ),

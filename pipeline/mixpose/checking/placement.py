@@ -25,7 +25,7 @@ from mixpose.sensors import (
     facing,
 )
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import count_seen, pivot_of, places
+from mixpose.simulation.central_pose import candidate_places, count_seen, pivot_of
 
 Camera: TypeAlias = PinholeCamera | FisheyeCamera
 Looking: TypeAlias = Camera | ParallelBeam
@@ -299,7 +299,7 @@ def typical_poses(session: Session, count: int, *, away: float = 1.0) -> list[Fl
     pivot = pivot_of(session.body)
     seen_at_best = 0
     chosen: list[Floats] = []
-    for place in places(session):
+    for place in candidate_places(session):
         if depends_on_distance(session):
             centre = session.sensors[0].sensor.towards(place)
             place = place + (1 - away) * centre  # noqa: PLW2901

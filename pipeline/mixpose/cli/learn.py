@@ -10,7 +10,7 @@ from mixpose.cli.app import LearnRequest
 from mixpose.cli.notices import say, warn, watched
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
-from mixpose.learning import Learnt, Lesson, by_markers, learn, like
+from mixpose.learning import LearningResult, LearntBody, in_axes_of, in_marker_axes, learn
 from mixpose.learning.telling import MARK, doubts_of, lines_of, look_alikes, table_text
 from mixpose.session import Session, load_scene
 from mixpose.session.marker_files import Markers, read_marker_file
@@ -50,12 +50,14 @@ def _older(path: Path, session: Session) -> Markers:
         raise SessionError(f"--like {path}: {problem.text}") from problem
 
 
-def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> list[Learnt]:
+def _in_frames(
+    lesson: LearningResult, request: LearnRequest, older: Markers | None
+) -> list[LearntBody]:
     """Bodies in the frame that was asked for; the one that is like an older one first."""
     bodies = list(lesson.bodies)
     if older is not None:
-        found = [(like(each, older.points, older.names), k) for k, each in enumerate(bodies)]
-        alike = [(-one.shared, one.off, k, one) for one, k in found if one is not None]
+        found = [(in_axes_of(each, older.points, older.names), k) for k, each in enumerate(bodies)]
+        alike = [(-one.shared, one.max_distance, k, one) for one, k in found if one is not None]
         if not alike:
             raise RecordingError(
                 f"--like {request.like}: found bodies of "
@@ -64,19 +66,19 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
             )
         _, off, k, best = min(alike, key=lambda each: each[:3])
         say(f"like {request.like}: {best.shared} markers in both, {off:.3g} off at most")
-        if best.others:
+        if best.other_ways:
             warn(
-                f"--like {request.like}: the markers can be laid on it in {best.others} other "
-                f"way{'s' * (best.others > 1)} with as many of them; the closest is taken"
+                f"--like {request.like}: the markers can be laid on it in {best.other_ways} other "
+                f"way{'s' * (best.other_ways > 1)} with as many of them; the closest is taken"
             )
-        bodies = [best.learnt, *(each for n, each in enumerate(bodies) if n != k)]
+        bodies = [best.body, *(each for n, each in enumerate(bodies) if n != k)]
     if request.axes is not None:
-        bodies[0] = by_markers(bodies[0], request.axes)
+        bodies[0] = in_marker_axes(bodies[0], request.axes)
     return bodies
 
 
 def _tell(
-    lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
+    lesson: LearningResult, bodies: Sequence[LearntBody], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
     called = [Path("body.csv") if output.is_stdout(file) else file for file in files]
@@ -97,7 +99,7 @@ def _tell(
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
 
 
-def _late_ones(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+def _late_ones(session: Session, bodies: Sequence[LearntBody], names: Sequence[str]) -> list[str]:
     """Bodies whose motion is not known, where late sensors ask for it."""
     late = [one.name for one in session.sensors if one.delay or one.readout]
     return [

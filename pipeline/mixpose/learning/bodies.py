@@ -1,4 +1,4 @@
-"""Bodies of a recording, one after the other.
+"""Find the bodies of a recording, one after the other.
 
 Each begins with a shape: points of one frame that lie alike in others.
 """
@@ -16,189 +16,187 @@ from scipy.spatial.distance import cdist
 from mixpose.body.symmetry import congruent_triples_of_each, motions
 from mixpose.calibration.task import Progress
 from mixpose.learning import shapes
-from mixpose.learning.copies import is_chance, left_by, with_copies
+from mixpose.learning.copies import is_chance, with_copies, without_bodies
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import RULES
-from mixpose.learning.shapes import FEWEST, Found, Places, Shape, placed
+from mixpose.learning.shapes import FEWEST, PlacedBody, Placements, Shape, find_placements
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 
-_TRIED = 8  # seeds that may fail one after the other
-_OF_MATCHED = 0.34  # frames in which a point goes along with a triple, of those that show this
+_TRIED = 8  # most promising shapes that are tried for a body
+_OF_MATCHED = 0.34  # of the frames with a triple: share in which a point must move along with it
 
 
 def find_bodies(
     clouds: Sequence[Cloud], rng: np.random.Generator, progress: Progress
-) -> list[Found]:
-    """Find what moves rigidly in clouds without what stands still; most points seen first.
+) -> list[PlacedBody]:
+    """Find what moves rigidly in clouds without points at rest; the bodies with most points first.
 
-    Which points the bodies meet is told by `Cloud.rows`.
+    Their placements name points by `Cloud.rows`.
     """
-    left, found = list(clouds), list[Found]()
-    while len(found) < RULES.most_bodies:
-        progress("looking for bodies", len(found), RULES.most_bodies)
-        body = _next(left, rng)
-        if body is None:
+    unclaimed, bodies = list(clouds), list[PlacedBody]()
+    while len(bodies) < RULES.most_bodies:
+        progress("looking for bodies", len(bodies), RULES.most_bodies)
+        if (body := _next(unclaimed, rng)) is None:
             break
-        # a frame that shows few points of a body may show none of the triples it was found by
+        # a frame with few points of a body may show none of the triples by which it is searched
         least = shapes.least_met(len(body.shape))
-        more = _missed(body, left_by(body.places, left), least, RULES.many_bases)
-        body = replace(body, places=tuple(sorted([*body.places, *more], key=lambda each: each[0])))
-        places = []
-        for k, one in body.places:  # with points numbered as they were before any were left out
-            met = np.where(one.met >= 0, left[k].rows[one.met], -1)
-            places.append((k, replace(one, met=met)))
-        found.append(replace(body, places=tuple(places)))
-        # also where too few of its points are seen for a frame to count
-        left = left_by(body.places, left)
-        left = left_by(_missed(body, left, FEWEST, RULES.bases), left)
-    return sorted(found, key=lambda each: -each.met)
+        more = _missed(body, without_bodies(body.placements, unclaimed), least, RULES.many_bases)
+        all_frames = sorted([*body.placements, *more], key=lambda entry: entry[0])
+        body = replace(body, placements=tuple(all_frames))
+        placements = []
+        for k, placement in body.placements:  # with the numbers of points before any was claimed
+            met = np.where(placement.met >= 0, unclaimed[k].rows[placement.met], -1)
+            placements.append((k, replace(placement, met=met)))
+        bodies.append(replace(body, placements=tuple(placements)))
+        # also remove its points in frames that show too few of them to count
+        unclaimed = without_bodies(body.placements, unclaimed)
+        unclaimed = without_bodies(_missed(body, unclaimed, FEWEST, RULES.bases), unclaimed)
+    return sorted(bodies, key=lambda body: -body.met_count)
 
 
-def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> Found | None:
-    """The most evident body of what is left."""
-    for loose in RULES.looser[:2]:
-        looser = [cloud.loosened(loose) for cloud in clouds]
-        for shape in _shapes(looser, rng)[:_TRIED]:
-            body = _loose_enough(shape, loose, clouds)
-            if body is not None:
+def _next(clouds: Sequence[Cloud], rng: np.random.Generator) -> PlacedBody | None:
+    """Return the most evident body of unclaimed points."""
+    for looseness in RULES.looser[:2]:
+        loosened = [cloud.loosened(looseness) for cloud in clouds]
+        for shape in _shapes(loosened, rng)[:_TRIED]:
+            if (body := _tightest_body(shape, looseness, clouds)) is not None:
                 return body
     return None
 
 
-def _loose_enough(shape: Shape, least: float, clouds: Sequence[Cloud]) -> Found | None:
-    """The body of a shape, as rigid as it can be without losing points in many frames."""
+def _tightest_body(shape: Shape, least: float, clouds: Sequence[Cloud]) -> PlacedBody | None:
+    """Return the body of a shape, as rigid as it can be without losing points in many frames."""
     best, frames = None, 0
-    for loose in RULES.looser[RULES.looser.index(least) :]:
-        looser = [cloud.loosened(loose) for cloud in clouds]
-        body = shapes.grown(shape, looser)
-        if body is None or is_chance(body, looser):
+    for looseness in RULES.looser[RULES.looser.index(least) :]:
+        loosened = [cloud.loosened(looseness) for cloud in clouds]
+        body = shapes.grow_body(shape, loosened)
+        if body is None or is_chance(body, loosened):
             break
-        if best is not None and len(body.places) < RULES.worth * frames:
+        if best is not None and len(body.placements) < RULES.worth * frames:
             break
-        best = replace(with_copies(body, looser), loose=loose)
-        # with as few points as a looser shape is met by, where it has other bodies' among them
-        frames = len(placed(best.shape, looser, best.count, FEWEST))
+        best = replace(with_copies(body, loosened), looseness=looseness)
+        # count with as few points as suffice for a looser shape with points of other bodies too
+        frames = len(find_placements(best.shape, loosened, best.count, FEWEST))
     return best
 
 
-def _missed(body: Found, left: Sequence[Cloud], least: int, bases: int) -> Places:
-    """Where it is in what it left, in frames in which fewer of it were found than there are."""
-    missing = body.count - np.bincount([k for k, _ in body.places], minlength=len(left))
+def _missed(body: PlacedBody, unclaimed: Sequence[Cloud], least: int, bases: int) -> Placements:
+    """Find a body among unclaimed points, in frames with fewer placements than its copies."""
+    missing = body.count - np.bincount([k for k, _ in body.placements], minlength=len(unclaimed))
     frames = np.flatnonzero(missing > 0)
-    some = [left[k].loosened(body.loose) for k in frames.tolist()]
-    found, rest = placed(body.shape, some, body.count, least, bases), []
-    for k, one in found:
+    clouds = [unclaimed[k].loosened(body.looseness) for k in frames.tolist()]
+    candidates, more = find_placements(body.shape, clouds, body.count, least, bases), []
+    for k, placement in candidates:
         if missing[frames[k]] > 0:
-            rest.append((int(frames[k]), one))
+            more.append((int(frames[k]), placement))
             missing[frames[k]] -= 1
-    return rest
+    return more
 
 
 def _shapes(clouds: Sequence[Cloud], rng: np.random.Generator) -> list[Shape]:
-    """Shapes that recur, the most promising first; where there are too many, triples are drawn."""
+    """Return shapes that recur, the most promising first; of too many triples some are drawn."""
     sizes = np.array([len(cloud) for cloud in clouds])
     usable = np.flatnonzero(sizes >= FEWEST)
     if len(usable) < RULES.least_frames:
         return []
-    some = np.linspace(0, len(usable) - 1, min(len(usable), RULES.compared)).astype(np.intp)
-    compared = usable[np.unique(some)]
-    found = list[tuple[int, Shape]]()
-    for part in np.array_split(usable, min(RULES.references, len(usable))):
-        reference = clouds[part[np.argmax(sizes[part])]]
-        others = _Others.of([clouds[k] for k in compared if clouds[k] is not reference])
-        for triple in _near_triples(reference, rng):
-            scored = _scored(reference, triple, others)
-            if scored is not None:
-                found.append(scored)
-    return [shape for _, shape in sorted(found, key=lambda scored: -scored[0])]
+    spaced = np.linspace(0, len(usable) - 1, min(len(usable), RULES.compared)).astype(np.intp)
+    compared = usable[np.unique(spaced)]
+    candidates = list[tuple[int, Shape]]()
+    for group in np.array_split(usable, min(RULES.references, len(usable))):
+        reference = clouds[group[np.argmax(sizes[group])]]
+        others = _PaddedClouds.of([clouds[k] for k in compared if clouds[k] is not reference])
+        for triple in _reference_triples(reference, rng):
+            if (scored := _scored(reference, triple, others)) is not None:
+                candidates.append(scored)
+    return [shape for _, shape in sorted(candidates, key=lambda scored: -scored[0])]
 
 
-def _near_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int, int]]:
-    """Triples that are not on a line: of a point and two of its neighbours, and of any."""
-    reach = min(RULES.neighbours + 1, len(cloud))
-    _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
-    found = set[tuple[int, int, int]]()
-    for row in near:
-        own = np.sort(row[shapes.triples_of(cloud.points[row], cloud.reach[row])], axis=1)
-        found |= {(a, b, c) for a, b, c in own.tolist()}
-    drawn = sorted(found)
+def _reference_triples(cloud: Cloud, rng: np.random.Generator) -> list[tuple[int, int, int]]:
+    """Return triples that are not on a line: of a point and two neighbours, and of any points."""
+    count = min(RULES.neighbours + 1, len(cloud))
+    _, neighbours = cKDTree(cloud.points).query(cloud.points, k=count)
+    near = set[tuple[int, int, int]]()
+    for row in neighbours:
+        triples = np.sort(row[shapes.triples_of(cloud.points[row], cloud.sigma[row])], axis=1)
+        near |= {(a, b, c) for a, b, c in triples.tolist()}
+    drawn = sorted(near)
     if len(drawn) > RULES.triples:
         drawn = [drawn[k] for k in rng.choice(len(drawn), RULES.triples, replace=False)]
-    for _ in range(RULES.far_triples if len(cloud) > reach else 0):
+    for _ in range(RULES.far_triples if len(cloud) > count else 0):
         a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
-        some = [a, b, c]
-        if (a, b, c) not in found and len(shapes.triples_of(cloud.points[some], cloud.reach[some])):
+        rows = [a, b, c]
+        if (a, b, c) not in near and len(shapes.triples_of(cloud.points[rows], cloud.sigma[rows])):
             drawn.append((a, b, c))
     return drawn
 
 
 def _scored(
-    reference: Cloud, triple: tuple[int, int, int], others: _Others
+    reference: Cloud, triple: tuple[int, int, int], others: _PaddedClouds
 ) -> tuple[int, Shape] | None:
-    """What goes along with a triple, and how many points other frames show alike beyond two."""
+    """Count points beyond two that other frames show like a triple; also return their shape."""
     base = list(triple)
-    goes_along, matched, score = np.zeros(len(reference)), 0, 0
-    seen = reference.points[base][None]
-    far = RULES.apart * RULES.gate * reference.reach[base].max()
-    for met, places in _going_along(reference, base, others):
-        if np.abs(places - seen).max(axis=(1, 2)).min() > far:
-            seen = np.concatenate([seen, places[None]])
-            matched += 1
+    times_met, poses_matched, score = np.zeros(len(reference)), 0, 0
+    places_seen = reference.points[base][None]
+    far = RULES.apart * RULES.gate * reference.sigma[base].max()
+    for met, places in _matches_of(reference, base, others):
+        if np.abs(places - places_seen).max(axis=(1, 2)).min() > far:
+            places_seen = np.concatenate([places_seen, places[None]])
+            poses_matched += 1
             score += int(met.sum()) - FEWEST + 1
-            goes_along += met
-    chosen = np.flatnonzero(goes_along >= max(_OF_MATCHED * matched, 2.0))
-    if matched < FEWEST or len(chosen) < FEWEST:
+            times_met += met
+    chosen = np.flatnonzero(times_met >= max(_OF_MATCHED * poses_matched, 2.0))
+    if poses_matched < FEWEST or len(chosen) < FEWEST:
         return None
-    return score, Shape(reference.points[chosen], reference.reach[chosen])
+    return score, Shape(reference.points[chosen], reference.sigma[chosen])
 
 
 @dataclass(frozen=True, eq=False)
-class _Others:
-    """Clouds in which triples are looked for, filled up to the same number of points."""
+class _PaddedClouds:
+    """Clouds in which triples are searched, padded to the same number of points."""
 
-    points: Floats  # (O, P, 3)
-    reach: Floats  # (O, P)
-    apart: Floats  # (O, P, P): distances; infinite of a point to itself, and of those filled up
-    typical: Floats  # (O,): median of reach
+    points: Floats  # (O, P, 3): infinite for padding
+    sigma: Floats  # (O, P)
+    distances: Floats  # (O, P, P): between points; infinite from a point to itself and to padding
+    typical: Floats  # (O,): median of sigma
 
     @classmethod
-    def of(cls, clouds: Sequence[Cloud]) -> _Others:
-        """Fill clouds up."""
+    def of(cls, clouds: Sequence[Cloud]) -> _PaddedClouds:
+        """Pad clouds."""
         most = max(len(cloud) for cloud in clouds)
-        points, reach = np.full((len(clouds), most, 3), np.inf), np.ones((len(clouds), most))
-        apart = np.full((len(clouds), most, most), np.inf)
+        points, sigma = np.full((len(clouds), most, 3), np.inf), np.ones((len(clouds), most))
+        distances = np.full((len(clouds), most, most), np.inf)
         for k, cloud in enumerate(clouds):
-            points[k, : len(cloud)], reach[k, : len(cloud)] = cloud.points, cloud.reach
-            apart[k, : len(cloud), : len(cloud)] = cdist(cloud.points, cloud.points)
-        apart[:, range(most), range(most)] = np.inf
-        return cls(points, reach, apart, np.array([np.median(cloud.reach) for cloud in clouds]))
+            points[k, : len(cloud)], sigma[k, : len(cloud)] = cloud.points, cloud.sigma
+            distances[k, : len(cloud), : len(cloud)] = cdist(cloud.points, cloud.points)
+        distances[:, range(most), range(most)] = np.inf
+        return cls(points, sigma, distances, np.array([np.median(cloud.sigma) for cloud in clouds]))
 
 
-def _going_along(
-    reference: Cloud, base: list[int], others: _Others
+def _matches_of(
+    reference: Cloud, base: list[int], others: _PaddedClouds
 ) -> Iterator[tuple[Mask, Floats]]:
-    """Points (P,) of a cloud that lie in others as they do about a triple, and where this is."""
+    """Yield, by cloud, the points (P,) met at the best pose of a triple, and its points (3, 3)."""
     points = reference.points[base]
-    slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.reach[base].max())
-    cloud, triples = congruent_triples_of_each(points, others.apart, slack)
+    slack = RULES.gate * np.sqrt(2.0) * np.hypot(others.typical, reference.sigma[base].max())
+    cloud, triples = congruent_triples_of_each(points, others.distances, slack)
     poses = motions(points, others.points[cloud[:, None], triples])
     moved = transform(poses, reference.points)
-    away, reach = np.empty((2, *moved.shape[:2]))
+    distance, sigma = np.empty((2, *moved.shape[:2]))
     edges = np.searchsorted(cloud, np.arange(len(others.points) + 1))
-    parts = [slice(*each) for each in pairwise(edges.tolist())]
-    for k, own in enumerate(parts):
-        found = cdist(others.points[k], moved[own].reshape(-1, 3))
-        nearest = found.argmin(axis=0)
-        away[own] = found[nearest, np.arange(len(nearest))].reshape(away[own].shape)
-        reach[own] = others.reach[k, nearest].reshape(away[own].shape)
-    share = away / (2 * RULES.gate * np.hypot(reach, reference.reach))
+    parts = [slice(*ends) for ends in pairwise(edges.tolist())]
+    for k, rows in enumerate(parts):
+        distances = cdist(others.points[k], moved[rows].reshape(-1, 3))
+        nearest = distances.argmin(axis=0)
+        distance[rows] = distances[nearest, np.arange(len(nearest))].reshape(distance[rows].shape)
+        sigma[rows] = others.sigma[k, nearest].reshape(distance[rows].shape)
+    share = distance / (2 * RULES.gate * np.hypot(sigma, reference.sigma))
     met = share < 1
     met &= met[:, base].all(axis=1)[:, None]
     counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
-    for k, own in enumerate(parts):
-        if own.start == own.stop:
+    for k, rows in enumerate(parts):
+        if rows.start == rows.stop:
             continue
-        best = own.start + int(np.argmax(counts[own]))
+        best = rows.start + int(np.argmax(counts[rows]))
         if met[best].any():
             yield met[best], others.points[k, triples[best]]

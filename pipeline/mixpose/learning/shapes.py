@@ -1,7 +1,7 @@
-"""Shapes, a few points at known distances: where they are in a frame, and how they grow to bodies.
+"""Shapes, a few points at known distances: find them in frames, and grow them to bodies.
 
-Frames in which a body is where it was before tell nothing new of what belongs to it: whatever rests
-beside it would.  What counts are poses apart from each other.
+Only frames at different poses show what belongs to a body: at one pose, anything at rest near it
+seems to.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, inverse, transform
 
 FEWEST = 3
-_HEIGHT = 4.0  # deviations of a point above the longest side: less fixes no turn
-# gates within which points are met before and after each fit to all that is met; later fits reach
-# farther from the first three
+_HEIGHT = 4.0  # deviations: least height of a triangle above its longest side that fixes its turn
+# gates within which points are met before and after each fit to the points met; the first fits
+# extrapolate from three points
 _WIDE = (2.0, 2.0, 1.0, 1.0)
-_SURER = 0.15  # of a point's reach: errors that many frames have in common
+_COMMON = 0.15  # of a point's deviation: errors that many frames have in common
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Points of a body, as far as it is known."""
+    """Points of a body, as far as they are known."""
 
     points: Floats  # (N, 3)
-    reach: Floats  # (N,): standard deviation of each, as of `Cloud`
+    sigma: Floats  # (N,): standard deviations, as those of `Cloud`
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,39 +44,39 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where a shape is in a frame."""
+    """The pose of a shape in the cloud of a frame, and the points that it meets."""
 
     T_world_shape: Floats  # (4, 4)
-    met: Indices  # (N,): the point of the cloud that each point of the shape is; -1 for none
-    off: float  # root mean square distance of the two, by what they may be off
+    met: Indices  # (N,): for each point of the shape its point of the cloud; -1 for none
+    misfit: float  # root mean square distance of these pairs, in gates
 
     @cached_property
-    def own(self) -> Indices:
-        """Points of the shape that are met."""
+    def shape_rows(self) -> Indices:
+        """Indices (n,) of the points of the shape that are met."""
         return np.flatnonzero(self.met >= 0)
 
     @cached_property
-    def there(self) -> Indices:
-        """Points of the cloud that they meet."""
-        return self.met[self.own]
+    def cloud_rows(self) -> Indices:
+        """Indices (n,) of the points of the cloud that they meet."""
+        return self.met[self.shape_rows]
 
     @property
     def count(self) -> int:
-        """How many points are met."""
-        return len(self.own)
+        """Number of points met."""
+        return len(self.shape_rows)
 
 
-Places: TypeAlias = Sequence[tuple[int, Placement]]
+Placements: TypeAlias = Sequence[tuple[int, Placement]]
 """Placements with the index of the cloud that each is in."""
 
 
 def body_of(name: str, points: Floats) -> Body:
-    """A body of points without spread."""
+    """Return a body of points without spread."""
     return Body(name, tuple(PointFeature(point) for point in points))
 
 
-def triples_of(points: Floats, reach: Floats) -> Indices:
-    """Triples (K, 3) of points (N, 3) that are not on a line, the largest heights first."""
+def triples_of(points: Floats, sigma: Floats) -> Indices:
+    """Return triples (K, 3) of points (N, 3) that are not on a line, the largest heights first."""
     triples = np.array(list(combinations(range(len(points)), FEWEST)), dtype=np.intp)
     if not len(triples):
         return np.zeros((0, FEWEST), dtype=np.intp)
@@ -84,94 +84,94 @@ def triples_of(points: Floats, reach: Floats) -> Indices:
     longest = np.linalg.norm(np.array([b - a, c - a, c - b]), axis=2).max(axis=0)
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-300)
     order = np.argsort(-height, kind="stable")
-    return np.asarray(triples[order][(height > _HEIGHT * reach[triples].max(axis=1))[order]])
+    return np.asarray(triples[order][(height > _HEIGHT * sigma[triples].max(axis=1))[order]])
 
 
-def wide_triples(points: Floats, reach: Floats, most: int) -> Indices:
-    """Some of these triples (K, 3), in which all points stand about equally often."""
-    triples = triples_of(points, reach)
-    kept, used = list[int](), np.zeros(len(points))
-    left = np.ones(len(triples), dtype=np.bool_)
-    while left.any() and len(kept) < most:
-        k = int(np.argmin(np.where(left, used[triples].sum(axis=1), np.inf)))
-        used[triples[k]] += 1
-        left[k] = False
-        kept.append(k)
-    return np.asarray(triples[kept])
+def wide_triples(points: Floats, sigma: Floats, most: int) -> Indices:
+    """Select up to `most` of these triples (K, 3), in which all points are used about equally."""
+    triples = triples_of(points, sigma)
+    chosen, uses = list[int](), np.zeros(len(points))
+    is_unused = np.ones(len(triples), dtype=np.bool_)
+    while is_unused.any() and len(chosen) < most:
+        k = int(np.argmin(np.where(is_unused, uses[triples].sum(axis=1), np.inf)))
+        uses[triples[k]] += 1
+        is_unused[k] = False
+        chosen.append(k)
+    return np.asarray(triples[chosen])
 
 
-def placements(
+def placements_in(
     shape: Shape, bases: Indices, cloud: Cloud, most: int, least: int
 ) -> list[Placement]:
-    """Placements of a shape in a cloud, of which no two have a point in common; the best first.
+    """Find placements of a shape in a cloud that have no point in common; the best first.
 
-    At most so many, by the triples (B, 3) of it that are looked for, and with at least so many
-    points met.
+    They are at most `most`, from the triples (B, 3) of the shape that are tried, and each has at
+    least `least` points met.
     """
     if len(cloud) < least or not len(bases):
         return []
-    typical = np.hypot(np.median(cloud.reach), np.median(shape.reach))
-    off, candidates = RULES.gate * np.sqrt(2.0) * typical, []
+    typical = np.hypot(np.median(cloud.sigma), np.median(shape.sigma))
+    tolerance, candidates = RULES.gate * np.sqrt(2.0) * typical, []
     for base in shape.points[bases]:
-        triples = congruent_triples(base, cloud.points, off)
+        triples = congruent_triples(base, cloud.points, tolerance)
         candidates.append(motions(base, cloud.points[triples]))
     poses = np.concatenate(candidates)
     if not len(poses):
         return []
     tree = cKDTree(cloud.points)
-    away, nearest = tree.query(transform(poses, shape.points))
-    allowed = RULES.gate * np.hypot(cloud.reach[nearest], shape.reach)
-    counts = (away < 2 * allowed).sum(axis=1) - 0.1 * np.minimum(away / allowed, 2).mean(axis=1)
+    gaps, nearest = tree.query(transform(poses, shape.points))
+    allowed = RULES.gate * np.hypot(cloud.sigma[nearest], shape.sigma)
+    counts = (gaps < 2 * allowed).sum(axis=1) - 0.1 * np.minimum(gaps / allowed, 2).mean(axis=1)
     order = np.argsort(-counts, kind="stable")[: RULES.placements * most]
     refined = list[Placement]()
     for k in order:
-        # most triples of a shape lead to the one place where it is; triangles fit in many ways
-        alone = most == 1 and len(shape) > FEWEST and refined
-        if alone and max(each.count for each in refined) >= counts[k]:
+        # most triples of a shape lead to its true pose; mere triangles fit in many places
+        is_unique = most == 1 and len(shape) > FEWEST and refined
+        if is_unique and max(placement.count for placement in refined) >= counts[k]:
             break
         refined.append(_refined(shape, poses[k], cloud, tree))
-    good = [each for each in refined if each.count >= least]
-    good.sort(key=lambda each: (-each.count, each.off))
-    kept, taken = list[Placement](), set[int]()
-    for each in good:
-        own = set(each.there.tolist())
-        if not own & taken:
-            kept.append(each)
-            taken |= own
-        if len(kept) == most:
+    valid = [placement for placement in refined if placement.count >= least]
+    valid.sort(key=lambda placement: (-placement.count, placement.misfit))
+    chosen, taken = list[Placement](), set[int]()
+    for placement in valid:
+        rows = set(placement.cloud_rows.tolist())
+        if not rows & taken:
+            chosen.append(placement)
+            taken |= rows
+        if len(chosen) == most:
             break
-    return kept
+    return chosen
 
 
 def _refined(shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree) -> Placement:
-    """Fit a pose to all points that it meets."""
-    found = _placement(shape, T, cloud, tree, _WIDE[0])
+    """Fit a pose to all points that it meets, repeatedly."""
+    placement = _placement(shape, T, cloud, tree, _WIDE[0])
     for wide in _WIDE[1:]:
-        if found.count < FEWEST:
+        if placement.count < FEWEST:
             break
-        there = found.there
-        T = _weighted_motion(shape.points[found.own], cloud.points[there], cloud.reach[there])
-        found = _placement(shape, T, cloud, tree, wide)
-    return found
+        rows, source = placement.cloud_rows, shape.points[placement.shape_rows]
+        T = _weighted_motion(source, cloud.points[rows], cloud.sigma[rows])
+        placement = _placement(shape, T, cloud, tree, wide)
+    return placement
 
 
 def _placement(shape: Shape, T: Floats, cloud: Cloud, tree: cKDTree, wide: float) -> Placement:
-    """Which point of a cloud each point of a shape is at a pose, one to one."""
-    away, nearest = tree.query(transform(T, shape.points))
-    share = away / (RULES.gate * wide * np.hypot(cloud.reach[nearest], shape.reach))
+    """Pair points of a shape at a pose with the nearest points of a cloud, one to one."""
+    distance, nearest = tree.query(transform(T, shape.points))
+    share = distance / (RULES.gate * wide * np.hypot(cloud.sigma[nearest], shape.sigma))
     met = np.full(len(shape), -1, dtype=np.intp)
     order = np.argsort(share, kind="stable")
     order = order[share[order] < 1]
     _, first = np.unique(nearest[order], return_index=True)
-    found = np.sort(order[first])
-    met[found] = nearest[found]
-    off = float(np.sqrt(np.mean(share[found] ** 2))) if len(found) else np.inf
-    return Placement(T, met, off)
+    rows = np.sort(order[first])
+    met[rows] = nearest[rows]
+    misfit = float(np.sqrt(np.mean(share[rows] ** 2))) if len(rows) else np.inf
+    return Placement(T, met, misfit)
 
 
-def _weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
-    """The motion (4, 4) of points (n, 3) onto others, those that are known better counting more."""
-    weight = 1 / reach**2
+def _weighted_motion(source: Floats, target: Floats, sigma: Floats) -> Floats:
+    """Fit the motion (4, 4) of points (n, 3) onto others with standard deviations (n,)."""
+    weight = 1 / sigma**2
     weight = weight / weight.sum()
     a, b = weight @ source, weight @ target
     turn, _ = Rotation.align_vectors(target - b, source - a, weights=weight)
@@ -180,152 +180,148 @@ def _weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A body, and where it is in which frames."""
+class PlacedBody:
+    """A body with its placements."""
 
-    shape: Shape  # in a frame of its own
-    places: tuple[tuple[int, Placement], ...]  # of congruent bodies several in a cloud
-    count: int = 1  # congruent bodies that are seen at a time
-    loose: float = 1.0  # times the error of triangulation that its points may be off
+    shape: Shape  # in arbitrary axes
+    placements: tuple[tuple[int, Placement], ...]  # several in a cloud for congruent bodies
+    count: int = 1  # congruent bodies that are seen at the same time
+    looseness: float = 1.0  # times the error of triangulation: allowed offsets of its points
 
     @property
-    def met(self) -> int:
-        """Points that are met, all frames together."""
-        return sum(one.count for _, one in self.places)
+    def met_count(self) -> int:
+        """Number of points met in all frames together."""
+        return sum(placement.count for _, placement in self.placements)
 
 
 def least_met(points: int) -> int:
-    """Points of a shape that must be met, so that no other points lie like them by chance."""
+    """Return how many points of a shape must be met so that it is not there by chance."""
     return FEWEST if points <= FEWEST + 1 else FEWEST + 1
 
 
-def placed(
+def find_placements(
     shape: Shape,
     clouds: Sequence[Cloud],
     most: int = 1,
     least: int | None = None,
     bases: int | None = None,
 ) -> list[tuple[int, Placement]]:
-    """Where a shape is in all clouds, at most so many times in each."""
-    triples = wide_triples(shape.points, shape.reach, bases or RULES.bases)
+    """Find a shape in all clouds, at most `most` times in each."""
+    triples = wide_triples(shape.points, shape.sigma, bases or RULES.bases)
     least = least_met(len(shape)) if least is None else least
     return [
-        (k, one)
+        (k, placement)
         for k, cloud in enumerate(clouds)
-        for one in placements(shape, triples, cloud, most, least)
+        for placement in placements_in(shape, triples, cloud, most, least)
     ]
 
 
-def grown(shape: Shape, clouds: Sequence[Cloud]) -> Found | None:
-    """Find a shape of three points or more in all frames, and in these all that goes along.
-
-    None where it does not recur.
-    """
-    for turn in range(RULES.rounds):
-        places = placed(shape, clouds)
-        if len(places) < RULES.least_frames:
+def grow_body(shape: Shape, clouds: Sequence[Cloud]) -> PlacedBody | None:
+    """Find a shape in all frames and add points that move along; None if it does not recur."""
+    for n in range(RULES.rounds):
+        placements = find_placements(shape, clouds)
+        if len(placements) < RULES.least_frames:
             return None
-        shape, _ = averaged(shape, places, clouds)
+        shape, _ = averaged(shape, placements, clouds)
         if len(shape) < FEWEST:
             return None
-        if turn + 1 == RULES.rounds:
+        if n + 1 == RULES.rounds:
             break
         before = len(shape)
-        shape = _with_hidden(shape, places, clouds)
-        if len(shape) == before and turn:
+        shape = _with_further_points(shape, placements, clouds)
+        if len(shape) == before and n:
             break
-    if not len(wide_triples(shape.points, shape.reach, 1)):
+    if not len(wide_triples(shape.points, shape.sigma, 1)):
         return None
-    places = placed(shape, clouds)
-    _, different = _poses_apart(shape, places, clouds)
-    return Found(shape, tuple(places)) if different >= RULES.least_frames else None
+    placements = find_placements(shape, clouds)
+    _, different = _pose_ids(shape, placements, clouds)
+    return PlacedBody(shape, tuple(placements)) if different >= RULES.least_frames else None
 
 
-def usual_reach(places: Places, clouds: Sequence[Cloud]) -> float:
-    """By how much points that are met are off, in most placements."""
-    return float(np.median([clouds[k].reach[one.there].mean() for k, one in places]))
+def usual_sigma(placements: Placements, clouds: Sequence[Cloud]) -> float:
+    """Return the median over placements of the mean standard deviation of the points met."""
+    return float(np.median([clouds[k].sigma[p.cloud_rows].mean() for k, p in placements]))
 
 
-def _poses_apart(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple[Indices, int]:
-    """Numbers (K,) of the poses of placements, the same where no point is far, and how many."""
-    if not places:
+def _pose_ids(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> tuple[Indices, int]:
+    """Number the different poses of placements (K,), equal if no point is far away; count them."""
+    if not placements:
         return np.zeros(0, dtype=np.intp), 0
-    points = transform(np.array([one.T_world_shape for _, one in places]), shape.points)
-    far = RULES.apart * RULES.gate * usual_reach(places, clouds)
+    points = transform(np.array([p.T_world_shape for _, p in placements]), shape.points)
+    far = RULES.apart * RULES.gate * usual_sigma(placements, clouds)
     number, count = np.full(len(points), -1, dtype=np.intp), 0
     for k in range(len(points)):
         if number[k] < 0:
-            away = np.abs(points - points[k]).max(axis=(1, 2), initial=0.0)
-            number[(number < 0) & (away <= far)] = count
+            distance = np.abs(points - points[k]).max(axis=(1, 2), initial=0.0)
+            number[(number < 0) & (distance <= far)] = count
             count += 1
     return number, count
 
 
-def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> tuple[Shape, Mask]:
-    """The shape as its frames show it on average, without points that few of them show.
-
-    And which of its points (N,) are left.
-    """
+def averaged(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> tuple[Shape, Mask]:
+    """Average a shape without rarely seen points and duplicates; also return which points stay."""
     weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
-    counts, reach = np.zeros(len(shape)), np.zeros(len(shape))
-    number, different = _poses_apart(shape, places, clouds)
-    seen = np.zeros((len(shape), different), dtype=np.bool_)
-    for n, (k, one) in zip(number.tolist(), places, strict=True):
-        own, there = one.own, one.there
-        w = 1 / clouds[k].reach[there] ** 2
-        total[own] += w[:, None] * transform(inverse(one.T_world_shape), clouds[k].points[there])
-        weight[own] += w
-        counts[own] += 1
-        reach[own] += clouds[k].reach[there]
-        seen[own, n] = True
-    kept = seen.sum(axis=1) >= max(RULES.least_frames, RULES.least_share * seen.shape[1])
-    near = RULES.alike * RULES.gate * reach / np.maximum(counts, 1)
-    kept &= only_once(shape.points, counts, near)
-    middle = total[kept] / weight[kept, None]
-    return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept])), kept
+    counts, sigma = np.zeros(len(shape)), np.zeros(len(shape))
+    number, different = _pose_ids(shape, placements, clouds)
+    is_seen = np.zeros((len(shape), different), dtype=np.bool_)
+    for n, (k, placement) in zip(number.tolist(), placements, strict=True):
+        rows, cloud_rows = placement.shape_rows, placement.cloud_rows
+        in_shape = transform(inverse(placement.T_world_shape), clouds[k].points[cloud_rows])
+        information = 1 / clouds[k].sigma[cloud_rows] ** 2
+        total[rows] += information[:, None] * in_shape
+        weight[rows] += information
+        counts[rows] += 1
+        sigma[rows] += clouds[k].sigma[cloud_rows]
+        is_seen[rows, n] = True
+    is_kept = is_seen.sum(axis=1) >= max(RULES.least_frames, RULES.least_share * is_seen.shape[1])
+    near = RULES.alike * RULES.gate * sigma / np.maximum(counts, 1)
+    is_kept &= are_unique(shape.points, counts, near)
+    mean = total[is_kept] / weight[is_kept, None]
+    return Shape(mean, _averaged_sigma(sigma[is_kept] / counts[is_kept], counts[is_kept])), is_kept
 
 
-def only_once(points: Floats, counts: Floats | Indices, near: Floats) -> Mask:
-    """Which points (N,) are not beside one that is seen more often: that is the same one."""
-    kept = np.ones(len(points), dtype=np.bool_)
+def are_unique(points: Floats, counts: Floats | Indices, near: Floats) -> Mask:
+    """Test which points (N,) are not within the distance `near` of a point with more counts."""
+    is_kept = np.ones(len(points), dtype=np.bool_)
     for k in np.argsort(-counts, kind="stable"):
-        if kept[k]:
-            beside = np.linalg.norm(points - points[k], axis=1) < near[k]
-            kept[beside] = False
-            kept[k] = True
-    return kept
+        if is_kept[k]:
+            is_near = np.linalg.norm(points - points[k], axis=1) < near[k]
+            is_kept[is_near] = False
+            is_kept[k] = True
+    return is_kept
 
 
-def _reach_of(reach: Floats, counts: Floats) -> Floats:
-    return np.asarray(reach * np.maximum(1 / np.sqrt(counts), _SURER))
+def _averaged_sigma(sigma: Floats, counts: Floats) -> Floats:
+    """Return the standard deviations of means over `counts` frames."""
+    return np.asarray(sigma * np.maximum(1 / np.sqrt(counts), _COMMON))
 
 
-def _with_hidden(shape: Shape, places: Places, clouds: Sequence[Cloud]) -> Shape:
-    """The shape with points that are at one place of it at many poses."""
-    points, reach, frame = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
-    number, different = _poses_apart(shape, places, clouds)
-    for n, (k, one) in zip(number.tolist(), places, strict=True):
-        free = clouds[k].without(clouds[k].detections[one.there])
-        own = transform(inverse(one.T_world_shape), free.points)
-        points.append(own)
-        reach.append(RULES.gate * free.reach * _lever(shape, own, one.count))
-        frame.append(np.full(len(own), n))
+def _with_further_points(shape: Shape, placements: Placements, clouds: Sequence[Cloud]) -> Shape:
+    """Return the shape with further points that are at one place of it at many poses."""
+    points, radius, pose_number = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
+    number, different = _pose_ids(shape, placements, clouds)
+    for n, (k, placement) in zip(number.tolist(), placements, strict=True):
+        unclaimed = clouds[k].without(clouds[k].detections[placement.cloud_rows])
+        in_shape = transform(inverse(placement.T_world_shape), unclaimed.points)
+        points.append(in_shape)
+        radius.append(RULES.gate * unclaimed.sigma * _lever(shape, in_shape, placement.count))
+        pose_number.append(np.full(len(in_shape), n))
     least = max(RULES.least_frames, RULES.least_share * different)
-    reaches = np.concatenate(reach)
-    more = gathered_places(np.concatenate(points), reaches, np.concatenate(frame), least)
-    if not more:
+    radii = np.concatenate(radius)
+    gathered = gathered_places(np.concatenate(points), radii, np.concatenate(pose_number), least)
+    if not gathered:
         return shape
-    added = np.array([np.median(reaches[there]) / RULES.gate for _, there in more])
-    counts = np.array([len(there) for _, there in more], dtype=np.float64)
+    added = np.array([np.median(radii[rows]) / RULES.gate for _, rows in gathered])
+    counts = np.array([len(rows) for _, rows in gathered], dtype=np.float64)
     return Shape(
-        np.concatenate([shape.points, [place for place, _ in more]]),
-        np.concatenate([shape.reach, _reach_of(added, counts)]),
+        np.concatenate([shape.points, [place for place, _ in gathered]]),
+        np.concatenate([shape.sigma, _averaged_sigma(added, counts)]),
     )
 
 
 def _lever(shape: Shape, points: Floats, met: int) -> Floats:
-    """By how much errors of a pose make points (n, 3) err more than by themselves."""
-    middle = shape.points.mean(axis=0)
-    radius = np.sqrt(((shape.points - middle) ** 2).sum(axis=1).mean())
-    away = np.linalg.norm(points - middle, axis=1) / radius
-    return np.asarray(np.sqrt(1 + (1 + away**2) / met))
+    """Return the factors by which errors of a pose enlarge those of points (n, 3)."""
+    mean = shape.points.mean(axis=0)
+    radius = np.sqrt(((shape.points - mean) ** 2).sum(axis=1).mean())
+    distance = np.linalg.norm(points - mean, axis=1) / radius
+    return np.asarray(np.sqrt(1 + (1 + distance**2) / met))

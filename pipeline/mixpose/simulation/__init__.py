@@ -1,10 +1,10 @@
 """Simulation: recordings of a moving body with its true poses, made from a session file.
 
-`recording` is the whole; `motion` says where the body is, `visible_spots` what a sensor sees of it,
-`render` how that looks and is written, `naming` where.
+`recording` writes a recording; `motion` moves the body, `visible_spots` decides what a sensor sees,
+`render` draws and writes it, and `naming` chooses the files.
 
-Of all that estimates poses, simulation knows only the sensors and the object model, so that no
-estimate is checked against itself.
+Simulation shares only the sensors and the object model with the estimator, so that no estimate is
+checked against itself.
 """
 
 from mixpose.simulation.options import SimulationOptions as SimulationOptions

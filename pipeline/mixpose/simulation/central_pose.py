@@ -1,8 +1,8 @@
-"""Where bodies are simulated if the session names no start: in view of its sensors.
+"""Choose where bodies are simulated if the session has no start: in view of its sensors.
 
-With several cameras that is where they look together; with one camera, in front of it where the
-body fills about a quarter of the image; among range sensors, beside their middle.  Bodies beside
-the first stand about that place, so far from each other that they touch by their motion at most.
+With several cameras that is the point at which they look; with one camera, in front of it where the
+body fills about a quarter of the image; with range sensors, to one side of their mean position.
+Further bodies are placed around it, so far apart that they touch by their motion at most.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from mixpose.simulation.scenery import Actor
 from mixpose.simulation.visible_spots import brightness_levels, facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
-_SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob
+_SIDE_VISIBLE = 0.05  # a smaller body would look like a single blob
 _ORIENTATIONS = 64
 _AMPLITUDE = 0.4  # of the body's radius
 _APART = 1.1  # sums of radii between bodies at rest
-_TRIES = 48  # places at each distance
-_DISTANCES = (1.2, 1.6, 2.2, 3.0, 4.0)  # radii of the largest
-_SEEDS_APART = 101  # between the motions of bodies
+_TRIES = 48  # candidate places at each distance
+_DISTANCES = (1.2, 1.6, 2.2, 3.0, 4.0)  # radii of the largest body
+_SEEDS_APART = 101  # between the seeds of bodies
 
 
 def central_pose(session: Session, seed: int) -> Floats:
-    """T_world_object (4, 4) that a simulated motion swings about.
+    """Return the pose T_world_object (4, 4) about which a simulated motion swings.
 
-    That is ``[start]`` where the session has one. Else the place follows from the sensors, and the
-    orientation is drawn by chance: the one of several that shows most features. A `SessionError` if
-    no sensor sees any feature of the body there.
+    That is ``[start]`` if the session has one.  Otherwise the place follows from the sensors, and
+    of several random orientations the one with most features in view is chosen.  Raises a
+    `SessionError` if no sensor sees a feature of the body there.
     """
     if session.start is not None:
         T = session.start.T_world_object
@@ -52,7 +52,8 @@ def central_pose(session: Session, seed: int) -> Floats:
     pivot = pivot_of(session.body)
     rng = generator(seed, Purpose.ORIENTATION)
     rotations = Rotation.random(_ORIENTATIONS, rng=rng).as_matrix()
-    poses = [from_parts(R, place - R @ pivot) for place in places(session) for R in rotations]
+    places = candidate_places(session)
+    poses = [from_parts(R, place - R @ pivot) for place in places for R in rotations]
     counts = [count_seen(session, T) for T in poses]
     best = int(np.argmax(counts))
     if counts[best] == 0:
@@ -63,10 +64,10 @@ def central_pose(session: Session, seed: int) -> Floats:
     return poses[best]
 
 
-def swinging(
+def motion_about(
     session: Session, T_world_object: Floats, options: SimulationOptions, seed: int
 ) -> Motion:
-    """The motion of a session's body about a central pose."""
+    """Plan the motion of a session's body about a central pose."""
     body, amplitude = session.body, options.amplitude_translation
     return plan_motion(
         T_world_object,
@@ -80,32 +81,32 @@ def swinging(
 
 
 def pivot_of(body: Body) -> Floats:
-    """The point that a simulated body turns about: the middle of its features (3,)."""
+    """Return the point (3,) about which a simulated body turns: the mean of its features."""
     return np.asarray(body.means.mean(axis=0))
 
 
 def count_seen(session: Session, T_world_object: Floats) -> int:
-    """How many features are in view, summed over the sensors."""
+    """Count the features in view, summed over the sensors."""
     body, points = session.body, transform(T_world_object, session.body.means)
     sensors = [setup.sensor for setup in session.sensors]
-    seen = [one.project(points)[1] & facing(one, body, T_world_object) for one in sensors]
+    seen = [s.project(points)[1] & facing(s, body, T_world_object) for s in sensors]
     return int(np.sum(seen))
 
 
-def places(session: Session) -> list[Floats]:
-    """Candidates for the pivot's place (3,) in the world, best first; resolutions are known."""
+def candidate_places(session: Session) -> list[Floats]:
+    """Return candidates for the pivot's place (3,) in the world, best first; needs resolutions."""
     radius = session.body.radius
     all_rays = [_ray(setup, radius) for setup in session.sensors]
     rays = [ray for ray in all_rays if ray is not None]
     if not rays:
         clouds = [s.sensor for s in session.sensors if isinstance(s.sensor, CloudSensor)]
-        return [inverse(clouds[0].T_sensor_world)[:3, 3]] if clouds else [_beside_ranges(session)]
+        return [inverse(clouds[0].T_sensor_world)[:3, 3]] if clouds else [_place_by_ranges(session)]
     origin = np.mean([ray.origin for ray in rays], axis=0)
     direction = np.mean([ray.direction for ray in rays], axis=0)
     ahead = origin + direction * float(np.mean([ray.distance or 0.0 for ray in rays]))
-    meeting = _meeting_point(rays)
-    if meeting is not None and all(ray.suits(meeting) for ray in rays):
-        return [meeting, ahead]
+    crossing = _crossing(rays)
+    if crossing is not None and all(ray.has_in_range(crossing) for ray in rays):
+        return [crossing, ahead]
     return [ahead]
 
 
@@ -115,10 +116,10 @@ class _Ray:
 
     origin: Floats
     direction: Floats
-    distance: float | None  # where the body fills its share of the image; None: anywhere
+    distance: float | None  # at which the body fills its share of the image; None for any
 
-    def suits(self, place: Floats) -> bool:
-        """Whether the body is in front there, and neither too near nor too small."""
+    def has_in_range(self, place: Floats) -> bool:
+        """Test whether a body at a place is in front, and neither too near nor too small."""
         if self.distance is None:
             return True
         depth = float((place - self.origin) @ self.direction)
@@ -141,20 +142,19 @@ def _ray(setup: SensorSetup, radius: float) -> _Ray | None:
     return _Ray(-R.T @ t, R.T @ sight / np.linalg.norm(sight), float(distance))
 
 
-def _meeting_point(rays: list[_Ray]) -> Floats | None:
-    """The point (3,) nearest to all rays; None where they are about parallel."""
-    across = [np.eye(3) - np.outer(ray.direction, ray.direction) for ray in rays]
-    total = np.sum(across, axis=0)
+def _crossing(rays: list[_Ray]) -> Floats | None:
+    """Return the point (3,) nearest to all rays; None if they are about parallel."""
+    projections = [np.eye(3) - np.outer(ray.direction, ray.direction) for ray in rays]
+    total = np.sum(projections, axis=0)
     if np.linalg.eigvalsh(total)[0] < 1e-3 * len(rays):
         return None
-    return np.asarray(np.linalg.solve(total, sum(A @ r.origin for A, r in zip(across, rays))))
+    return np.asarray(np.linalg.solve(total, sum(P @ r.origin for P, r in zip(projections, rays))))
 
 
-def _beside_ranges(session: Session) -> Floats:
-    """Beside the plane of the range sensors: within it, ranges would not tell one side."""
-    positions = np.array(
-        [s.sensor.position for s in session.sensors if isinstance(s.sensor, RangeSensor)]
-    )
+def _place_by_ranges(session: Session) -> Floats:
+    """Return a place off the plane of the range sensors, in which ranges cannot tell the side."""
+    sensors = [setup.sensor for setup in session.sensors]
+    positions = np.array([s.position for s in sensors if isinstance(s, RangeSensor)])
     nearest = max((s.range_min or 0.0 for s in session.sensors), default=0.0)
     centred = positions - positions.mean(axis=0)
     spread = float(np.sqrt((centred**2).sum(axis=1).mean()))
@@ -166,8 +166,8 @@ def _beside_ranges(session: Session) -> Floats:
 def plan_companions(
     session: Session, first: Motion, options: SimulationOptions
 ) -> tuple[Actor, ...]:
-    """Place and move the bodies beside the first; a `SessionError` where that cannot be done."""
-    members = [(one, i) for one in session.objects for i in one.instances][1:]
+    """Place and move the further bodies of a session; a `SessionError` if there is no place."""
+    members = [(entry, i) for entry in session.objects for i in entry.instances][1:]
     if not members:
         return ()
     if any(setup.sensor.dimension != 2 for setup in session.sensors):
@@ -177,17 +177,17 @@ def plan_companions(
         )
     placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
     companions = []
-    for k, (one, instance) in enumerate(members, start=1):
-        own = session.alone(one.body.name)
+    for k, (entry, instance) in enumerate(members, start=1):
+        alone = session.alone(entry.body.name)
         seed = options.seed + _SEEDS_APART * k
-        T = central_pose(own, seed)
-        if one.start is None or instance:
-            T = _aside(own, T, placed, seed, turned=one.start is not None)
-        placed.append((_middle(T, one.body), one.body.radius))
-        motion = swinging(own, T, options, seed)
+        T = central_pose(alone, seed)
+        if entry.start is None or instance:
+            T = _pose_apart(alone, T, placed, seed, turned=entry.start is not None)
+        placed.append((_middle(T, entry.body), entry.body.radius))
+        motion = motion_about(alone, T, options, seed)
         rng = generator(seed, Purpose.BRIGHTNESS)
-        levels = brightness_levels(len(one.body), options.brightness_spread, rng)
-        companions.append(Actor(one.body, motion.pose, levels, is_body=True))
+        levels = brightness_levels(len(entry.body), options.brightness_spread, rng)
+        companions.append(Actor(entry.body, motion.pose, levels, is_body=True))
     return tuple(companions)
 
 
@@ -195,10 +195,10 @@ def _middle(T_world_object: Floats, body: Body) -> Floats:
     return np.asarray(T_world_object[:3, :3] @ pivot_of(body) + T_world_object[:3, 3])
 
 
-def _aside(
+def _pose_apart(
     session: Session, T: Floats, placed: Sequence[tuple[Floats, float]], seed: int, *, turned: bool
 ) -> Floats:
-    """A pose apart from all that are placed, as near as can be where most features are seen."""
+    """Return a pose apart from all placed bodies, as near as possible with all features seen."""
     body = session.body
     rng = generator(seed, Purpose.ORIENTATION)
     largest = max([body.radius, *(radius for _, radius in placed)])
@@ -214,10 +214,10 @@ def _aside(
                 for other, radius in placed
             ):
                 continue
-            there = from_parts(R, middle - R @ pivot_of(body))
-            seen = count_seen(session, there)
+            T_candidate = from_parts(R, middle - R @ pivot_of(body))
+            seen = count_seen(session, T_candidate)
             if best is None or seen > best[0]:
-                best = seen, there
+                best = seen, T_candidate
         if best is not None and best[0] == len(body) * len(session.sensors):
             return best[1]
     raise SessionError(

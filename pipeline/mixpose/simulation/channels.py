@@ -1,4 +1,4 @@
-"""What a recording needs to know of each sensor: its view of the body and its writer."""
+"""Prepare each sensor of a recording: its view of the body and its writer."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.visible_spots import View, brightness_levels
 
 _LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
-_CLOUD_NOISE = 0.2  # of sigma, which is a tolerance
+_CLOUD_NOISE = 0.2  # of sigma, which is a tolerance and not the noise
 _TABLE_SPACING_PX = 2.0
 _SPOT_SIGMA_PX = 1.6
-_OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size themselves
-_PEAK_BINS = 1.5  # standard deviation of a peak, where nothing says it
-_PEAK_REACH = 5.0  # standard deviations of a peak that still fit into a profile
-_COORDINATES = {1: ("range",), 2: ("u", "v"), 3: ("x", "y", "z")}  # of tables
+_OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size
+_PEAK_BINS = 1.5  # standard deviation of a peak, unless stated
+_PEAK_REACH = 5.0  # standard deviations of a peak for which a profile has room
+_COORDINATES = {1: ("range",), 2: ("u", "v"), 3: ("x", "y", "z")}  # columns of tables
 
 
 @dataclass(frozen=True)
 class Channel:
     """One sensor of a recording."""
 
-    gives: Output
+    output: Output
     files: SourceFiles
     view: View
-    options: SimulationOptions  # as they hold for this sensor
-    open: Callable[[Path], SensorWriter]  # takes the recording's folder and starts to write there
-    step_s: float = 0.0  # seconds after the first sensor, as its times say
+    options: SimulationOptions  # that hold for this sensor
+    open: Callable[[Path], SensorWriter]  # opens the writer in the recording's folder
+    step_s: float = 0.0  # seconds after the first sensor, as in its table of times
 
 
 def check_setup(session: Session) -> None:
-    """Raise a `SessionError` for a camera without a resolution, or that looks for no spots."""
+    """Raise a `SessionError` for a camera without a resolution, or one that looks for corners."""
     for setup in session.sensors:
         where = f"{session.path}: sensor {setup.name!r}"
         if setup.extract.method == "corners":
@@ -60,26 +60,26 @@ def check_setup(session: Session) -> None:
 
 @dataclass(frozen=True)
 class Planner:
-    """Prepares the sensors of a session that `check_setup` has passed."""
+    """Preparation of the sensors of a session that `check_setup` has passed."""
 
     body: Body
     motion: Motion
     options: SimulationOptions
     fps: float
-    scenery: Scenery  # that cameras see, too
+    scenery: Scenery  # that cameras also see
 
     def channel(self, setup: SensorSetup, files: SourceFiles, index: int, step_s: float) -> Channel:
-        """A sensor, or a `SessionError` where it cannot be simulated.
+        """Return the channel of a sensor, or raise a `SessionError` if it cannot be simulated.
 
-        Its place in the session, `index`, keys its random numbers; it is `step_s` later than the
-        first, and says so.
+        Random numbers are keyed by its `index` in the session; it is `step_s` later than the first
+        sensor, and so are its times.
         """
         shutter = shutter_of(setup, self.options, step_s)
         is_image = setup.sensor.dimension == 2
         is_profile = setup.range_min is not None and setup.bin_size is not None
         if files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile):
             channel = self._table(setup, files)
-            if is_image:  # a detection is where the middle of a streak is
+            if is_image:  # a detection is the middle of a streak
                 shutter = replace(shutter, exposure_s=0.0)
         elif is_image:
             channel = self._camera(setup, files, index)
@@ -129,7 +129,7 @@ class Planner:
             bounds, spacing = (sensor.lower, sensor.upper), _TABLE_SPACING_PX
             noise = options.pixel_noise
         else:
-            # lines become detections about as far apart as these are exact
+            # a line becomes detections that are about their noise apart
             bounds, spacing = self._around(setup), sigma
             usual = sigma if sensor.dimension == 1 else _CLOUD_NOISE * sigma
             noise = usual if options.range_noise is None else options.range_noise
@@ -146,17 +146,17 @@ class Planner:
     def _view(
         self, setup: SensorSetup, bounds: tuple[Floats, Floats], sigma: float, index: int
     ) -> View:
-        """The view of a sensor whose spots have a standard deviation."""
-        # the same throughout a recording
+        """Return the view of a sensor whose spots have the standard deviation `sigma`."""
+        # brightness does not change during a recording
         rng = generator(self.options.seed, Purpose.BRIGHTNESS, index)
         levels = brightness_levels(len(self.body), self.options.brightness_spread, rng)
         spacing = _LINE_SPACING * sigma
-        # spots this far apart are together as bright as one spot alone
+        # overlapping spots at this spacing add up to the brightness of a single spot
         ridge = float(spacing / (np.sqrt(2 * np.pi) * sigma))
         return View(setup.sensor, *bounds, levels, spacing, ridge)
 
     def _around(self, setup: SensorSetup) -> tuple[Floats, Floats]:
-        """Bounds (m,), (m,) of lengths along a sensor's axes that the moving body can have."""
+        """Return bounds (m,), (m,) of the moving body along the axes of a sensor of lengths."""
         motion, points = self.motion, self.body.nodes.points
         pivot_world = motion.T_world_object[:3, :3] @ motion.pivot + motion.T_world_object[:3, 3]
         middle, _ = setup.sensor.project(pivot_world)
@@ -167,11 +167,11 @@ class Planner:
 
 
 def shutter_of(setup: SensorSetup, options: SimulationOptions, step_s: float) -> Shutter:
-    """When a sensor sees what: as the session states, but for what the options say."""
+    """Return the timing of a sensor: as the options say, else as the session states."""
     stated = setup.delay if isinstance(setup.delay, float) else 0.0
     readout = setup.readout if options.readout is None else options.readout
     exposure = setup.exposure if options.exposure is None else options.exposure
-    late = options.delay.get(setup.name, stated) + step_s
+    delay = options.delay.get(setup.name, stated) + step_s
     if setup.resolution is None:
-        return Shutter(late)
-    return Shutter(late, readout, exposure, setup.resolution[1])
+        return Shutter(delay)
+    return Shutter(delay, readout, exposure, setup.resolution[1])

@@ -1,4 +1,4 @@
-"""Which files a simulated recording consists of, so that the session file reads them as it stands.
+"""Choose the files of a simulated recording, so that the copied session reads them unchanged.
 
 A glob becomes images with the frame number in place of its last ``*``, a folder is filled with
 numbered images, a list gives its own names, and a video or a table is one file.
@@ -32,45 +32,45 @@ _FEWEST_DIGITS = 4
 class SourceFiles:
     """The files of one sensor, relative to the recording's folder."""
 
-    sensor: str  # its name
+    sensor: str  # name
     kind: Kind
-    path: str  # the one file of a video or table; for images what comes before the frame number
-    ending: str = ""  # for images: what comes after the frame number
-    digits: int = 0  # for images: how many digits the frame number has at least
-    listed: dict[int, str] = field(default_factory=dict)  # for images of a list: their names
-    pattern: str = ""  # the glob that the session reads the images by; empty for all other sources
+    path: str  # the file of a video or table; of images the text before the frame number
+    ending: str = ""  # of images: the text after the frame number
+    digits: int = 0  # of images: the least number of digits of the frame number
+    listed: dict[int, str] = field(default_factory=dict)  # of images of a list: names by frame
+    pattern: str = ""  # the glob by which the session reads the images; empty for other sources
 
     def name(self, number: int) -> str:
-        """The file that holds a frame."""
+        """Return the name of the file that holds a frame."""
         if self.kind != "images":
             return self.path
         return self.listed.get(number) or f"{self.path}{number:0{self.digits}d}{self.ending}"
 
     @property
     def may_lack_frames(self) -> bool:
-        """Whether a frame may be left out: each of the others says its own number."""
+        """Whether a frame may be missing, as the others state their own numbers."""
         if self.kind == "images":
             return not self.listed and self.ending == PurePosixPath(f"0{self.ending}").suffix
         return self.kind == "detections"
 
     @property
     def counts_from_zero(self) -> bool:
-        """Whether frames are numbered by their place."""
+        """Whether frames are numbered by their position."""
         return not self.may_lack_frames and not self.listed
 
     def existing(self, folder: Path) -> Iterator[Path]:
-        """Files that lie in a folder and that the session would read as this source."""
+        """Yield files in a folder that the session would read as this source."""
         if self.pattern:
             yield from (path for path in folder.glob(self.pattern) if path.is_file())
         elif self.kind == "images" and not self.listed:
-            found = (folder / self.path).glob("*")
-            yield from (path for path in found if path.suffix.casefold() in IMAGE_SUFFIXES)
+            paths = (folder / self.path).glob("*")
+            yield from (path for path in paths if path.suffix.casefold() in IMAGE_SUFFIXES)
         else:
             names = self.listed.values() if self.listed else [self.path]
             yield from (path for path in (folder / name for name in names) if path.is_file())
 
     def reads(self, name: str) -> bool:
-        """Whether the session would take a file for one of this source."""
+        """Test whether the session would read a file of this name as part of this source."""
         if self.pattern:
             return _matches(self.pattern, name)
         if self.kind == "images" and not self.listed:
@@ -85,8 +85,8 @@ Sources: TypeAlias = Sequence[tuple[SensorSetup, Source]]
 def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[SourceFiles, ...]]:
     """Choose the files of a recording, for sources inside its folder.
 
-    The frame numbers, ascending, are those that lists of images say, else from 0. A `SessionError`
-    if no files that can be written would be read by these sources.
+    The frame numbers, ascending, are those of lists of images, else they count from 0.  Raises a
+    `SessionError` if these sources would read no files that can be written.
     """
     single = [
         (setup, source[0] if isinstance(source, tuple) and len(source) == 1 else source)
@@ -94,17 +94,17 @@ def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[Sour
     ]
     numbers = _frame_numbers(single, frames)
     files = tuple(_source_files(setup, source, numbers) for setup, source in single)
-    for one in files:
-        if one.counts_from_zero and numbers[-1] != frames - 1:
+    for target in files:
+        if target.counts_from_zero and numbers[-1] != frames - 1:
             raise SessionError(
-                f"{_where(one.sensor)}: counts frames from 0, while a list of images of another "
+                f"{_where(target.sensor)}: counts frames from 0, while a list of images of another "
                 f"sensor has the numbers {numbers[0]} to {numbers[-1]}; use numbered images"
             )
-    for one, other in permutations(files, 2):
-        name = one.name(numbers[0])
+    for first, other in permutations(files, 2):
+        name = first.name(numbers[0])
         if other.reads(name):
             raise SessionError(
-                f"{_where(other.sensor)}: would also read {name} of sensor {one.sensor!r}; give "
+                f"{_where(other.sensor)}: would also read {name} of sensor {first.sensor!r}; give "
                 "each sensor files of its own"
             )
     return numbers, files
@@ -116,7 +116,7 @@ def _where(sensor: str) -> str:
 
 def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
     numbers: Sequence[int] = range(frames)
-    found_in = ""
+    listed_by = ""
     for setup, source in sources:
         names = _image_names(source)
         if not names or setup.sensor.dimension != 2:
@@ -126,18 +126,18 @@ def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
                 f"{_where(setup.name)}: names {len(names)} image{'s' * (len(names) != 1)}; "
                 f'allowed: one per frame ({frames}), or a glob like "{setup.name}*.png"'
             )
-        own = sorted(frame_numbers([Path(name) for name in names]))
-        if found_in and own != numbers:
+        listed = sorted(frame_numbers([Path(name) for name in names]))
+        if listed_by and listed != numbers:
             raise SessionError(
-                f"{_where(setup.name)}: has other frame numbers than that of {found_in!r}; name "
+                f"{_where(setup.name)}: has other frame numbers than that of {listed_by!r}; name "
                 "the images of one moment by the same number"
             )
-        numbers, found_in = own, setup.name
+        numbers, listed_by = listed, setup.name
     return numbers
 
 
 def _image_names(source: Source) -> tuple[str, ...]:
-    """Names of images that the session states one by one."""
+    """Return the names of images that the session lists one by one."""
     if isinstance(source, tuple):
         return source
     is_image = PurePosixPath(source).suffix.casefold() in IMAGE_SUFFIXES
@@ -185,8 +185,8 @@ def _camera_files(sensor: str, source: Source, numbers: Sequence[int]) -> Source
             raise SessionError(f"{_where(sensor)}: names an image twice; allowed: one per frame")
         for name in names:
             _check_format(name, sensor)
-        own = frame_numbers([Path(name) for name in names])
-        return SourceFiles(sensor, "images", "", listed=dict(sorted(zip(own, names))))
+        listed_numbers = frame_numbers([Path(name) for name in names])
+        return SourceFiles(sensor, "images", "", listed=dict(sorted(zip(listed_numbers, names))))
     assert isinstance(source, str)
     suffix = PurePosixPath(source).suffix.casefold()
     if suffix == ".csv":
@@ -211,14 +211,14 @@ def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> Source
         concrete = f"{pattern}.png"
     elif _WILD.search(suffix):
         concrete = f"{head}.png"
-    before, after, room = _split_at_number(concrete, sensor)
-    digits = room or max(_FEWEST_DIGITS, len(str(numbers[-1])))
-    if before[-1:].isdigit():  # else cam2 and frame 0001 would be frame 20001
-        before, digits = f"{before}_", room - 1 if room else digits
+    before, after, width = _split_at_number(concrete, sensor)
+    digits = width or max(_FEWEST_DIGITS, len(str(numbers[-1])))
+    if before[-1:].isdigit():  # otherwise frame 0001 of cam2 would be read as frame 20001
+        before, digits = f"{before}_", width - 1 if width else digits
     files = SourceFiles(sensor, "images", before, after, digits, pattern=pattern)
     ends = [numbers[0], numbers[-1]] if len(numbers) > 1 else [numbers[0]]
     names = [files.name(number) for number in ends]
-    # images that do not end in their number are counted, two of them as 0 and 1
+    # images that do not end in their number are counted, so that two of them are 0 and 1
     wanted = list(range(len(ends))) if files.counts_from_zero else ends
     read_as = frame_numbers([Path(name) for name in names])
     if not all(_matches(pattern, name) for name in names) or read_as != wanted:
@@ -231,18 +231,18 @@ def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> Source
 
 
 def _split_at_number(pattern: str, sensor: str) -> tuple[str, str, int]:
-    """What stands before and after the number, and how many digits it has room for; 0 for any."""
+    """Return the text before and after the number, and its digits; 0 for any number of digits."""
     stars = [match for match in _WILD.finditer(pattern) if match.group() == "*"]
-    found = stars or list(_SINGLES.finditer(pattern))
-    if not found:
+    wildcards = stars or list(_SINGLES.finditer(pattern))
+    if not wildcards:
         raise SessionError(f'{_where(sensor)}: found {pattern!r}; use a glob like "{sensor}*.png"')
-    start, end = found[-1].span()
-    room = 0 if stars else len(_WILD.findall(found[-1].group()))
-    return _filled(pattern[:start]), _filled(pattern[end:]), room
+    start, end = wildcards[-1].span()
+    digits = 0 if stars else len(_WILD.findall(wildcards[-1].group()))
+    return _filled(pattern[:start]), _filled(pattern[end:]), digits
 
 
 def _filled(pattern: str) -> str:
-    """A name that a glob matches, the shortest."""
+    """Return the shortest name that matches a glob."""
 
     def fill(match: re.Match[str]) -> str:
         text = match.group()

@@ -1,4 +1,4 @@
-"""A simulated recording: frames of every sensor, the session file that plays them, the truth."""
+"""Simulate a recording: frames of every sensor, the session file that plays them, and the truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.central_pose import central_pose, plan_companions, swinging
+from mixpose.simulation.central_pose import central_pose, motion_about, plan_companions
 from mixpose.simulation.channels import Channel, Planner, check_setup
 from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import plan_files
@@ -24,18 +24,18 @@ from mixpose.simulation.options import DEFAULT_FPS, Purpose, SimulationOptions, 
 from mixpose.simulation.render import SensorWriter
 from mixpose.simulation.scenery import Actor, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
-from mixpose.simulation.visible_spots import VisibleSpots, displacements, later, look
+from mixpose.simulation.visible_spots import VisibleSpots, displacements, look, shifted
 
 TRUTH_NAME = "truth.jsonl"
 
-_DECIMALS = 12  # of true poses: what machines round differently is beyond
+_DECIMALS = 12  # of true poses: machines round later ones differently
 
 Progress: TypeAlias = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Everything about a recording but its frames."""
+    """All data of a recording except its frames."""
 
     session: Session
     options: SimulationOptions
@@ -55,20 +55,20 @@ def simulate(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> tuple[str, ...]:
-    """Write a recording that the session plays, with the true poses beside it.
+    """Write a recording that the session plays, and its true poses.
 
-    Returns the names of options that ask for what none of its sensors gives.
+    Returns the names of options that affect none of its sensors.
 
-    The folder, made if it is not there, then holds ``session.toml``, the marker and calibration
-    files that it names, frames for the source of each sensor, and ``truth.jsonl``. The same
-    session, options and seed give the same bytes. `progress` is told the number of frames done. A
-    `SessionError` if the session cannot be simulated, or the folder holds a recording that is not
-    to be overwritten, or cannot be written.
+    The folder, made if missing, then holds ``session.toml``, the marker and calibration files that
+    it names, frames for the source of each sensor, and ``truth.jsonl``.  The same session, options
+    and seed give the same bytes.  `progress` receives the number of frames done.  Raises a
+    `SessionError` if the session cannot be simulated, or the folder cannot be written or holds a
+    recording that is not to be overwritten.
     """
     folder = Path(folder)
     plan = _plan(session, options)
     try:
-        _make_room(plan, folder, overwrite=overwrite)
+        _clear_folder(plan, folder, overwrite=overwrite)
         plan.copied.write(folder)
         _write_times(plan, folder)
         _record(plan, folder, progress)
@@ -76,34 +76,34 @@ def simulate(
         raise SessionError(
             f"simulate: {error.filename or folder}: cannot be written: {error.strerror}"
         ) from error
-    given = {channel.gives for channel in plan.channels}
-    return options.unused(given, is_exact=session.body.spread == 0)
+    outputs = {channel.output for channel in plan.channels}
+    return options.unused(outputs, is_exact=session.body.spread == 0)
 
 
 def _plan(session: Session, options: SimulationOptions) -> _Plan:
     check_setup(session)
     copied = copy_session(session)
     sources = list(zip(session.sensors, copied.sources))
-    motion = swinging(session, central_pose(session, options.seed), options, options.seed)
+    motion = motion_about(session, central_pose(session, options.seed), options, options.seed)
     companions = plan_companions(session, motion, options)
     try:
         numbers, files = plan_files(sources, options.frames)
         fps = _frames_per_second(session, options)
-        steps = _steps(session, [own.kind for own in files], options)
-        setups = _as_they_stand(session.sensors, options)
+        steps = _steps_s(session, [source.kind for source in files], options)
+        setups = _with_turned_camera(session.sensors, options)
         cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
         scenery = plan_scenery(session.body, motion, cameras, options)
         scenery = replace(scenery, actors=(*companions, *scenery.actors))
         planner = Planner(session.body, motion, options, fps, scenery)
         numbered = enumerate(zip(setups, files, steps))
-        channels = tuple(planner.channel(a, own, i, step) for i, (a, own, step) in numbered)
-    except SessionError as error:  # which key is known there, which file here
+        channels = tuple(planner.channel(a, source, i, step) for i, (a, source, step) in numbered)
+    except SessionError as error:  # it names the key, but not the file
         raise SessionError(f"{session.path}: {error}") from error
     return _Plan(session, options, copied, numbers, fps, motion, channels, companions)
 
 
-def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -> list[float]:
-    """Seconds by which each sensor is later than the first, where its times can say so."""
+def _steps_s(session: Session, kinds: Sequence[str], options: SimulationOptions) -> list[float]:
+    """Return the seconds by which each sensor's times are later than those of the first."""
     names = {setup.name for setup in session.sensors}
     for name in options.delay:
         if name not in names:
@@ -123,10 +123,10 @@ def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -
     return [options.out_of_step * i / max(count - 1, 1) for i in range(count)]
 
 
-def _as_they_stand(
+def _with_turned_camera(
     setups: Sequence[SensorSetup], options: SimulationOptions
 ) -> Sequence[SensorSetup]:
-    """The sensors, the last camera turned away from where the session says it looks."""
+    """Return the sensors with the last camera turned from the direction that the session states."""
     cameras = [i for i, setup in enumerate(setups) if setup.sensor.dimension == 2]
     if not options.turned_camera_deg or not cameras:
         return setups
@@ -143,17 +143,17 @@ def _as_they_stand(
 
 def _frames_per_second(session: Session, options: SimulationOptions) -> float:
     stated = [(f"sensor {setup.name!r}", setup.fps) for setup in session.sensors]
-    given = {who: fps for who, fps in (*stated, ("asked for", options.fps)) if fps is not None}
-    if len(set(given.values())) > 1:
-        told = ", ".join(f"{fps:g} ({who})" for who, fps in given.items())
+    rates = {who: fps for who, fps in (*stated, ("asked for", options.fps)) if fps is not None}
+    if len(set(rates.values())) > 1:
+        listed = ", ".join(f"{fps:g} ({who})" for who, fps in rates.items())
         raise SessionError(
-            f"fps: found {told}; allowed: the same for all, as frames are taken together"
+            f"fps: found {listed}; allowed: the same for all, as frames are taken together"
         )
-    return next(iter(given.values()), DEFAULT_FPS)
+    return next(iter(rates.values()), DEFAULT_FPS)
 
 
-def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
-    """See that the frames in the folder will be those of this recording only."""
+def _clear_folder(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
+    """Make the folder, and remove an earlier recording if it may be overwritten."""
     if folder.resolve() == plan.session.folder.resolve():
         raise SessionError(
             f"simulate: {folder}: is the folder of {plan.session.path.name} itself; choose "
@@ -162,15 +162,15 @@ def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
     if folder.exists() and not folder.is_dir():
         raise SessionError(f"simulate: {folder}: is a file; allowed: a folder")
     folder.mkdir(parents=True, exist_ok=True)
-    held = [path for channel in plan.channels for path in channel.files.existing(folder)]
+    existing = [path for channel in plan.channels for path in channel.files.existing(folder)]
     names = [SESSION_NAME, TRUTH_NAME, *plan.copied.times, *(n for _, n in plan.copied.files)]
-    held += [path for path in (folder / name for name in names) if path.exists()]
-    if held and not overwrite:
+    existing += [path for path in (folder / name for name in names) if path.exists()]
+    if existing and not overwrite:
         raise SessionError(
-            f"simulate: {folder}: holds a recording already ({held[0].name}); choose another "
+            f"simulate: {folder}: holds a recording already ({existing[0].name}); choose another "
             "folder, or --overwrite (in Python overwrite=True)"
         )
-    for path in held:
+    for path in existing:
         path.unlink(missing_ok=True)
 
 
@@ -186,14 +186,14 @@ def _write_times(plan: _Plan, folder: Path) -> None:
 
 def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
     # in the order of the session's bodies
-    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
-    paths = [plan.motion.pose, *(one.pose for one in plan.companions)]
+    names = [(entry.body.name, i) for entry in plan.session.objects for i in entry.instances]
+    paths = [plan.motion.pose, *(companion.pose for companion in plan.companions)]
     with ExitStack() as stack:
         writers = [stack.enter_context(closing(c.open(folder))) for c in plan.channels]
         truth = stack.enter_context((folder / TRUTH_NAME).open("w", encoding="ascii", newline="\n"))
         truth.write(_line(_header(plan)))
         for done, number in enumerate(plan.numbers, start=1):
-            # the motion begins with the first frame, whatever its number
+            # the motion begins at the first frame, whatever its number
             moment = (number - plan.numbers[0]) / plan.fps
             poses = [np.round(pose(moment), _DECIMALS) + 0.0 for pose in paths]
             is_recorded = _record_frame(plan, writers, number, poses[0], moment)
@@ -215,11 +215,11 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
 def _record_frame(
     plan: _Plan, writers: Iterable[SensorWriter], number: int, T_world_object: Floats, moment: float
 ) -> bool:
-    """Record one frame with every sensor; False if the body is away or all of them missed it."""
+    """Record one frame with every sensor; return False if none has it or the body is away."""
     options, body = plan.options, plan.session.body
     offsets = None
-    after = options.away_from
-    is_away = after is not None and number - plan.numbers[0] >= after
+    frames_present = options.away_from
+    is_away = frames_present is not None and number - plan.numbers[0] >= frames_present
     if options.deform:
         rng = generator(options.seed, Purpose.DEFORMATION, number)
         offsets = displacements(body, T_world_object, rng)
@@ -237,7 +237,7 @@ def _record_frame(
             channel.options,
             rng,
             offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else later(plan.motion.pose, moment),
+            pose_after=None if channel.view.shutter.is_ideal else shifted(plan.motion.pose, moment),
             time_s=moment,
             is_away=is_away,
         )

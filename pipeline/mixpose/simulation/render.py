@@ -1,7 +1,7 @@
-"""From spots to grey images and range profiles, and to the disk: a writer per kind of source.
+"""Draw spots into grey images and range profiles, and write them: a writer per kind of source.
 
-A spot is a Gaussian integrated over each pixel or bin, so that its centroid is where the feature
-projects to, without a bias toward pixel centres.
+A spot is a Gaussian integrated over each pixel or bin, so that its centroid is at the projection of
+the feature, without a bias toward pixel centres.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.visible_spots import VisibleSpots, coverage
 
-_REACH = 5.0  # standard deviations up to which a spot is drawn: the rest is below 1e-6 of it
+_REACH = 5.0  # standard deviations up to which a spot is drawn: it is below 1e-6 beyond
 _WHITE = 255.0
 _RED, _GREEN, _BLUE = 1.0, 0.8, 0.6
-# Runs and no filter: the best for noise, and fast.
+# Run lengths without a filter: best for noise, and fast.
 _PNG = (
     cv2.IMWRITE_PNG_STRATEGY,
     cv2.IMWRITE_PNG_STRATEGY_RLE,
@@ -39,8 +39,8 @@ _VIDEO_QUALITY = 95
 def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma: float) -> None:
     """Add Gaussian spots at centres (M, 2) to an image (H, W), in place.
 
-    Centres are in px, u right and v down, pixel centres at integers; a spot of a `peak` adds ``peak
-    · 2π σ²`` in all.
+    Centres are in px, u right and v down, pixel centres at integers; a spot adds ``peak · 2π σ²``
+    in total.
     """
     height, width = image.shape
     for (u, v), peak in zip(points, peaks):
@@ -54,7 +54,7 @@ def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma
 def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -> None:
     """Add Gaussian peaks at `places` (M,), in bins, to a profile (B,), in place.
 
-    Bin centres are at integers; a peak adds ``peak · √(2π) σ`` in all.
+    Bin centres are at integers; a peak adds ``peak · √(2π) σ`` in total.
     """
     for place, peak in zip(places, peaks):
         bins = _cells(place, sigma, len(profile))
@@ -64,7 +64,7 @@ def draw_profile(profile: Floats, places: Floats, peaks: Floats, sigma: float) -
 
 @dataclass(frozen=True)
 class ImageFormat:
-    """How a camera's images are drawn."""
+    """Format of a camera's images."""
 
     resolution: tuple[int, int]  # width and height, px
     spot_sigma: float  # standard deviation of a spot, px
@@ -73,7 +73,7 @@ class ImageFormat:
 
 @dataclass(frozen=True)
 class ProfileFormat:
-    """How a range sensor's profiles are drawn."""
+    """Format of a range sensor's profiles."""
 
     bins: int
     range_min: float  # of the first bin
@@ -84,12 +84,12 @@ class ProfileFormat:
 def render_image(
     visible: VisibleSpots, form: ImageFormat, options: SimulationOptions, rng: Generator
 ) -> NDArray[np.uint8]:
-    """The image (H, W) that a camera takes of spots in px; what is brighter than 255 is 255."""
+    """Draw the image (H, W) that a camera takes of spots in px, clipped at 255."""
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
     draw_light(image, visible, options.brightness, form.spot_sigma)
     if options.bayer:
-        # what each pixel of a colour sensor takes of warm white light, by its filter
+        # share of warm white light that passes the colour filter of each pixel
         gains = np.full(image.shape, _GREEN, np.float32)
         gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
         image *= gains
@@ -118,30 +118,30 @@ def render_image(
 def draw_light(
     image: NDArray[np.float32], visible: VisibleSpots, brightness: float, sigma: float
 ) -> None:
-    """Add all that shines to an image, and take away what something dark stands before.
+    """Add all spots to an image, and darken it where something dark is in front.
 
-    Spots without a size are Gaussians of `sigma`; the others are evenly bright within their edges,
-    blurred by as much.
+    Spots without a size are Gaussians of `sigma`; the others are evenly bright within outlines that
+    are blurred by `sigma`.
     """
-    sized = visible.outlines
-    plain = np.array([k not in sized for k in range(len(visible))], dtype=np.bool_)
+    outlines = visible.outlines
+    is_plain = np.array([k not in outlines for k in range(len(visible))], dtype=np.bool_)
     peaks = brightness * visible.levels
-    draw_spots(image, visible.points[plain], peaks[plain], sigma)
-    if sized:
+    draw_spots(image, visible.points[is_plain], peaks[is_plain], sigma)
+    if outlines:
         disks = np.zeros(image.shape, dtype=np.float32)
-        for k, edge in sized.items():
-            rows, columns, shares = coverage(edge, image.shape)
+        for k, outline in outlines.items():
+            rows, columns, shares = coverage(outline, image.shape)
             disks[rows, columns] += np.float32(peaks[k]) * shares.astype(np.float32)
         image += cv2.GaussianBlur(disks, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    for cover in visible.covers:
-        rows, columns, shares = coverage(cover, image.shape)
+    for occluder in visible.occluders:
+        rows, columns, shares = coverage(occluder, image.shape)
         image[rows, columns] *= (1 - shares).astype(np.float32)
 
 
 def render_profile(
     visible: VisibleSpots, form: ProfileFormat, options: SimulationOptions, rng: Generator
 ) -> NDArray[np.float32]:
-    """The profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
+    """Draw the profile (bins,) of spots in length units: 1 at a mean feature, never below 0."""
     profile = np.zeros(form.bins)
     places = (visible.points[:, 0] - form.range_min) / form.bin_size
     draw_profile(profile, places, visible.levels, form.width / form.bin_size)
@@ -150,27 +150,27 @@ def render_profile(
 
 
 def _cells(centre: float, sigma: float, count: int) -> range:
-    """The cells within reach of a spot."""
+    """Return the cells within reach of a spot."""
     reach = ceil(_REACH * sigma) + 1
     middle = round(centre)
     return range(min(max(middle - reach, 0), count), max(min(middle + reach + 1, count), 0))
 
 
 def _shares(cells: range, centre: float, sigma: float) -> Floats:
-    """Share of a unit Gaussian that falls into each cell."""
+    """Return the share of a unit Gaussian in each cell."""
     edges = np.arange(cells.start, cells.stop + 1) - 0.5
     return np.asarray(np.diff(0.5 * erf((edges - centre) / (np.sqrt(2) * sigma))))
 
 
-def _made(path: Path) -> Path:
-    """A path whose folder is there."""
+def _with_folder(path: Path) -> Path:
+    """Return a path after making its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
 @dataclass(frozen=True)
 class ImageWriter:
-    """A file per image."""
+    """Writer of a file per image."""
 
     files: SourceFiles
     folder: Path
@@ -180,16 +180,16 @@ class ImageWriter:
     def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Draw and write one image."""
         image = render_image(visible, self.form, self.options, rng)
-        path = _made(self.folder / self.files.name(number))
+        path = _with_folder(self.folder / self.files.name(number))
         suffix = path.suffix.casefold()
         path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
 
     def close(self) -> None:
-        """Nothing is left to do: every image is whole."""
+        """Do nothing: each image is complete when it is written."""
 
 
 class VideoWriter:
-    """All images in one video: MJPEG in .avi, MPEG-4 in .mp4."""
+    """Writer of all images into one video: MJPEG in .avi, MPEG-4 in .mp4."""
 
     def __init__(
         self,
@@ -200,16 +200,16 @@ class VideoWriter:
         fps: float,
     ) -> None:
         self._options, self._form = options, form
-        path = _made(folder / files.path)
-        # OpenCV's own writer of MJPEG lets the quality be set
-        own = path.suffix.casefold() == ".avi"
+        path = _with_folder(folder / files.path)
+        # the quality of OpenCV's own MJPEG writer can be set
+        is_mjpeg = path.suffix.casefold() == ".avi"
         self._video = cv2.VideoWriter(
             str(path),
-            cv2.CAP_OPENCV_MJPEG if own else cv2.CAP_FFMPEG,
-            cv2.VideoWriter.fourcc(*("MJPG" if own else "mp4v")),
+            cv2.CAP_OPENCV_MJPEG if is_mjpeg else cv2.CAP_FFMPEG,
+            cv2.VideoWriter.fourcc(*("MJPG" if is_mjpeg else "mp4v")),
             fps,
             form.resolution,
-            (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if own else (),
+            (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if is_mjpeg else (),
         )
         if not self._video.isOpened():
             raise SessionError(
@@ -228,10 +228,10 @@ class VideoWriter:
 
 
 class _TableWriter:
-    """Rows of one file."""
+    """Writer of rows into one file."""
 
     def __init__(self, files: SourceFiles, folder: Path) -> None:
-        self._path = _made(folder / files.path)
+        self._path = _with_folder(folder / files.path)
         self._file = self._path.open("wb")
 
     def close(self) -> None:
@@ -240,7 +240,7 @@ class _TableWriter:
 
 
 class ProfileWriter(_TableWriter):
-    """A row per frame: .npy of float32, or .csv without a header."""
+    """Writer of a row per frame: .npy of float32, or .csv without a header."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
@@ -263,7 +263,7 @@ class ProfileWriter(_TableWriter):
 
 
 class DetectionWriter(_TableWriter):
-    """A row per detection, in no order, or one of weight 0: the sensor looked, and saw none."""
+    """Writer of a row per detection, shuffled, or one of weight 0 for a frame without any."""
 
     def __init__(
         self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
@@ -278,12 +278,12 @@ class DetectionWriter(_TableWriter):
     def write(self, number: int, time_s: float, visible: VisibleSpots, rng: Generator) -> None:
         """Append the detections of one frame."""
         noise = self._noise * rng.standard_normal(visible.points.shape)
-        shown = np.ones(len(noise), dtype=bool)
-        for cover in visible.covers:  # of something dark before cameras
-            corners = cover.astype(np.float32)
+        is_shown = np.ones(len(noise), dtype=bool)
+        for occluder in visible.occluders:
+            corners = occluder.astype(np.float32)
             inside = [cv2.pointPolygonTest(corners, y.tolist(), False) for y in visible.points]
-            shown &= np.array(inside, dtype=float) < 0
-        points, weights = (visible.points + noise)[shown], visible.levels[shown]
+            is_shown &= np.array(inside, dtype=float) < 0
+        points, weights = (visible.points + noise)[is_shown], visible.levels[is_shown]
         if not len(points):
             points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
         for i in rng.permutation(len(points)):
@@ -292,4 +292,4 @@ class DetectionWriter(_TableWriter):
 
 
 SensorWriter: TypeAlias = ImageWriter | VideoWriter | ProfileWriter | DetectionWriter
-"""Writes what one sensor records, frame by frame by ascending numbers, until it is closed."""
+"""Writer of the frames of one sensor, by ascending numbers, until it is closed."""

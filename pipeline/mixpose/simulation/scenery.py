@@ -1,7 +1,7 @@
-"""What else is before the cameras: lamps, a polished table, the markers of others, an arm.
+"""What cameras see besides the body: lamps, a reflecting table, other bodies' markers, an arm.
 
-Placed about the middle of the body's motion, between what the cameras look at and beyond, and drawn
-from a seed.  Sensors of ranges know nothing of it.
+It is placed around the centre of the body's motion, and drawn from a seed.  Range sensors do not
+see it.
 """
 
 from __future__ import annotations
@@ -19,44 +19,44 @@ from mixpose.sensors import Sensor
 from mixpose.simulation.motion import Motion, PoseAt, plan_motion
 from mixpose.simulation.options import Purpose, SimulationOptions, generator
 
-_LAMP = 0.12  # of the body's radius
-_LAMP_LEVEL = 3.0  # of a marker: the image is white there
+_LAMP = 0.12  # radius, of that of the body
+_LAMP_LEVEL = 3.0  # brightness, of that of a marker: the image is saturated
 _LAMPS_AWAY = (3.0, 6.0)  # radii behind the body
 _LAMPS_ASIDE = 3.0
-_TABLE_BELOW = 1.3  # radii under the middle of the motion
+_TABLE_BELOW = 1.3  # radii below the centre of the motion
 _OTHERS_ASIDE = (2.2, 3.2)
 _OTHERS_MOVE = 0.3
 _ARM_BEFORE = 2.5  # radii towards the cameras
 _ARM_SWING = 1.5
 _ARM_LENGTH = 8.0
 _ARM_WIDTH = 0.22
-_ARM_PERIOD = 0.8  # of that of the body
+_ARM_PERIOD = 0.8  # of the period of the body
 
 
 @dataclass(frozen=True)
 class Actor:
-    """Markers that are no part of the body."""
+    """Features in view: markers of a body, lamps, or mirror images of markers."""
 
     body: Body
-    pose: PoseAt  # from seconds to T_world_object (4, 4)
-    levels: Floats  # (N,) of brightness
+    pose: PoseAt  # T_world_object (4, 4) by seconds
+    levels: Floats  # (N,): brightness
     mirror: Floats | None = None  # reflection (4, 4) of the world in which they are seen
-    is_image: bool = False  # whether they are a mirror image of the body, and gone when it is
-    is_body: bool = False  # another body of the session: solid, and hidden by others now and then
+    is_body_image: bool = False  # a mirror image of the body, which is away when the body is
+    is_body: bool = False  # a body of the session: solid, some features hidden by chance
 
 
 @dataclass(frozen=True)
 class Arm:
     """A straight dark bar that swings before the body."""
 
-    ends: Floats  # (2, 3), at rest, in the world
-    swing: Floats  # (3,), farthest displacement
+    ends: Floats  # (2, 3): at rest, in the world
+    swing: Floats  # (3,): largest displacement
     period_s: float
     phase: float
     radius: float  # half its width
 
     def outline(self, sensor: Sensor, time_s: float) -> Floats:
-        """Corners (4, 2) of the bar in a sensor without bounds, px; none where it is not seen."""
+        """Return the corners (4, 2) of the bar in a sensor without bounds, px; none if not seen."""
         ends = self.ends + self.swing * np.sin(2 * np.pi * time_s / self.period_s + self.phase)
         along = ends[1] - ends[0]
         across = np.cross(along, sensor.towards(ends.mean(axis=0)))
@@ -68,7 +68,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Scenery:
-    """All that is before the cameras beside the body."""
+    """All that cameras see besides the body."""
 
     actors: tuple[Actor, ...] = ()
     arms: tuple[Arm, ...] = ()
@@ -77,31 +77,31 @@ class Scenery:
 def plan_scenery(
     body: Body, motion: Motion, cameras: Sequence[Sensor], options: SimulationOptions
 ) -> Scenery:
-    """Place what the options ask for about a body in front of cameras."""
-    wanted = options.lamps or options.others or options.occluder or options.mirror
-    if not cameras or not wanted:
+    """Place the scenery that the options ask for around a body in front of cameras."""
+    is_wanted = options.lamps or options.others or options.occluder or options.mirror
+    if not cameras or not is_wanted:
         return Scenery()
     rng = generator(options.seed, Purpose.SCENERY)
     R, t = motion.T_world_object[:3, :3], motion.T_world_object[:3, 3]
-    middle = R @ motion.pivot + t
-    front = _unit(np.mean([_unit(camera.towards(middle)) for camera in cameras], axis=0))
-    downs = []  # where rows of images go in the world: a small step that is seen below
+    centre = R @ motion.pivot + t
+    front = _unit(np.mean([_unit(camera.towards(centre)) for camera in cameras], axis=0))
+    downs = []  # directions in the world that are seen as down in each image
     for camera in cameras:
-        _, J, _ = camera.linearise(middle)
+        _, J, _ = camera.linearise(centre)
         downs.append(_unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300)))
     down = _unit(np.mean(downs, axis=0))
     side = _unit(np.cross(front, down))
-    stage = _Stage(body, middle, np.stack([side, down, front]), options, rng)
+    stage = _Stage(body, centre, np.stack([side, down, front]), options, rng)
     lamps = [stage.lamp() for _ in range(options.lamps)]
     others = [stage.other(k) for k in range(options.others)]
     images = []
     if options.mirror:
-        # the map of the world onto its mirror image in the table
-        mirror, plane = np.eye(4), middle + _TABLE_BELOW * body.radius * down
+        # maps the world onto its mirror image in the table
+        mirror, plane = np.eye(4), centre + _TABLE_BELOW * body.radius * down
         mirror[:3, :3] -= 2 * np.outer(down, down)
         mirror[:3, 3] = 2 * (plane @ down) * down
         levels = np.full(len(body), options.mirror)
-        images = [Actor(body, motion.pose, levels, mirror, is_image=True)]
+        images = [Actor(body, motion.pose, levels, mirror, is_body_image=True)]
         images += [Actor(o.body, o.pose, options.mirror * o.levels, mirror) for o in others]
     arms = tuple(stage.arm() for _ in range(options.occluder))
     return Scenery((*lamps, *others, *images), arms)
@@ -113,25 +113,25 @@ def _unit(vector: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Stage:
-    """The surroundings of a body, of which scenery is drawn."""
+    """The surroundings of a body, in which scenery is drawn."""
 
     body: Body
-    middle: Floats  # (3,)
-    frame: Floats  # (3, 3), rows to the side, down and to the front, as cameras see it
+    centre: Floats  # (3,): of the motion
+    frame: Floats  # (3, 3): unit vectors to the side, down and towards the cameras
     options: SimulationOptions
     rng: Generator
 
     def lamp(self) -> Actor:
-        """A lamp behind the body that stays where it is."""
+        """Draw a lamp behind the body that does not move."""
         radius, rng = self.body.radius, self.rng
         aside = rng.uniform(-_LAMPS_ASIDE, _LAMPS_ASIDE, 2)
-        place = self.middle + radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ self.frame)
+        place = self.centre + radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ self.frame)
         radii = np.array([_LAMP * radius])
         lamp = Body("lamp", (PointFeature(place),), None, None, "sphere", radii)
         return Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL]))
 
     def other(self, index: int) -> Actor:
-        """As many markers as the body has, elsewhere on another body that moves by itself."""
+        """Draw another body with as many markers, which moves by itself."""
         body, options, rng, count = self.body, self.options, self.rng, len(self.body)
         directions = rng.standard_normal((count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -144,7 +144,7 @@ class _Stage:
         aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
         turn = 0.3 * rng.standard_normal(3)
         motion = plan_motion(
-            from_rotation_vector(turn, self.middle + body.radius * (aside @ self.frame)),
+            from_rotation_vector(turn, self.centre + body.radius * (aside @ self.frame)),
             np.zeros(3),
             translation=_OTHERS_MOVE * body.radius,
             rotation_deg=options.amplitude_rotation_deg,
@@ -154,11 +154,11 @@ class _Stage:
         return Actor(other, motion.pose, np.ones(count))
 
     def arm(self) -> Arm:
-        """A bar across the view that swings over the body and beside it."""
+        """Draw a bar across the view that swings over the body and past it."""
         radius, angle = self.body.radius, self.rng.uniform(0, np.pi)
         along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ self.frame
         swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ self.frame
-        centre = self.middle + _ARM_BEFORE * radius * self.frame[2]
+        centre = self.centre + _ARM_BEFORE * radius * self.frame[2]
         reach = 0.5 * _ARM_LENGTH * radius * along
         return Arm(
             np.array([centre - reach, centre + reach]),

@@ -1,7 +1,7 @@
-"""The session file of a recording: the user's own, made to stand beside the frames.
+"""Copy the session file of a recording, to be stored with its frames.
 
-It is copied byte for byte, with the files other than frames that it names.  Only a path
-that leads out of its folder is changed, as the recording is to hold all that belongs to it.
+It is copied byte for byte, with the files other than frames that it names.  Only paths that lead
+out of its folder are changed, as the recording must contain everything.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ SESSION_NAME = "session.toml"
 
 @dataclass(frozen=True)
 class SessionCopy:
-    """What a recording takes over from a session."""
+    """A session file and the files that it names."""
 
     content: bytes  # the session file
     sources: tuple[str | tuple[str, ...], ...]  # sources of the sensors in `content`, in order
-    times: Mapping[str, str]  # tables of frame times that it names, with the first sensor of each
-    # marker and calibration files and own extraction: where they are, and paths in the recording
+    times: Mapping[str, str]  # tables of frame times, with the first sensor that names each
+    # marker and calibration files and Python modules: present paths, and paths in the recording
     files: tuple[tuple[Path, str], ...]
 
     def write(self, folder: Path) -> None:
@@ -41,7 +41,7 @@ class SessionCopy:
 
 
 def copy_session(session: Session) -> SessionCopy:
-    """Read a session file for a recording; a `SessionError` if what it names cannot go along."""
+    """Read a session file for a recording; a `SessionError` if its files cannot be copied."""
     with reporting(SessionError, f"{session.path}: cannot be read"):
         content = session.path.read_bytes()
     try:
@@ -77,7 +77,7 @@ def copy_session(session: Session) -> SessionCopy:
 
 
 def _moved(session: Session, document: Any) -> dict[str, str]:
-    """New paths for those that lead out of the session's folder."""
+    """Return new paths for those that lead out of the session's folder."""
     moved: dict[str, str] = {}
     for container, key, role, owner in places_of(document):
         old = str(container[key])

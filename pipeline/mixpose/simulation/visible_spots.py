@@ -1,7 +1,7 @@
-"""What one sensor gets to see of a body at one moment, before anything is drawn.
+"""Decide what one sensor sees of a body at one moment, before anything is drawn.
 
-Features that face away, lie outside the sensor or are hidden by chance are left out; false ones
-are put in.  Images, profiles and tables of detections are all made from this.
+Features that face away, lie outside the sensor or are hidden by chance are left out, and false ones
+are added.  Images, profiles and tables of detections are all made from the result.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mixpose.simulation.motion import PoseAt, Shutter
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.scenery import Actor, Scenery
 
-_DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
-_CORE = 0.45  # of a body's radius: what others are hidden behind
-_PIECES = 32  # in which a line's image is measured
-CORNERS = 180  # of an outline: of a circle, half a thousandth of the radius is left out
+_DIMMEST = 0.3  # of the mean brightness: features are at least so bright
+_CORE = 0.45  # of a body's radius: the opaque core that hides features behind it
+_PIECES = 32  # in which the image of a line is measured
+CORNERS = 180  # of an outline: half a thousandth of a circle's radius is cut off
 _ROWS_PER_PIXEL = 16
 
 _AROUND = np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
@@ -40,11 +40,11 @@ _CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=-1)
 class VisibleSpots:
     """Spots in sensor coordinates."""
 
-    points: Floats  # (M, m), places of the spots
-    levels: Floats  # (M,), their brightness; 1 for the mean feature
-    features: NDArray[np.intp]  # (M,), that spots belong to; numbers from N on are false features
-    outlines: Mapping[int, Floats] = field(default_factory=dict)  # edges (K, 2) of sized spots
-    covers: tuple[Floats, ...] = ()  # corners (4, 2) of what is dark before all spots
+    points: Floats  # (M, m): positions
+    levels: Floats  # (M,): brightness; 1 for the mean feature
+    features: NDArray[np.intp]  # (M,): feature of each spot; from N on false features
+    outlines: Mapping[int, Floats] = field(default_factory=dict)  # (K, 2) of spots with a size
+    occluders: tuple[Floats, ...] = ()  # corners (4, 2) of dark areas in front of all spots
 
     def __len__(self) -> int:
         return len(self.points)
@@ -52,20 +52,20 @@ class VisibleSpots:
 
 @dataclass(frozen=True)
 class View:
-    """How one sensor looks at the body throughout a recording."""
+    """The view of one sensor throughout a recording."""
 
     sensor: Sensor
     lowest: Floats  # (m,): bounds of false features
-    highest: Floats
-    levels: Floats  # (N,), brightness of the features
-    spacing: float  # distance of the spots of which a line consists, sensor units
-    ridge: float = 0.0  # brightness of each of these spots; 0 shares that of one feature among them
+    highest: Floats  # (m,)
+    levels: Floats  # (N,): brightness of the features
+    spacing: float  # distance between the spots of a line, sensor units
+    ridge: float = 0.0  # brightness of each of these spots; 0: they share that of one feature
     shutter: Shutter = Shutter()
     scenery: Scenery = Scenery()
 
     @cached_property
     def unbounded(self) -> Sensor:
-        """The sensor of an image without end."""
+        """The sensor with an image without bounds."""
         sensor: Any = self.sensor
         return cast("Sensor", replace(sensor, resolution=None))
 
@@ -84,66 +84,68 @@ def look(
 ) -> VisibleSpots:
     """Decide what a sensor sees of a body at T_world_object (4, 4) at the frame's time.
 
-    Features are displaced by `offsets` (N, 3) in the object's frame; without `pose_after`, poses
-    later by some seconds, the body stands still; `time_s` since the motion began is for what else
-    moves.
+    Features are displaced by `offsets` (N, 3) in the object's frame.  `pose_after` gives poses some
+    seconds after the frame; without it the body stands still.  Other things are where they are at
+    `time_s` since the motion began.
     """
     count = len(body)
-    # evenly over the bounds, their number of the given mean
+    # uniform within the bounds; their number has the given mean
     least = int(options.clutter)
     false_count = least + int(rng.random() < options.clutter - least)
-    false = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
-    spots = _Spots([false], [brightness_levels(len(false), options.brightness_spread, rng)])
-    spots.owners += range(count, count + len(false))
-    own = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
-    actors = [own, *view.scenery.actors]
+    clutter = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
+    spots = _Spots([clutter], [brightness_levels(len(clutter), options.brightness_spread, rng)])
+    spots.owners += range(count, count + len(clutter))
+    subject = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
+    actors = [subject, *view.scenery.actors]
     poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
     means = [actor.body.means.mean(axis=0)[None] for actor in actors]
     middles = [transform(T, mean)[0] for T, mean in zip(poses, means, strict=True)]
-    radii = [0.0 if one is own and is_away else _CORE * one.body.radius for one in actors]
+    radii = [_CORE * actor.body.radius for actor in actors]
+    if is_away:
+        radii[0] = 0.0
     for actor, T in zip(actors, poses, strict=True):
         seen = facing(view.sensor, actor.body, T, actor.mirror)
         if actor.is_body:
-            seen &= ~_hidden(len(actor.body), options, rng)
+            seen &= ~_hidden_by_chance(len(actor.body), options, rng)
             cores = zip(actors, middles, radii, strict=True)
-            others = [(m, r) for one, m, r in cores if one.is_body and one is not actor]
-            seen &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
-        if is_away and (actor is own or actor.is_image):
+            others = [(m, r) for other, m, r in cores if other.is_body and other is not actor]
+            seen &= ~are_occluded(view.sensor, transform(T, actor.body.means), others)
+        if is_away and (actor is subject or actor.is_body_image):
             continue
-        pose_later = own.pose if actor is own else later(actor.pose, time_s)
-        first = 0 if actor is own else count + len(false)
+        pose_later = subject.pose if actor is subject else shifted(actor.pose, time_s)
+        first = 0 if actor is subject else count + len(clutter)
         for i in np.flatnonzero(seen).tolist():
-            offset = offsets[i] if actor is own and offsets is not None else np.zeros(3)
+            offset = offsets[i] if actor is subject and offsets is not None else np.zeros(3)
             spots.add(view, actor, i, first + i, pose_later, offset)
-    late = time_s + view.shutter.late_s
-    covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
-    return spots.visible(tuple(one for one in covers if len(one)))
+    seen_at_s = time_s + view.shutter.delay_s
+    occluders = [arm.outline(view.unbounded, seen_at_s) for arm in view.scenery.arms]
+    return spots.visible(tuple(corners for corners in occluders if len(corners)))
 
 
-def hidden_behind(sensor: Sensor, points: Floats, others: Sequence[tuple[Floats, float]]) -> Mask:
-    """Which points (n, 3) a core stands before, by the middle and radius of each."""
-    hidden = np.zeros(len(points), dtype=np.bool_)
-    if isinstance(sensor, CloudSensor):  # seen from several sides
-        return hidden
-    towards = sensor.towards(points)
-    lengths = np.linalg.norm(towards, axis=1)
-    units = towards / lengths[:, None]
-    for middle, radius in others:
-        arms = middle - points
-        along = (arms * units).sum(axis=1)
-        across = np.linalg.norm(arms - along[:, None] * units, axis=1)
-        hidden |= (across < radius) & (along > 0)
-    return hidden
+def are_occluded(sensor: Sensor, points: Floats, spheres: Sequence[tuple[Floats, float]]) -> Mask:
+    """Test which points (n, 3) are behind opaque spheres, by the centre and radius of each."""
+    is_hidden = np.zeros(len(points), dtype=np.bool_)
+    if isinstance(sensor, CloudSensor):  # made by sensors on several sides
+        return is_hidden
+    to_sensor = sensor.towards(points)
+    lengths = np.linalg.norm(to_sensor, axis=1)
+    units = to_sensor / lengths[:, None]
+    for centre, radius in spheres:
+        to_centre = centre - points
+        along = (to_centre * units).sum(axis=1)
+        across = np.linalg.norm(to_centre - along[:, None] * units, axis=1)
+        is_hidden |= (across < radius) & (along > 0)
+    return is_hidden
 
 
-def later(pose: PoseAt, time_s: float) -> PoseAt:
-    """Poses so many seconds after a time."""
+def shifted(pose: PoseAt, time_s: float) -> PoseAt:
+    """Return the poses by seconds after a time."""
     return lambda seconds: pose(time_s + seconds)
 
 
 @dataclass
 class _Spots:
-    """All that one sensor sees of a frame, while they are put together."""
+    """All spots of one sensor in a frame, while they are collected."""
 
     points: list[Floats]
     levels: list[Floats]
@@ -159,7 +161,7 @@ class _Spots:
         pose_after: PoseAt,
         offset: Floats,
     ) -> None:
-        """Add what is seen of one feature, at each moment of its exposure."""
+        """Add the spots of one feature, at each moment of the exposure."""
         body, mirror, sensor = actor.body, actor.mirror, view.sensor
         has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
         poses = view.shutter.poses(sensor, body.means[feature], pose_after)
@@ -168,9 +170,8 @@ class _Spots:
             T[:3, 3] += T[:3, :3] @ offset
             edge = outline(view.unbounded, body, feature, T, mirror) if has_size else None
             if edge is None:
-                y, shares = _spots(
-                    view, body.features[feature], T if mirror is None else mirror @ T
-                )
+                M = T if mirror is None else mirror @ T
+                y, shares = _spots(view, body.features[feature], M)
             else:
                 y, shares = centroid(edge)[None], np.ones(1)
                 if (y < sensor.lower).any() or (y > sensor.upper).any():
@@ -180,27 +181,28 @@ class _Spots:
             self.levels.append(actor.levels[feature] * shares / len(poses))
             self.owners += [owner] * len(y)
 
-    def visible(self, covers: tuple[Floats, ...]) -> VisibleSpots:
-        """All of them."""
+    def visible(self, occluders: tuple[Floats, ...]) -> VisibleSpots:
+        """Return all spots."""
         points, levels = np.concatenate(self.points), np.concatenate(self.levels)
-        return VisibleSpots(points, levels, np.array(self.owners, np.intp), self.outlines, covers)
+        owners = np.array(self.owners, np.intp)
+        return VisibleSpots(points, levels, owners, self.outlines, occluders)
 
 
 def facing(
     sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
 ) -> Mask:
-    """Which features (N,) turn their front to a sensor; all of a body without normals."""
+    """Test which features (N,) face a sensor; all of a body without normals."""
     M = T_world_object if mirror is None else mirror @ T_world_object
     return sensors.facing(sensor, M, transform(M, body.means), body.normals)
 
 
 def brightness_levels(count: int, spread: float, rng: Generator) -> Floats:
-    """Brightness (count,) about 1 with a standard deviation, never too dark to be seen."""
+    """Draw brightness (count,) about 1 with a standard deviation, never too dark to be seen."""
     return np.maximum(1.0 + spread * rng.standard_normal(count), _DIMMEST)
 
 
 def displacements(body: Body, T_world_object: Floats, rng: Generator) -> Floats:
-    """Displacements (N, 3) in the body's axes, drawn from its spread; gravity's by its pose."""
+    """Draw displacements (N, 3) in the body's axes, by its spread and its spread along gravity."""
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
     pairs = zip(draws, body.features, strict=True)
     drawn = np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
@@ -210,19 +212,19 @@ def displacements(body: Body, T_world_object: Floats, rng: Generator) -> Floats:
     return np.asarray(drawn + along @ T_world_object[:3, :3])
 
 
-def _hidden(count: int, options: SimulationOptions, rng: Generator) -> Mask:
-    """Which features (N,) something stands before in this view."""
-    hidden = rng.random(count) < options.hidden
-    hidden[rng.permutation(count)[: options.hidden_count]] = True
-    return hidden
+def _hidden_by_chance(count: int, options: SimulationOptions, rng: Generator) -> Mask:
+    """Draw which features (N,) are hidden in this view."""
+    is_hidden = rng.random(count) < options.hidden
+    is_hidden[rng.permutation(count)[: options.hidden_count]] = True
+    return is_hidden
 
 
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
-    """Places (K, m) and shares of brightness (K,) of one feature's visible spots."""
+    """Return positions (K, m) and shares of brightness (K,) of one feature's visible spots."""
     points, shares = feature.nodes()
     if isinstance(feature, SegmentFeature):
         ends = transform(T_world_object, np.array([feature.start, feature.end]))
-        # so many that they lie no farther apart than `spacing`
+        # enough spots that they are at most `spacing` apart
         pieces = np.linspace(0, 1, _PIECES + 1)[:, None]
         y, visible = view.sensor.project(ends[0] + pieces * (ends[1] - ends[0]))
         steps = np.linalg.norm(np.diff(y, axis=0), axis=1)[visible[1:] & visible[:-1]]
@@ -239,10 +241,10 @@ def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats
 def outline(
     sensor: Sensor, body: Body, feature: int, T_world_object: Floats, mirror: Floats | None = None
 ) -> Floats | None:
-    """Where the edge (CORNERS, 2) of a sphere or disk is seen, px; None where not all of it is.
+    """Return the outline (CORNERS, 2) of a sphere or disk, px; None if not all of it is in view.
 
-    `sensor` should have no bounds: what lies beyond an image has no place in it. Through a `mirror`
-    (4, 4) that is a reflection of the world.
+    `sensor` should have no bounds, as parts beyond an image have no projection in it.  `mirror`
+    (4, 4) is a reflection of the world in which the feature is seen.
     """
     assert body.radii is not None, "a body of points has no outlines"
     radius = float(body.radii[feature])
@@ -267,20 +269,19 @@ def outline(
 
 
 def centroid(polygon: Floats) -> Floats:
-    """Centroid (2,) of the area that a polygon (n, 2) encloses."""
-    middle = polygon.mean(axis=0)
-    x, y = (polygon - middle).T
+    """Return the centroid (2,) of the area of a polygon (n, 2)."""
+    centre = polygon.mean(axis=0)
+    x, y = (polygon - centre).T
     cross = x * np.roll(y, -1) - np.roll(x, -1) * y
-    return np.asarray(
-        middle + [(cross * (one + np.roll(one, -1))).sum() / (3 * cross.sum()) for one in (x, y)]
-    )
+    shift = [(cross * (axis + np.roll(axis, -1))).sum() / (3 * cross.sum()) for axis in (x, y)]
+    return np.asarray(centre + shift)
 
 
 def coverage(polygon: Floats, shape: tuple[int, int]) -> tuple[slice, slice, Floats]:
-    """Share of every pixel that a convex polygon covers, in a box of an image of a shape (H, W).
+    """Return the share of each pixel that a convex polygon covers, in a box of an image (H, W).
 
-    The corners (n, 2) are (u, v) in order, pixel centres at integers. Rows and columns of the box
-    are empty where the polygon is outside of the image.
+    The corners (n, 2) are (u, v) in order, pixel centres at integers.  Rows and columns of the box
+    are empty if the polygon is outside of the image.
     """
     low = np.clip(np.floor(polygon.min(axis=0) + 0.5).astype(int), 0, shape[::-1])
     high = np.clip(np.ceil(polygon.max(axis=0) + 0.5).astype(int), 0, shape[::-1])
@@ -289,12 +290,12 @@ def coverage(polygon: Floats, shape: tuple[int, int]) -> tuple[slice, slice, Flo
     if not height or not width:
         return rows, columns, np.zeros((height, width))
     lines = (np.arange(height * _ROWS_PER_PIXEL) + 0.5) / _ROWS_PER_PIXEL - 0.5 + low[1]
-    # where horizontal lines enter and leave it; alike where they miss it
+    # u at which horizontal lines enter and leave it; equal for lines that miss it
     top, bottom = int(polygon[:, 1].argmin()), int(polygon[:, 1].argmax())
     turned, turn = np.roll(polygon, -top, axis=0), (bottom - top) % len(polygon)
     sides = [turned[: turn + 1], np.concatenate([turned[turn:], turned[:1]])[::-1]]
-    one, other = (np.interp(lines, side[:, 1], side[:, 0]) for side in sides)
-    left, right = np.minimum(one, other), np.maximum(one, other)
+    first, second = (np.interp(lines, side[:, 1], side[:, 0]) for side in sides)
+    left, right = np.minimum(first, second), np.maximum(first, second)
     right = np.where((lines < polygon[top, 1]) | (lines > polygon[bottom, 1]), left, right)
     edges = np.arange(width) + low[0] - 0.5
     within = np.clip(right[:, None] - edges, 0, 1) - np.clip(left[:, None] - edges, 0, 1)
