@@ -106,6 +106,21 @@ def test_a_sudden_turn_is_unlikely_but_no_surprise() -> None:
     assert at - turned == pytest.approx(3 * np.log(1 + 36 / 3), rel=0.02)
 
 
+def test_a_prediction_is_no_surer_than_the_pose_that_it_starts_from() -> None:
+    resting = followed(Track(), [TRUTH], 0, 0.0)
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(resting, 1, 0.1, [])
+    unsure = np.repeat([0.01, np.radians(12.0)], 3)  # a turn that the frame left open
+    (after,) = follow(data, [(Branch(TRUTH, deviation=unsure), ())]).branches
+    (sure,) = follow(data, [(Branch(TRUTH), ())]).branches
+    assert after.uncertainty[3:] == pytest.approx(unsure[3:])
+    assert (sure.uncertainty[3:] < np.radians(2.0)).all()  # it did not move
+    assert after.uncertainty[:3] == pytest.approx(sure.uncertainty[:3])
+    # never as unsure as a pose of which nothing is known
+    unsure = np.repeat([1e9, 1e9], 3)
+    (after,) = follow(data, [(Branch(TRUTH, deviation=unsure), ())]).branches
+    assert np.array_equal(after.uncertainty, data.flat_prior[1])
+
+
 def test_how_far_a_prediction_erred_over_several_frames_counts_per_frame() -> None:
     track = followed(followed(Track(), [moved(0)], 0, 0.0), [moved(1)], 1, 0.1)
     for _ in range(3):

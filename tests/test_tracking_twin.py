@@ -168,6 +168,17 @@ def test_where_there_are_mirrors_a_flat_body_by_itself_is_never_ok() -> None:
     assert all(one.status == "ok" for one in estimates_of(SOLID, [[HERE]] * 6, options))
 
 
+def test_where_there_are_mirrors_a_flat_body_whose_markers_face_one_side_is_ok() -> None:
+    options = replace(EstimatorOptions(), mirrors=True)
+    one_side = replace(FLAT, normals=np.tile([0.0, 0.0, -1.0], (len(FLAT), 1)))
+    assert all(one.status == "ok" for one in estimates_of(one_side, [[HERE]] * 6, options))
+    # but a square turned over lies on itself: its image in a mirror has the same face
+    corners = np.array([[-40.0, -40, 0], [40, -40, 0], [40, 40, 0], [-40, 40, 0]])
+    square = replace(body("square", corners), normals=np.tile([0.0, 0.0, -1.0], (4, 1)))
+    found = estimates_of(square, [[HERE]] * 6, options)
+    assert {(one.status, one.doubt) for one in found} == {("ambiguous", IN_A_MIRROR)}
+
+
 def in_mirror(T: Floats, own: Sequence[float] = (1.0, 1.0, -1.0)) -> Floats:
     """Where a body is seen in a mirror 150 mm behind the middle of the scene.
 

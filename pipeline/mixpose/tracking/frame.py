@@ -401,8 +401,8 @@ def follow(
                 motion_filter = parent.motion_filter.followed(moved, deviation, elapsed)
         if frame.is_timed:
             motion_filter = motion_filter or MotionFilter.begun(deviation, body.radius, rules)
-        # a prediction errs by the motion, and by the pose that it starts from
-        uncertainty = np.minimum(np.hypot(uncertainty, deviation), frame.flat_prior[1])
+        # a prediction is no surer than the pose that it starts from, whose errors are in the change
+        uncertainty = np.minimum(np.maximum(uncertainty, deviation), frame.flat_prior[1])
         branch = replace(branch, velocity=velocity, uncertainty=uncertainty)
         branches.append(replace(branch, motion_filter=motion_filter))
     return replace(
