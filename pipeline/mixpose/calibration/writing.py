@@ -28,7 +28,7 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
         _put_sensor(table, found, session, index)
         for key in ("position", "range_bias") if scale != 1 else ():
             if key in (errors := table.get("calibration_error", {})):
-                rewriting.put(errors, key, rewriting.plain(scale * float(errors[key])))
+                rewriting.put(errors, key, rewriting.rounded(scale * float(errors[key])))
     first, *others = zip(rewriting.objects_of(document), session.objects, strict=True)
     if scale != 1 or any(block.kind == "body" for block in found.blocks):
         _put_body(first[0], first[1].body, found.after.points, scale)
@@ -77,7 +77,7 @@ def _put_sensor(table: Any, found: Calibration, session: Session, index: int) ->
 
 
 def _put(table: Any, key: str, value: Floats | float, said: str | None) -> None:
-    rewriting.put(table, key, rewriting.plain(value), _deviation(said))
+    rewriting.put(table, key, rewriting.rounded(value), _deviation(said))
 
 
 def _deviation(said: str | None) -> str | None:
@@ -98,18 +98,18 @@ def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
     """Features as points, which replace a file of them; other lengths of the body are scaled."""
     had_file = table.pop("file", None) is not None
     if had_file and body.normals is not None:
-        table["normals"] = rewriting.plain(body.normals)
+        table["normals"] = rewriting.rounded(body.normals)
     if (had_file or scale != 1) and body.covariances.any():
-        table["sigma"] = [rewriting.plain(scale**2 * covariance) for covariance in body.covariances]
+        table["sigma"] = [rewriting.rounded(scale**2 * C) for C in body.covariances]
     count = len(body) - len(table.get("segments", ()))
     if count:  # segments come after the points
-        table["points"] = rewriting.plain(points[:count])
+        table["points"] = rewriting.rounded(points[:count])
     if had_file and body.names:
         table["names"] = list(body.names)
     if scale == 1:
         return
     for key in ("segments", "radius", "tip"):
         if key in table:
-            rewriting.put(table, key, rewriting.plain(scale * np.array(table[key], float)))
+            rewriting.put(table, key, rewriting.rounded(scale * np.array(table[key], float)))
     if body.gravity is not None:
-        rewriting.put(table["gravity"], "sigma", rewriting.plain(scale * body.gravity.sigma))
+        rewriting.put(table["gravity"], "sigma", rewriting.rounded(scale * body.gravity.sigma))

@@ -85,7 +85,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
     for table, setup in zip(document["sensor"], session.sensors, strict=True):
         sensor: Any = setup.sensor.moved(T_old_new)
         if hasattr(sensor, "position"):
-            place = rewriting.plain(sensor.position, rewriting.ALL_DIGITS)
+            place = rewriting.rounded(sensor.position, rewriting.ALL_DIGITS)
             rewriting.put(table, "position", place)
         else:
             T, digits = sensor.T_sensor_world, rewriting.ALL_DIGITS

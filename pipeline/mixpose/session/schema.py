@@ -1,8 +1,8 @@
-"""The tables and keys of a session file: what `docs/session.md` is made from.
+"""The tables and keys of a session file, from which `docs/session.md` is generated.
 
-The description of a key is what is allowed, and what an error message says, where its type does not
-say it; the docstring below it is what the key means, in which unit, with an example.  Both are
-written for the user.  What depends on several keys at once is checked where they are put together.
+The description of a key says what is allowed, in the reference and in error messages, if its type
+does not; the docstring below says what the key means, with unit and example.  Both are written for
+the user.  Rules about several keys are checked by the functions that use their values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mixpose.session.schema_sensors import ExtractTable, Motion, Placement, Posi
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, Free, array_of
 from mixpose.units import Unit
 
-MOST_ALIKE = 1000  # identical bodies that a session may have
+MOST_ALIKE = 1000  # most identical bodies in a session
 
 
 class GravityTable(Table):
@@ -175,7 +175,7 @@ class SessionTable(Table):
     and in the poses.
     Example: `unit = "mm"`"""
     object: Annotated[
-        list[ObjectTable], BeforeValidator(lambda one: [one] if isinstance(one, dict) else one)
+        list[ObjectTable], BeforeValidator(lambda item: [item] if isinstance(item, dict) else item)
     ] = Field(min_length=1, description="a table [object], or [[object]] for each of several")
     """See `[object]`; of several bodies `[[object]]`, one for each."""
     start: StartTable | None = Field(None, description="a table [start]")

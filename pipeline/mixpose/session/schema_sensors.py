@@ -1,6 +1,6 @@
-"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor, and ``[extract]``.
+"""The tables ``[[sensor]]`` of a session file, one per kind of sensor, and ``[extract]``.
 
-How keys are described is said in `schema`.
+`mixpose.session.schema` says how keys are described.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""pycalib's JSON: lists K, d, R and t with an entry per camera."""
+"""Read pycalib's JSON: lists K, d, R and t with an entry per camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, 
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion, motion_of
 from mixpose.session.messages import BadKeyError, under
 
-_DEEP = 3  # a list of matrices; one matrix alone is a camera of another format
+_DEEP = 3  # nesting of a list of matrices; a single matrix is a camera of another format
 
 
 def _depth(value: Any) -> int:
