@@ -22,7 +22,7 @@ from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.task import SeenFrame
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, twist_between
-from mixpose.sensors.moving import moments, rows_apart
+from mixpose.sensors.moving import read_times, row_span
 
 _NODES = 4  # frames that motion is interpolated through
 _TOGETHER = 32  # frames that pairs are looked for at a time
@@ -42,7 +42,7 @@ class Clock:
         """Seconds from the common time of frames (n,) to when a sensor took them, or read y."""
         late = self.late[sensor, frame] + rig.delays[sensor]
         late = late + rig.drifts[sensor] * self.since[sensor, frame]
-        return late if y is None else moments(rig.sensors[sensor], y, late, rig.readouts[sensor])
+        return late if y is None else read_times(rig.sensors[sensor], y, late, rig.readouts[sensor])
 
 
 def clock_of(frames: Sequence[SeenFrame], sensors: int, gap: float) -> Clock:
@@ -173,7 +173,7 @@ def _seen(state: State, clock: Clock, sensor: int) -> tuple[Floats, Mask]:
         ahead = perturb(state.poses, interpolate(clock, state.poses, frame, tau + step).twist)
         y_ahead, there = state.rig.seen(sensor, ahead)
         rate, eye = (y_ahead - y) / step, state.rig.sensors[sensor]
-        after = moments(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / rows_apart(eye))
+        after = read_times(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / row_span(eye))
         y, visible = y + rate * after[..., None], visible & there
     return y, visible
 

@@ -25,8 +25,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the body; its features are the points, then the segments.
 
     The marker file is relative to `folder`; lengths of other programs' files are converted to
-    `unit`. Raises BadKeyError for fewer than three features, repeated ones, or other keys that do
-    not fit them.
+    `unit`. Raises BadKeyError for fewer than three features, copies, or keys that do not fit them.
     """
     markers = _markers(table, folder, unit)
     points = markers.points

@@ -61,8 +61,7 @@ def _load(path: Path, *, allow_code: bool, bodies: bool) -> Session:
         content = read_bytes(path)
         data = parse_toml(as_text(content))
         if not bodies:
-            ignored = ("start", "estimator")
-            data = {key: value for key, value in data.items() if key not in ignored}
+            data = {k: v for k, v in data.items() if k not in ("start", "estimator")}
             data["object"] = _PLACEHOLDER
         session = _build(path, hashlib.sha256(content).hexdigest(), data)
         return replace(session, allow_code=allow_code)
