@@ -34,7 +34,7 @@ def align_session(request: AlignRequest) -> None:
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
-    rewriting.refuse_held(session)
+    rewriting.refuse_held_directions(session)
     rewriting.refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)

@@ -131,7 +131,7 @@ def _body_content(
         evaluation = evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
         names = [one.body.name for one in origin.session.objects]
-        alone = origin.session.alone(series.object) if series.object in names else None
+        alone = origin.session.with_only(series.object) if series.object in names else None
         origin = replace(origin, session=alone)
     overlays, overlay_notices = (
         ([], [])

@@ -75,13 +75,13 @@ class Sensor(Protocol):
         """Map world points (..., 3) to sensor coordinates (..., m) and a visibility mask (...)."""
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`; return coordinates, their Jacobian (..., m, 3) by points, and the mask."""
+        """Return coordinates as `project`, their Jacobian (..., m, 3) by points, and the mask."""
 
     def towards(self, points_world: Floats) -> Floats:
         """Return directions (..., 3) of any length from world points (..., 3) to the sensor."""
 
     def rays(self, y: Floats) -> Rays | None:
-        """Return rays of those detections (M, m) that a point can cause; None without rays."""
+        """Return rays of detections (M, m) that a point can cause; None if the sensor has none."""
 
     def moved(self, motion: Floats) -> Self:
         """Return a sensor whose reading of x is this one's of ``motion @ x``, rigid (4, 4)."""

@@ -100,7 +100,7 @@ class PinholeBatch:
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
         self._count = len(cameras)
         self._K = np.array([camera.camera_matrix for camera in cameras])
-        self._middle, self._half = _images(cameras)
+        self._middle, self._half = _image_bounds(cameras)
         self._lens = _lenses(cameras)
         # maps to pixels, or to normalised coordinates, which lenses distort
         T = np.array([camera.T_sensor_world for camera in cameras])
@@ -155,7 +155,7 @@ class PinholeBatch:
         return np.asarray(self._centres - points_world)
 
 
-def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:
+def _image_bounds(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:
     """Return centres and half sizes (L, 1, 2) of images; infinite for an unknown resolution."""
     lower = np.array([camera.lower for camera in cameras])[:, None]
     upper = np.array([camera.upper for camera in cameras])[:, None]

@@ -68,7 +68,7 @@ class CentralCamera(Camera):
         return np.asarray(centre - points_world)
 
     def _rays_along(self, directions: Floats, pixels: Floats) -> Rays:
-        """Return rays along directions (M, 3) in camera axes, of pixels that they project to."""
+        """Return rays along directions (M, 3), in camera axes, that project to their pixels."""
         T_world_sensor = inverse(self.T_sensor_world)
         directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         directions = directions @ T_world_sensor[:3, :3].T

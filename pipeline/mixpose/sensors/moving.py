@@ -29,7 +29,7 @@ class Motion:
     acceleration: Floats = field(default_factory=lambda: np.zeros(6))
 
     def after(self, seconds: float) -> Floats:
-        """Return the motion (4, 4) of world points in a number of seconds after the common time."""
+        """Return the motion (4, 4) of world points from the common time to `seconds` later."""
         twist = (self.velocity + 0.5 * seconds * self.acceleration) * seconds
         return np.asarray(perturb(self.T_world_object, twist) @ self._back)
 
@@ -143,7 +143,7 @@ class RollingBatch:
         return np.asarray(self._static.towards(places.swapaxes(1, 2)) @ turns)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `SensorBatch.linearise`, at the time t at which the row that a point has at t is read.
+        """As `SensorBatch.linearise`, at the time at which the row that a point has then is read.
 
         One Newton step from the middle row leaves an error of second order in the rows by which
         the image moves while a row is read.

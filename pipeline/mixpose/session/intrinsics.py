@@ -116,10 +116,10 @@ def required(content: dict[str, Any], key: str) -> Any:
     return content[key]
 
 
-def plain(value: Any) -> Any:
-    """Convert text such as 1e-05, which YAML does not read as a number, to numbers."""
+def with_numbers(value: Any) -> Any:
+    """Return a value with text such as 1e-05, which YAML reads as text, converted to numbers."""
     if isinstance(value, list):
-        return [plain(item) for item in value]
+        return [with_numbers(item) for item in value]
     with suppress(ValueError):
         return float(value) if isinstance(value, str) else value
     return value

@@ -95,7 +95,7 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
         estimator=estimator,
         sensors=build_sensors(table.sensor, table.extract, path.parent, table.unit),
         count=objects[0].count,
-        others=objects[1:],
+        other_objects=objects[1:],
     )
 
 

@@ -109,7 +109,7 @@ def put_gravity(document: Any, session: Session, T_new_old: Floats) -> None:
             put(table["gravity"], "direction", rounded(direction, ALL_DIGITS))
 
 
-def refuse_held(session: Session) -> None:
+def refuse_held_directions(session: Session) -> None:
     """Raise a SessionError if world directions are held, as these change with the world frame."""
     if len(session.estimator.free) < len(TWIST_NAMES):
         raise SessionError(

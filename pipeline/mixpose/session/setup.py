@@ -86,22 +86,22 @@ class Session:
     sensors: tuple[SensorSetup, ...]
     allow_code: bool = False  # whether functions named in the file may be run
     count: int = 1
-    others: tuple[ObjectSetup, ...] = ()  # bodies after the first, in the order of the file
+    other_objects: tuple[ObjectSetup, ...] = ()  # bodies after the first, in the order of the file
 
     @property
     def objects(self) -> tuple[ObjectSetup, ...]:
         """All bodies, in the order of the file."""
-        return (ObjectSetup(self.body, self.start, self.count), *self.others)
+        return (ObjectSetup(self.body, self.start, self.count), *self.other_objects)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of all bodies, identical ones numbered, in the order of their pose lines."""
         return tuple(label for setup in self.objects for label in setup.labels)
 
-    def alone(self, name: str) -> Session:
+    def with_only(self, name: str) -> Session:
         """Return the session with a single one of its bodies, by name."""
         chosen = next(setup for setup in self.objects if setup.body.name == name)
-        return replace(self, body=chosen.body, start=chosen.start, count=1, others=())
+        return replace(self, body=chosen.body, start=chosen.start, count=1, other_objects=())
 
     @property
     def folder(self) -> Path:

@@ -36,7 +36,7 @@ MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 RESOLUTION_FORM = "[width, height], two positive integers"
 
 LARGEST = 1e12  # powers of larger numbers would silently overflow to infinity
-SMALLEST = 1e-12  # positive number; powers of smaller ones would underflow to 0
+SMALLEST = 1e-12  # of keys greater than 0; powers of smaller numbers would underflow to 0
 _WIDEST = 1_000_000  # px; more than any image library reads
 
 

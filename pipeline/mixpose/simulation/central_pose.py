@@ -181,7 +181,7 @@ def plan_companions(
     placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
     companions = []
     for k, (one, instance) in enumerate(members, start=1):
-        own = session.alone(one.body.name)
+        own = session.with_only(one.body.name)
         seed = options.seed + _SEEDS_APART * k
         is_at_start = one.start is not None and not instance
         T = central_pose(own, seed)

@@ -76,7 +76,7 @@ class Content:
         return [line.strip() for line in self.text.splitlines()]
 
     def parsed(self) -> Any:
-        """Return the content as JSON or YAML; raise BadKeyError by its ending if it is neither."""
+        """Return JSON or YAML; raise BadKeyError, chosen by the file's ending, if it is neither."""
         json_problem = ""
         if self.text.lstrip().startswith("{"):
             try:

@@ -88,7 +88,7 @@ def _placed(group: Group) -> _Placed:
 
 
 def _from_images(content: Content) -> _Placed:
-    """Return a pose for each image: a camera that was moved has several."""
+    """Return the camera and pose of each image: a camera that was moved has several poses."""
     lines = [line for line in content.lines if not line.startswith("#")]
     while lines and not lines[0]:
         lines.pop(0)

@@ -48,14 +48,14 @@ def _read(
             stated = pieces.required(camera, "distortion_model")
             model = pieces.model_of_distortion(stated) or "pinhole"
         with under("intrinsics"):
-            intrinsics = pieces.plain(camera["intrinsics"])
+            intrinsics = pieces.with_numbers(camera["intrinsics"])
             if not isinstance(intrinsics, list) or len(intrinsics) != 4:
                 raise BadKeyError(mismatch(intrinsics, "[fu, fv, pu, pv]"))
             fu, fv, pu, pv = intrinsics
             K = pieces.camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
             coefficients = [] if stated == "none" else pieces.required(camera, "distortion_coeffs")
-            D = pieces.distortion(pieces.plain(coefficients), model)
+            D = pieces.distortion(pieces.with_numbers(coefficients), model)
         with under("resolution"):
             size = pieces.size_of(camera.get("resolution"))
     return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
@@ -94,7 +94,7 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
         return None
     with under(name):
         with under(key):
-            matrix = numbers(pieces.plain(chain[name][key]), (4, 4), _MATRIX)
+            matrix = numbers(pieces.with_numbers(chain[name][key]), (4, 4), _MATRIX)
         return rigid(matrix, key)
 
 

@@ -71,7 +71,7 @@ def _first(content: dict[str, Any], keys: tuple[str, ...]) -> str:
 
 def _matrix_data(value: Any) -> Any:
     """Return the numbers of a matrix, written as rows, cols and data or as a list."""
-    return pieces.plain(value.get("data") if isinstance(value, dict) else value)
+    return pieces.with_numbers(value.get("data") if isinstance(value, dict) else value)
 
 
 def _ini_camera(group: Group) -> dict[str, Reader]:
