@@ -12,7 +12,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 from mixpose.session.motion import rigid, rotation_of_vector
-from mixpose.session.values import MATRIX_FORM, numbers, resolution
+from mixpose.session.values import MATRIX_FORM, numbers, read_resolution
 
 CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 
@@ -42,7 +42,7 @@ class Intrinsics:
     model: CameraModel | None = None  # the kind of camera; None: not stated
 
 
-def camera_matrix(value: Any) -> Floats:
+def read_camera_matrix(value: Any) -> Floats:
     """Read a camera matrix, three rows or nine numbers; raise BadKeyError if it cannot be one."""
     if isinstance(value, list) and len(value) == 9:
         K = numbers(value, (9,), f"nine numbers, {MATRIX_FORM} row by row").reshape(3, 3)
@@ -63,7 +63,7 @@ def camera_matrix(value: Any) -> Floats:
     return K
 
 
-def distortion(value: Any, model: str) -> Floats:
+def read_distortion(value: Any, model: str) -> Floats:
     """Read distortion coefficients of a model: a list, or a matrix of one row or column."""
     is_row = isinstance(value, list) and len(value) == 1 and isinstance(value[0], list)
     flat = value[0] if is_row else column_as_list(value)
@@ -127,4 +127,4 @@ def with_numbers(value: Any) -> Any:
 
 def size_of(value: Any) -> tuple[int, int] | None:
     """Return width and height; None if they are missing or, as some drivers write, zero."""
-    return None if value in (None, [0, 0]) else resolution(value)
+    return None if value in (None, [0, 0]) else read_resolution(value)

@@ -16,7 +16,7 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import Intrinsics, read_camera_matrix, read_distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
 from mixpose.session.schema_sensors import (
@@ -192,9 +192,9 @@ def _calibrated(table: CameraTable, folder: Path) -> CalibratedCamera:
     if table.camera_matrix is None:
         raise BadKeyError(f"missing; allowed: {MATRIX_FORM}, or calibration", "camera_matrix")
     with under("camera_matrix"):
-        K = camera_matrix(table.camera_matrix.tolist())
+        K = read_camera_matrix(table.camera_matrix.tolist())
     with under("distortion"):
-        D = distortion(table.distortion, table.model)
+        D = read_distortion(table.distortion, table.model)
     return CalibratedCamera(table.name, Intrinsics(K, D))
 
 

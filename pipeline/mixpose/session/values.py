@@ -121,7 +121,7 @@ Delay: TypeAlias = Annotated[float | Literal["estimate"], ReadBy(_read_delay, _D
 Free: TypeAlias = Annotated[tuple[str, ...], ReadBy(_read_free, _FREE_ALLOWED)]
 
 
-def resolution(value: Any) -> tuple[int, int]:
+def read_resolution(value: Any) -> tuple[int, int]:
     """Read the width and height of an image in px."""
     match value:
         case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
@@ -134,7 +134,7 @@ def resolution(value: Any) -> tuple[int, int]:
     raise BadKeyError(mismatch(value, RESOLUTION_FORM))
 
 
-Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(resolution, RESOLUTION_FORM)]
+Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(read_resolution, RESOLUTION_FORM)]
 
 
 def read_calibration_key(value: Any) -> Any:

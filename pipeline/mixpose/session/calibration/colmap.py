@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, size_of
+from mixpose.session.intrinsics import CameraModel, Intrinsics, read_camera_matrix, size_of
 from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 from mixpose.session.values import LARGEST, as_number
 
@@ -187,7 +187,7 @@ def _intrinsics(row: list[str]) -> Intrinsics:
         raise BadKeyError(f"found {len(values)} parameters of {row[1]}; allowed: {count} of them")
     fx, fy = values[0], values[focal_lengths - 1]
     cx, cy, *coefficients = values[focal_lengths:]
-    K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
+    K = read_camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
     D = np.array([*coefficients, *[0.0] * (total - stated)])
     return Intrinsics(K, D, size_of([_integer(cell) for cell in row[2:4]]), model)
 

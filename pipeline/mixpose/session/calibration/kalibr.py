@@ -52,10 +52,10 @@ def _read(
             if not isinstance(intrinsics, list) or len(intrinsics) != 4:
                 raise BadKeyError(mismatch(intrinsics, "[fu, fv, pu, pv]"))
             fu, fv, pu, pv = intrinsics
-            K = pieces.camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+            K = pieces.read_camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
             coefficients = [] if stated == "none" else pieces.required(camera, "distortion_coeffs")
-            D = pieces.distortion(pieces.with_numbers(coefficients), model)
+            D = pieces.read_distortion(pieces.with_numbers(coefficients), model)
         with under("resolution"):
             size = pieces.size_of(camera.get("resolution"))
     return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")

@@ -166,9 +166,9 @@ def _intrinsics(
     distortion_node = choose_node(opened, "distortion", coefficients)
     stated = _stated_model(opened)
     with under(matrix_node):
-        K = pieces.camera_matrix(_values(opened.nodes[matrix_node]))
+        K = pieces.read_camera_matrix(_values(opened.nodes[matrix_node]))
     with under(distortion_node):
-        D = pieces.distortion(_values(opened.nodes[distortion_node]), stated or model)
+        D = pieces.read_distortion(_values(opened.nodes[distortion_node]), stated or model)
     return Intrinsics(K, D, _resolution(opened), stated)
 
 

@@ -29,11 +29,11 @@ def _read(content: dict[str, Any], name: str, model: CameraModel) -> CalibratedC
         stated = pieces.model_of_distortion(content.get("distortion_model"))
     matrix_key = _first(content, ("camera_matrix", "K", "k"))
     with under(matrix_key):
-        K = pieces.camera_matrix(_matrix_data(content[matrix_key]))
+        K = pieces.read_camera_matrix(_matrix_data(content[matrix_key]))
     distortion_key = _first(content, ("distortion_coefficients", "D", "d"))
     with under(distortion_key):
         coefficients = _matrix_data(pieces.required(content, distortion_key))
-        D = pieces.distortion(coefficients, stated or model)
+        D = pieces.read_distortion(coefficients, stated or model)
         if D.size and stated is None:
             raise BadKeyError(
                 f"found {D.size} coefficients without a distortion_model; "
@@ -83,10 +83,10 @@ def _ini_camera(group: Group) -> dict[str, Reader]:
 def _read_ini(content: Content, name: str, _: CameraModel) -> CalibratedCamera:
     values = _ini_values(content)
     with under("camera matrix"):
-        K = pieces.camera_matrix(values.get("camera matrix"))
+        K = pieces.read_camera_matrix(values.get("camera matrix"))
     with under("distortion"):
         # five coefficients (plumb_bob) or eight (rational_polynomial), in OpenCV's order
-        D = pieces.distortion(values.get("distortion", []), "pinhole")
+        D = pieces.read_distortion(values.get("distortion", []), "pinhole")
     with under("[image]"):
         size = pieces.size_of([_integer(values, word) for word in ("width", "height")])
     return CalibratedCamera(name, Intrinsics(K, D, size, "pinhole"))

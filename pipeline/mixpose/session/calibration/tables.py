@@ -48,9 +48,9 @@ def _read(table: dict[str, Any], name: str, unit: Unit | None, _: CameraModel) -
         raise BadKeyError(mismatch(fisheye, "true or false"), "fisheye")
     model: CameraModel = "fisheye" if fisheye else "pinhole"
     with under("matrix"):
-        K = pieces.camera_matrix(table["matrix"])
+        K = pieces.read_camera_matrix(table["matrix"])
     with under("distortions"):
-        D = pieces.distortion(table["distortions"], model)
+        D = pieces.read_distortion(table["distortions"], model)
     with under("size"):
         size = pieces.size_of(pieces.required(table, "size"))
     pose = None
