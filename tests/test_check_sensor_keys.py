@@ -142,7 +142,7 @@ def test_a_key_is_said_to_stand_where_it_overrides_that_of_all_sensors(
 
 def test_keys_that_may_be_changed_are_said_to_stand_where_they_do(session: Session) -> None:
     left = session.sensors[0]
-    own = replace(left, own=frozenset(["threshold"]))
+    own = replace(left, overridden=frozenset(["threshold"]))
     dark = np.zeros((8, 8), np.uint8)
     change = "change polarity, threshold, min_area and max_area in [extract]"
     assert advice(session, left, 0, dark, 7) == change
@@ -192,7 +192,7 @@ def test_a_width_of_ranges_is_said_to_stand_where_it_does() -> None:
     ranges = load_session(SYNTHETIC / "range_profiles" / "session.toml")
     front, *others = ranges.sensors
     wide = replace(front.extract, sigma=500.0)
-    front = replace(front, extract=wide, own=frozenset(["sigma"]))
+    front = replace(front, extract=wide, overridden=frozenset(["sigma"]))
     (warning,) = key_warnings(replace(ranges, sensors=(front, *others)))
     assert "sigma = 500 mm in its own [sensor.extract] is wider" in warning
 

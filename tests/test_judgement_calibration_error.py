@@ -16,8 +16,8 @@ from mixpose.sensors import (
     ParallelBeam,
     PinholeCamera,
     RangeSensor,
-    by_calibration,
-    doubted,
+    calibration_shifts,
+    perturbed,
 )
 from mixpose.session import load_session
 from mixpose.simulation import SimulationOptions, simulate
@@ -32,7 +32,7 @@ def test_what_a_stated_error_moves_in_the_image_is_that_of_the_parameter() -> No
     y, _ = camera.project(POINTS)
 
     def moved(**error: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        return by_calibration(doubted(camera, CalibrationError(**error)), POINTS)
+        return calibration_shifts(perturbed(camera, CalibrationError(**error)), POINTS)
 
     np.testing.assert_allclose(moved(principal_point=0.5)[..., 0], [[0.5, 0]] * 5, atol=1e-9)
     np.testing.assert_allclose(moved(principal_point=0.5)[..., 1], [[0, 0.5]] * 5, atol=1e-9)
@@ -48,14 +48,15 @@ def test_what_a_stated_error_moves_in_the_image_is_that_of_the_parameter() -> No
 
 def test_sensors_of_other_kinds_have_errors_of_their_own() -> None:
     ranges = RangeSensor(np.array([0.0, 0, -1000]))
-    moved = by_calibration(doubted(ranges, CalibrationError(range_bias=2.0, position=1.0)), POINTS)
+    error = CalibrationError(range_bias=2.0, position=1.0)
+    moved = calibration_shifts(perturbed(ranges, error), POINTS)
     np.testing.assert_allclose(moved[:, 0, 0], 2.0)
     away = (POINTS - ranges.position) / np.linalg.norm(POINTS - ranges.position, axis=1)[:, None]
     # a source that moves towards a point makes its range shorter, to first order
     np.testing.assert_allclose(np.abs(moved[:, 0, 1:]), np.abs(away), atol=2e-3)
     beams = ParallelBeam(0.5, np.array([100.0, 100.0]))
-    moved = by_calibration(
-        doubted(beams, CalibrationError(principal_point=1.0, focal=0.01)), POINTS
+    moved = calibration_shifts(
+        perturbed(beams, CalibrationError(principal_point=1.0, focal=0.01)), POINTS
     )
     y, _ = beams.project(POINTS)
     np.testing.assert_allclose(moved[..., :2], [np.eye(2)] * 5, atol=1e-9)

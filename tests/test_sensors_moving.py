@@ -14,7 +14,7 @@ from mixpose.sensors import (
     RollingSensor,
     Sensor,
     in_motion,
-    moments,
+    read_times,
 )
 
 Floats = NDArray[np.float64]
@@ -92,7 +92,7 @@ def test_a_rolling_camera_can_be_moved_with_the_world() -> None:
 
 def test_rows_are_read_from_half_a_readout_before_the_delay_to_half_after() -> None:
     ends = np.array([[0.0, 0.0], [0.0, 511.5], [0.0, 1023.0]])
-    times = moments(CAMERAS["pinhole"], ends, LATE, READOUT)
+    times = read_times(CAMERAS["pinhole"], ends, LATE, READOUT)
     np.testing.assert_allclose(times, LATE + READOUT * np.array([-0.5, 0, 0.5]))
 
 

@@ -87,8 +87,8 @@ def test_one_table_is_one_body_and_an_array_is_several(tmp_path: Path) -> None:
     )
     assert several.labels == ("tool", "rod-0", "rod-1")
     assert several.start is not None
-    assert several.others[0].start is None
-    assert several.alone("rod").labels == ("rod",)
+    assert several.other_objects[0].start is None
+    assert several.with_only("rod").labels == ("rod",)
 
 
 @pytest.mark.parametrize(

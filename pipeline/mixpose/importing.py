@@ -1,4 +1,4 @@
-"""A session file from the files of other programs, and what is odd about these."""
+"""Make a session file from files of other programs, with warnings about their contents."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ _EXAMPLE_MM = [[0, 0, 0], [60, 0, 0], [0, 100, 0], [20, 30, 80]]
 
 @dataclass(frozen=True)
 class Imported:
-    """What was read, in the unit of the session."""
+    """The contents of imported files, in the unit of the session."""
 
     unit: Unit
     cameras: tuple[CalibratedCamera, ...]  # names are unique; translations are in `unit`
     bodies: tuple[Path, ...]  # files of markers
-    files: tuple[Path, ...]  # all that was read
-    remarks: tuple[str, ...]  # what is known of units and worlds, for the head of the session file
-    warnings: tuple[str, ...]  # what a person should look at
+    files: tuple[Path, ...]  # all imported files
+    remarks: tuple[str, ...]  # on units, for the head of the session file
+    warnings: tuple[str, ...]  # what the user should check
 
 
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
-    """Read calibration files and files of bodies, which are told by their ending.
+    """Read calibration files, and files of bodies, which are recognised by their ending.
 
-    Lengths are wanted in `unit`; `lengths` is that of translations in files whose format does not
-    fix it. Raises SessionError if a file cannot be read or files contradict each other.
+    Lengths are converted to `unit`; `lengths` is the unit of translations in files whose format
+    does not fix it. Raises SessionError for unreadable files and for several worlds.
     """
     bodies = [path for path in paths if path.suffix.lower() in _TABLES]
     try:
         for body in bodies:
             read_marker_file(body, unit)
-        others = [path for path in paths if path not in bodies]
-        rigs = read_rigs(others, also=f"; or a body: {', '.join(_TABLES)}")
+        calibrations = [path for path in paths if path not in bodies]
+        rigs = read_rigs(calibrations, also=f"; or a body: {', '.join(_TABLES)}")
     except BadKeyError as problem:
         raise SessionError(one_line("import", problem.key, problem.text)) from problem
     if not rigs:
@@ -54,14 +54,14 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             "import: found no calibration file among the files; allowed: at least one, beside "
             f"bodies ({', '.join(_TABLES)})"
         )
-    placed = [rig for rig in rigs if any(one.T_camera_rig is not None for one in rig.cameras)]
+    placed = [rig for rig in rigs if any(c.T_camera_rig is not None for c in rig.cameras)]
     if len(placed) > 1:
         raise SessionError(
             f"{placed[1].files[0]}: its cameras stand in another world than those of "
             f"{placed[0].files[0]}; import them one by one"
         )
     cameras: list[CalibratedCamera] = []
-    remarks, warnings = _of_tables(bodies, unit, lengths)
+    remarks, warnings = _notes_on_tables(bodies, unit, lengths)
     for rig in rigs:
         stated, remark, warning = _stated_unit(rig, unit, lengths)
         remarks.append(remark)
@@ -71,21 +71,21 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             T = camera.T_camera_rig
             scaled = None if T is None else from_parts(T[:3, :3], factor * T[:3, 3])
             cameras.append(replace(camera, T_camera_rig=scaled))
-    cameras = _renamed(cameras)
+    cameras = _with_valid_names(cameras)
     return Imported(
         unit,
         tuple(cameras),
         tuple(bodies),
         files=tuple(paths),
         remarks=tuple(filter(None, remarks)),
-        warnings=(*filter(None, warnings), *_odd(cameras)),
+        warnings=(*filter(None, warnings), *_camera_warnings(cameras)),
     )
 
 
-def _of_tables(
+def _notes_on_tables(
     bodies: Sequence[Path], unit: Unit, lengths: Unit | None
 ) -> tuple[list[str], list[str]]:
-    """Remarks and warnings about the lengths of tables, which a session reads as they are."""
+    """Return remarks and warnings about lengths of marker tables, which are not converted."""
     tables = [path.name for path in bodies if path.suffix.lower() not in READERS]
     if not tables:
         return [], []
@@ -99,7 +99,7 @@ def _of_tables(
 
 
 def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str, str]:
-    """The unit of a rig's translations, with a remark and perhaps a warning about it."""
+    """Return the unit of a rig's translations, with a remark and a warning, perhaps empty."""
     name = " and ".join(Path(file).name for file in rig.files)
     poses = [camera.T_camera_rig for camera in rig.cameras]
     if not any(T is not None and T[:3, 3].any() for T in poses):
@@ -107,8 +107,8 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
     (fixed,) = {camera.unit for camera in rig.cameras}
     notes = "; ".join(dict.fromkeys(camera.note for camera in rig.cameras if camera.note))
     if fixed is not None:
-        told = f"translations of {name} are in {fixed}, by its format"
-        return fixed, told, f"--lengths {lengths}: is not used, as {told}" if lengths else ""
+        remark = f"translations of {name} are in {fixed}, by its format"
+        return fixed, remark, f"--lengths {lengths}: is not used, as {remark}" if lengths else ""
     if lengths is not None:
         return lengths, f"translations of {name} are in {lengths}, as --lengths said", ""
     guess = f"translations of {name} are taken to be in {unit}, which the file does not say"
@@ -116,19 +116,19 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
     return unit, guess, hint
 
 
-def _renamed(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
-    """Cameras whose names are unique and can stand in NAME=PATH."""
+def _with_valid_names(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
+    """Return cameras with unique names that are valid in NAME=PATH."""
 
     def plain(name: str) -> str:
-        kept = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
-        return "".join(kept).strip() or "camera"
+        characters = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
+        return "".join(characters).strip() or "camera"
 
     names = distinct([camera.name for camera in cameras], plain)
     return [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
 
 
-def _odd(cameras: list[CalibratedCamera]) -> list[str]:
-    """Cameras without a place, without a size, or that are there twice."""
+def _camera_warnings(cameras: list[CalibratedCamera]) -> list[str]:
+    """Return warnings about missing poses and sizes, unclear models, odd centres and copies."""
     warnings = []
     unplaced = [camera.name for camera in cameras if camera.T_camera_rig is None]
     if unplaced and len(cameras) > 1:
@@ -142,11 +142,11 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
             "have the size that was calibrated"
         )
     lenses = {camera.name: camera.intrinsics for camera in cameras}
-    four = [name for name, k in lenses.items() if k.model is None and k.distortion.size == 4]
-    if four:
+    unclear = [name for name, k in lenses.items() if k.model is None and k.distortion.size == 4]
+    if unclear:
         warnings.append(
-            f"{', '.join(four)}: four coefficients of distortion are a pinhole's or a fisheye's, "
-            'and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
+            f"{', '.join(unclear)}: four coefficients of distortion are a pinhole's or a fisheye's"
+            ', and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
         )
     for camera in cameras:
         (cx, cy), size = camera.intrinsics.camera_matrix[:2, 2], camera.intrinsics.resolution
@@ -156,7 +156,7 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
                 f"images of {size[0]}x{size[1]} px: was it calibrated at another size?"
             )
     for a, b in combinations(cameras, 2):
-        if _same(a, b):
+        if _are_same(a, b):
             warnings.append(
                 f"{a.name} and {b.name} are the same camera at the same place: one of them is a "
                 "copy by mistake; drop it or calibrate it again"
@@ -164,15 +164,15 @@ def _odd(cameras: list[CalibratedCamera]) -> list[str]:
     return warnings
 
 
-def _same(a: CalibratedCamera, b: CalibratedCamera) -> bool:
+def _are_same(a: CalibratedCamera, b: CalibratedCamera) -> bool:
     if a.T_camera_rig is None or b.T_camera_rig is None:
         return False
-    alike = np.array_equal(a.intrinsics.camera_matrix, b.intrinsics.camera_matrix)
-    return bool(alike and np.allclose(a.T_camera_rig, b.T_camera_rig, rtol=1e-9, atol=1e-12))
+    are_equal = np.array_equal(a.intrinsics.camera_matrix, b.intrinsics.camera_matrix)
+    return bool(are_equal and np.allclose(a.T_camera_rig, b.T_camera_rig, rtol=1e-9, atol=1e-12))
 
 
 def session_text(imported: Imported, output: Path) -> str:
-    """The text of a session file; where it will be, as paths of bodies are relative to it."""
+    """Return the text of a session file at `output`, to which paths of bodies are relative."""
     names = ", ".join(path.name for path in imported.files)
     head = [f"# made by mixpose import from {names}"]
     head += [f"# {remark}" for remark in imported.remarks]
@@ -199,7 +199,7 @@ def _objects(imported: Imported, output: Path) -> list[str]:
 
 
 def _relative(path: Path, output: Path) -> str:
-    """A path as the session file is to name it."""
+    """Return a path relative to the folder of the session file; absolute on another drive."""
     try:
         return Path(os.path.relpath(path.resolve(), output.resolve().parent)).as_posix()
     except ValueError:  # on another drive
@@ -207,18 +207,18 @@ def _relative(path: Path, output: Path) -> str:
 
 
 def _sensor(camera: CalibratedCamera) -> str:
-    given = camera.intrinsics
+    intrinsics = camera.intrinsics
     lines = [
         "[[sensor]]",
         f"name = {json.dumps(camera.name, ensure_ascii=False)}",
-        f'model = "{given.model or "pinhole"}"',
+        f'model = "{intrinsics.model or "pinhole"}"',
         f"# source = {json.dumps(f'{camera.name}/*.png', ensure_ascii=False)}",
-        f"camera_matrix = {given.camera_matrix.tolist()}",
+        f"camera_matrix = {intrinsics.camera_matrix.tolist()}",
     ]
-    if given.distortion.size:
-        lines.append(f"distortion = {given.distortion.tolist()}")
-    if given.resolution is not None:
-        lines.append(f"resolution = {list(given.resolution)}")
+    if intrinsics.distortion.size:
+        lines.append(f"distortion = {intrinsics.distortion.tolist()}")
+    if intrinsics.resolution is not None:
+        lines.append(f"resolution = {list(intrinsics.resolution)}")
     if camera.T_camera_rig is not None:
         rows = ",\n    ".join(str(row) for row in camera.T_camera_rig.tolist())
         lines.append(f"T_sensor_world = [\n    {rows},\n]")

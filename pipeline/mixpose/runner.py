@@ -28,7 +28,7 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import Selection
-from mixpose.sensors import CloudSensor, doubted
+from mixpose.sensors import CloudSensor, perturbed
 from mixpose.threads import one_blas_thread, prompt_switching
 from mixpose.tracking import (
     DelayEvidence,
@@ -308,7 +308,7 @@ def _view(
         delay + stated_delay,
         setup.readout,
         DelayEvidence.unknown_s if setup.delay == "estimate" else None,
-        doubts=doubted(setup.sensor, error) if error else (),
+        doubts=perturbed(setup.sensor, error) if error else (),
     )
 
 

@@ -93,8 +93,8 @@ _SETUPS = (
     Mutant(
         "session-common-keys-win",
         "session/sensor_setups.py",
-        "[defaults, own]",
-        "[own, defaults]",
+        "[defaults, overrides]",
+        "[overrides, defaults]",
         "[sensor.extract] changes nothing",
     ),
     Mutant(
@@ -173,8 +173,8 @@ _CALIBRATIONS = (
     Mutant(
         "session-opencv-first-camera-for-all",
         "session/calibration/opencv.py",
-        "for name in usual if named is None else (named,):",
-        "for name in (*usual, named):",
+        "for name in common if named is None else (named,):",
+        "for name in (*common, named):",
         "both cameras of a stereo file are the same",
     ),
 )

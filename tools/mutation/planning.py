@@ -76,7 +76,7 @@ _IMPORTING = (
     Mutant(
         "importing-copies-pass",
         "importing.py",
-        "if _same(a, b):",
+        "if _are_same(a, b):",
         "if False:",
         "a camera that was copied by mistake is not noticed",
     ),

@@ -23,7 +23,7 @@ from mixpose.calibration.task import SeenFrame
 from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
-from mixpose.sensors import CalibrationError, by_calibration, doubted
+from mixpose.sensors import CalibrationError, calibration_shifts, perturbed
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
             by_rig[:, :, block.place] = parameter_jacobian(geometry, block.kind, world, by_world)
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
-        by_held = by_calibration(doubted(geometry, bundle.errors[sensor]), world)
+        by_held = calibration_shifts(perturbed(geometry, bundle.errors[sensor]), world)
     return Rows(pairs, pairs.y - y, by_pose, shares, by_rig, by_held, known & visible)
 
 

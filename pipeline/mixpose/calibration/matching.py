@@ -22,7 +22,7 @@ from mixpose.calibration.rig import Rig, State
 from mixpose.calibration.task import SeenFrame
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, twist_between
-from mixpose.sensors.moving import moments, rows_apart
+from mixpose.sensors.moving import read_times, row_span
 
 _NODES = 4  # frames that motion is interpolated through
 _TOGETHER = 32  # frames that are matched at a time
@@ -42,7 +42,7 @@ class Clock:
         """Return seconds from the common time of frames (n,) to when a sensor took them, or y."""
         lag = self.lags[sensor, frame] + rig.delays[sensor]
         lag = lag + rig.drifts[sensor] * self.elapsed[sensor, frame]
-        return lag if y is None else moments(rig.sensors[sensor], y, lag, rig.readouts[sensor])
+        return lag if y is None else read_times(rig.sensors[sensor], y, lag, rig.readouts[sensor])
 
 
 def clock_of(frames: Sequence[SeenFrame], sensors: int, gap: float) -> Clock:
@@ -177,7 +177,7 @@ def _projected(state: State, clock: Clock, sensor: int) -> tuple[Floats, Mask]:
         ahead = perturb(state.poses, interpolate(clock, state.poses, frame, tau + step).twist)
         y_ahead, visible_ahead = state.rig.project(sensor, ahead)
         rate, eye = (y_ahead - y) / step, state.rig.sensors[sensor]
-        after = moments(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / rows_apart(eye))
+        after = read_times(eye, y, 0.0, readout) / (1 - rate[..., 1] * readout / row_span(eye))
         y, visible = y + rate * after[..., None], visible & visible_ahead
     return y, visible
 

@@ -28,7 +28,7 @@ def calibrated_text(session: Session, calibration: Calibration, target: Path, ve
         _put_sensor(table, calibration, session, index)
         for key in ("position", "range_bias") if scale != 1 else ():
             if key in (errors := table.get("calibration_error", {})):
-                rewriting.put(errors, key, rewriting.plain(scale * float(errors[key])))
+                rewriting.put(errors, key, rewriting.rounded(scale * float(errors[key])))
     first, *others = zip(rewriting.objects_of(document), session.objects, strict=True)
     if scale != 1 or any(block.kind == "body" for block in calibration.blocks):
         _put_body(first[0], first[1].body, calibration.after.points, scale)
@@ -78,7 +78,7 @@ def _put_sensor(table: Any, calibration: Calibration, session: Session, index: i
 
 
 def _put(table: Any, key: str, value: Floats | float, deviations: str | None) -> None:
-    rewriting.put(table, key, rewriting.plain(value), _comment(deviations))
+    rewriting.put(table, key, rewriting.rounded(value), _comment(deviations))
 
 
 def _comment(deviations: str | None) -> str | None:
@@ -99,18 +99,18 @@ def _put_body(table: Any, body: Body, points: Floats, scale: float) -> None:
     """Write features as points in place of a file of them, and scale other lengths of the body."""
     had_file = table.pop("file", None) is not None
     if had_file and body.normals is not None:
-        table["normals"] = rewriting.plain(body.normals)
+        table["normals"] = rewriting.rounded(body.normals)
     if (had_file or scale != 1) and body.covariances.any():
-        table["sigma"] = [rewriting.plain(scale**2 * covariance) for covariance in body.covariances]
+        table["sigma"] = [rewriting.rounded(scale**2 * C) for C in body.covariances]
     count = len(body) - len(table.get("segments", ()))
     if count:  # segments come after the points
-        table["points"] = rewriting.plain(points[:count])
+        table["points"] = rewriting.rounded(points[:count])
     if had_file and body.names:
         table["names"] = list(body.names)
     if scale == 1:
         return
     for key in ("segments", "radius", "tip"):
         if key in table:
-            rewriting.put(table, key, rewriting.plain(scale * np.array(table[key], float)))
+            rewriting.put(table, key, rewriting.rounded(scale * np.array(table[key], float)))
     if body.gravity is not None:
-        rewriting.put(table["gravity"], "sigma", rewriting.plain(scale * body.gravity.sigma))
+        rewriting.put(table["gravity"], "sigma", rewriting.rounded(scale * body.gravity.sigma))

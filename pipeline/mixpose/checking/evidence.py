@@ -23,7 +23,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Indices, Mask, PointPattern
 from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin
-from mixpose.sensors.moving import moments
+from mixpose.sensors.moving import read_times
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.frame import Start
@@ -188,7 +188,7 @@ class Seen:
     @classmethod
     def by(cls, view: View, pairs: Pairs) -> Seen:
         """What a view met."""
-        seconds = moments(view.sensor, pairs[1], view.delay + (view.unsure or 0.0), view.readout)
+        seconds = read_times(view.sensor, pairs[1], view.delay + (view.unsure or 0.0), view.readout)
         return cls(view.name, *pairs, np.broadcast_to(seconds, len(pairs[0])))
 
 

@@ -265,7 +265,7 @@ def _otherwise(recording: _Recording, numbers: Sequence[int], *, are_odd: bool =
         ways.append(("method", "corners", "corners and no spots"))
     anew = list(replace(recording, surveys={}).read(numbers))
     for key, value, what in ways:
-        own = [setup.name for setup in session.sensors if key in setup.own]
+        own = [setup.name for setup in session.sensors if key in setup.overridden]
         tables = ["[extract]"] if len(own) < len(session.sensors) else []
         tables += [f"[sensor.extract] of {called(own)}"] if own else []
         where = " and in ".join(tables)

@@ -88,7 +88,7 @@ def advice(
         )
     keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
     change = keys.get(options.method, "polarity, threshold, min_area and max_area")
-    own = [key for key in re.findall(r"\w+", change) if key in setup.own]
+    own = [key for key in re.findall(r"\w+", change) if key in setup.overridden]
     beside = f", {' and '.join(own)} {_OWN}" if own else ""
     is_hidden = before > 0 and session.body.normals is None
     hidden = "; or give normals in [object], if the body hides some of them" if is_hidden else ""

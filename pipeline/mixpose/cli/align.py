@@ -34,7 +34,7 @@ def align_session(request: AlignRequest) -> None:
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
-    rewriting.refuse_held(session)
+    rewriting.refuse_held_directions(session)
     rewriting.refuse_lost_code(session, request.output)
     files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
@@ -85,7 +85,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
     for table, setup in zip(document["sensor"], session.sensors, strict=True):
         sensor: Any = setup.sensor.moved(T_old_new)
         if hasattr(sensor, "position"):
-            place = rewriting.plain(sensor.position, rewriting.ALL_DIGITS)
+            place = rewriting.rounded(sensor.position, rewriting.ALL_DIGITS)
             rewriting.put(table, "position", place)
         else:
             T, digits = sensor.T_sensor_world, rewriting.ALL_DIGITS

@@ -28,7 +28,7 @@ from mixpose.records import Floats
 from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
-from mixpose.session.rewriting import refuse_held, refuse_lost_code
+from mixpose.session.rewriting import refuse_held_directions, refuse_lost_code
 
 
 def calibrate_session(request: CalibrateRequest) -> None:
@@ -46,7 +46,7 @@ def calibrate_session(request: CalibrateRequest) -> None:
         output.refuse_suffix(target, (".toml",), "it is a session that is written")
         refuse_lost_code(session, target)
         if request.world is not None:
-            refuse_held(session)
+            refuse_held_directions(session)
     inputs = path, request.poses
     for written, mark, option in ((target, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:

@@ -120,7 +120,7 @@ def _of_geometry(session: Session) -> _Report:
     report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
     for one in session.objects:
         report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
-        _say_accuracy(report, session.alone(one.body.name))
+        _say_accuracy(report, session.with_only(one.body.name))
     report.of = ""
     report.warnings += keys.shared_part_warnings(session)
     return report
@@ -203,7 +203,7 @@ def _say_features(
     report: _Report, session: Session, setup: SensorSetup, source: Source, found: recordings.Survey
 ) -> None:
     where = f"sensor {setup.name!r}"
-    alone = [(session.alone(one.body.name), one.count) for one in session.objects]
+    alone = [(session.with_only(one.body.name), one.count) for one in session.objects]
     expected = sum(count * placement.expected_count(setup, each) for each, count in alone)
     if not (found.numbers or found.damage):
         report.warn(f"{where}: its recording has no frame")

@@ -14,7 +14,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.session import load_session
-from mixpose.session.rewriting import document_of, objects_of, plain, put, text_of
+from mixpose.session.rewriting import document_of, objects_of, put, rounded, text_of
 from mixpose.trajectories.pivot import Pivoting, PivotRules, Tip, find_tip, fixed_in, fixed_in_world
 from mixpose.trajectories.track import require_covariances, require_frames_once
 
@@ -143,5 +143,5 @@ def _put_into(path: Path, tool: str, poses: PoseFile, tip: Tip) -> None:
         raise SessionError(f"--into {path}: has {', '.join(names)}, and the poses are of {name}")
     table = list(objects_of(document))[names.index(name)]
     deviations = ", ".join(f"{d:.2g}" for d in np.sqrt(tip.covariance.diagonal()))
-    put(table, "tip", plain(tip.place, _DIGITS), f"one standard deviation: {deviations}")
+    put(table, "tip", rounded(tip.place, _DIGITS), f"one standard deviation: {deviations}")
     write_text(path, text_of(document, session), "--into")

@@ -36,7 +36,7 @@ from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import Matches
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
-from mixpose.sensors import Sensor, by_lenses
+from mixpose.sensors import Sensor, lens_shifts
 
 APART = "sensors contradict each other"
 SIZE = "the body seems to be of another size"
@@ -199,7 +199,7 @@ def _by_lenses(
     matches, points = pose.used, transform(pose.T_world_object, body.nodes.points)
     shifts = np.zeros(matches.offsets.shape)
     if sensors:
-        shifts = by_lenses(tuple([sensors[name] for name in matches.names]), model.lens, points)
+        shifts = lens_shifts(tuple([sensors[name] for name in matches.names]), model.lens, points)
     shifts *= (matches.weights > 0)[..., None] / matches.sigmas[:, None, None]
     L = len(shifts)
     columns = np.zeros((*shifts.shape, L))

@@ -22,7 +22,7 @@ from mixpose.matching.matches import Matches
 from mixpose.objective import MatchedObjective, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
-from mixpose.sensors import by_calibration, clouds_among, from_planes
+from mixpose.sensors import calibration_shifts, clouds_among, from_planes
 
 
 @dataclass(frozen=True)
@@ -395,7 +395,7 @@ def _by_calibration(objective: MatchedObjective, T_world_object: Floats) -> Floa
     for k, view in enumerate(views):
         if view.doubts:
             points = transform(T_world_object, objective.projection.body.nodes.points)
-            shifts = by_calibration(view.doubts, points)
+            shifts = calibration_shifts(view.doubts, points)
             column = np.zeros((len(views), len(points), 2, shifts.shape[2]))
             column[k, :, : shifts.shape[1]] = shifts / view.observation.sigma
             columns.append(column)

@@ -119,7 +119,7 @@ def _body_content(
         evaluation = evaluate(poses, own if own.poses else truth, numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
         names = [one.body.name for one in origin.session.objects]
-        alone = origin.session.alone(series.object) if series.object in names else None
+        alone = origin.session.with_only(series.object) if series.object in names else None
         origin = replace(origin, session=alone)
     overlays, overlay_notices = overlay_frames(origin.session, poses, series, errors)
     unit_of = _unit_of(origin, series)

@@ -1,6 +1,6 @@
-"""Sensors: from world points to sensor coordinates, with Jacobians.
+"""Sensors: maps from world points to sensor coordinates, with Jacobians.
 
-A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
+A new kind of sensor needs a module in this package and a line in `SENSOR_MODELS`.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from mixpose.sensors.cloud import (
     facing as facing,
     from_planes as from_planes,
 )
-from mixpose.sensors.doubted import (
-    CalibrationError as CalibrationError,
-    by_calibration as by_calibration,
-    by_lenses as by_lenses,
-    doubted as doubted,
-)
 from mixpose.sensors.fisheye import FisheyeCamera as FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor as RangeSensor
 from mixpose.sensors.moving import (
     Motion as Motion,
     RollingSensor as RollingSensor,
     in_motion as in_motion,
-    moments as moments,
+    read_times as read_times,
     side_by_side as side_by_side,
 )
 from mixpose.sensors.parallel import ParallelBeam as ParallelBeam
+from mixpose.sensors.perturbed import (
+    CalibrationError as CalibrationError,
+    calibration_shifts as calibration_shifts,
+    lens_shifts as lens_shifts,
+    perturbed as perturbed,
+)
 from mixpose.sensors.pinhole import PinholeCamera as PinholeCamera
 
 SENSOR_MODELS: dict[str, type[Sensor]] = {

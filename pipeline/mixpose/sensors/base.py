@@ -1,13 +1,13 @@
-"""What every sensor is: a map from world points to what it measures, with its Jacobian.
+"""The interface of all sensors: a map from world points to measurements, with its Jacobian.
 
 Conventions
 -----------
 * Sensor coordinates y have m numbers: pixels (u right, v down, pixel centres at integers) for
   cameras, one length for ranges.
 * A sensor's frame looks along +z, x right, y down (OpenCV); ``x_sensor = T_sensor_world x_world``.
-* A point that the sensor cannot measure (behind the camera, outside the image, where the lens
-  model no longer holds) is marked invisible, its coordinates are `OUTSIDE` and its Jacobian is
-  zero: finite everywhere, on no sensor, and without pull on the pose.
+* A point that the sensor cannot measure (behind the camera, outside the image, beyond the range of
+  the lens model) is marked invisible, its coordinates are `OUTSIDE` and its Jacobian is zero:
+  values are finite everywhere, and the point has no influence on the pose.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ OUTSIDE = -1.0e6
 class Rays:
     """Half-lines (lines, for parallel beams) in the world, one per detection.
 
-    A px covers ``offset + slope * d`` of length across the ray at a distance d from its origin.
+    A px is ``offset + slope * d`` wide, across the ray, at a distance d from its origin.
     """
 
     origins: Floats  # (M, 3) centre of projection, or a point on the sensor's plane
     directions: Floats  # (M, 3) unit vectors away from the sensor
     pixels: Floats  # (M, 2) the detections
-    central: bool  # whether all start at one centre, in front of which alone the camera sees
+    central: bool  # whether all start at one centre; only points in front of it are seen
     offset: float
     slope: float
-    cloud: object = None  # the same for the images of one cloud, whose rows are the same points
+    cloud: object = None  # token shared by the images of a cloud, whose rows are the same points
 
     def __len__(self) -> int:
         return len(self.origins)
 
     def select(self, chosen: NDArray[Any]) -> Rays:
-        """The rays of some detections."""
+        """Return the rays of the detections with these indices or this mask."""
         return replace(
             self,
             origins=self.origins[chosen],
@@ -61,30 +61,30 @@ class Sensor(Protocol):
 
     @property
     def unit(self) -> Literal["px", "length"]:
-        """What the sensor coordinates count."""
+        """Unit of the sensor coordinates."""
 
     @property
     def lower(self) -> Floats:
-        """Smallest measurable coordinates (m,); minus infinity where unknown."""
+        """Smallest measurable coordinates (m,); minus infinity if unknown."""
 
     @property
     def upper(self) -> Floats:
-        """Largest measurable coordinates (m,); infinity where unknown."""
+        """Largest measurable coordinates (m,); infinity if unknown."""
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Map world points (..., 3) to sensor coordinates (..., m) and a visibility mask (...)."""
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., m, 3) by world coordinates in between."""
+        """Return coordinates as `project`, their Jacobian (..., m, 3) by points, and the mask."""
 
     def towards(self, points_world: Floats) -> Floats:
-        """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
+        """Return directions (..., 3) of any length from world points (..., 3) to the sensor."""
 
     def rays(self, y: Floats) -> Rays | None:
-        """Lines of sight of detections (M, m) that a point can cause; None if they leave none."""
+        """Return rays of detections (M, m) that a point can cause; None if the sensor has none."""
 
     def moved(self, motion: Floats) -> Self:
-        """The sensor that measures of x what this one does of ``motion @ x``, rigid (4, 4)."""
+        """Return a sensor whose reading of x is this one's of ``motion @ x``, rigid (4, 4)."""
 
 
 @runtime_checkable
@@ -93,16 +93,16 @@ class AffineSensor(Sensor, Protocol):
 
     @property
     def affine(self) -> Floats:
-        """Sensor coordinates as rows (m, 4) that are multiplied by (x, y, z, 1) in the world."""
+        """Matrix (m, 4) that maps homogeneous world points (x, y, z, 1) to sensor coordinates."""
 
 
 def within(y: Floats, lower: Floats, upper: Floats) -> Mask:
-    """Whether coordinates (..., m) lie inside the bounds (m,)."""
+    """Test which coordinates (..., m) lie inside the bounds (m,)."""
     return np.asarray(np.all((y >= lower) & (y <= upper), axis=-1))
 
 
 def hide(y: Floats, visible: Mask, J: Floats | None = None) -> None:
-    """Overwrite what is not visible, in place: coordinates `OUTSIDE`, Jacobian zero."""
+    """Set invisible points in place: coordinates to `OUTSIDE`, Jacobians to zero."""
     if visible.all():
         return
     y[~visible] = OUTSIDE

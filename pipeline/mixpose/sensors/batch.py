@@ -1,6 +1,6 @@
-"""Several sensors of one kind, linearised together.
+"""Linearise several sensors of a kind together.
 
-For a handful of points NumPy spends its time on calls: one product for all costs no more.
+For few points NumPy's time is that of its calls: a single product for all sensors costs no more.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from mixpose.sensors.pinhole import NEAREST, PinholeCamera
 
 
 class SensorBatch(Protocol):
-    """L sensors side by side; those of one coordinate have 0 as their second."""
+    """L sensors together; the second coordinate of those with a single one is 0."""
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """Coordinates (L, n, 2), Jacobians (L, n, 2, 3) and visibility (L, n) of points.
+        """Return coordinates (L, n, 2), Jacobians (L, n, 2, 3) and visibility (L, n) of points.
 
-        As `Sensor.linearise` gives them one by one.  Points are (n, 3), or (L, n, 3) where each
-        sensor looks at its own.
+        As `Sensor.linearise` of each sensor.  Points are (n, 3), the same for all sensors, or
+        (L, n, 3).
         """
         ...
 
     def towards(self, points_world: Floats) -> Floats:
-        """Directions (L, n, 3) from points (n, 3) or (L, n, 3) to the sensors, of any length."""
+        """Return directions (L, n, 3) of any length from points (n, 3) or (L, n, 3) to sensors."""
         ...
 
 
 @lru_cache(maxsize=64)
 def side_by_side(sensors: tuple[Sensor, ...]) -> SensorBatch:
-    """Put sensors of any kinds side by side; once, where they are the same objects."""
+    """Return a batch of sensors of any kinds, cached for the same objects."""
     cameras = [sensor for sensor in sensors if isinstance(sensor, PinholeCamera)]
     if len(cameras) == len(sensors) and not any(_is_tilted(camera) for camera in cameras):
         return PinholeBatch(cameras)
@@ -47,7 +47,7 @@ def side_by_side(sensors: tuple[Sensor, ...]) -> SensorBatch:
 
 
 class MixedBatch:
-    """Sensors of any kinds, one after the other."""
+    """Sensors of any kinds, linearised one after the other."""
 
     def __init__(self, sensors: Sequence[Sensor]) -> None:
         self._sensors = tuple(sensors)
@@ -55,22 +55,22 @@ class MixedBatch:
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
         L, n = len(self._sensors), points_world.shape[-2]
-        each = np.broadcast_to(points_world, (L, n, 3))
+        points = np.broadcast_to(points_world, (L, n, 3))
         y, J = np.zeros((L, n, 2)), np.zeros((L, n, 2, 3))
         visible = np.empty((L, n), dtype=np.bool_)
         for k, sensor in enumerate(self._sensors):
             m = sensor.dimension
-            y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(each[k])
+            y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(points[k])
         return y, J, visible
 
     def towards(self, points_world: Floats) -> Floats:
         """As `SensorBatch.towards`."""
-        each = np.broadcast_to(points_world, (len(self._sensors), *points_world.shape[-2:]))
-        return np.array([one.towards(points) for one, points in zip(self._sensors, each)])
+        points = np.broadcast_to(points_world, (len(self._sensors), *points_world.shape[-2:]))
+        return np.array([sensor.towards(points[k]) for k, sensor in enumerate(self._sensors)])
 
 
 class RangeBatch:
-    """Range sensors, one row of positions each."""
+    """Range sensors."""
 
     def __init__(self, sensors: Sequence[RangeSensor]) -> None:
         self._positions = np.array([sensor.position for sensor in sensors])[:, None]
@@ -95,14 +95,14 @@ class RangeBatch:
 
 
 class PinholeBatch:
-    """Pinhole cameras without tilted sensors: one product projects the points into all."""
+    """Pinhole cameras without tilted sensors: one product projects points into all of them."""
 
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
         self._count = len(cameras)
         self._K = np.array([camera.camera_matrix for camera in cameras])
-        self._middle, self._half = _images(cameras)
+        self._middle, self._half = _image_bounds(cameras)
         self._lens = _lenses(cameras)
-        # straight to pixels, or to what lenses distort
+        # maps to pixels, or to normalised coordinates, which lenses distort
         T = np.array([camera.T_sensor_world for camera in cameras])
         P = T[:, :3]
         if self._lens is None:
@@ -137,7 +137,7 @@ class PinholeBatch:
             y, D = lens.linearise(xy)
             K, (L, _, n) = self._K[:, :2, :2], y.shape
             y = (K @ y + self._K[:, :2, 2:]).swapaxes(1, 2)
-            # by points before the camera: x / z and y / z fall as z grows
+            # Jacobian by points in camera axes: x / z and y / z decrease as z grows
             by_point = np.empty((L, 2, 3, n))
             by_point[:, :, :2] = (K @ D.reshape(L, 2, 2 * n)).reshape(L, 2, 2, n)
             by_point[:, :, 2] = -(by_point[:, :, :2] * xy[:, None]).sum(axis=2)
@@ -155,8 +155,8 @@ class PinholeBatch:
         return np.asarray(self._centres - points_world)
 
 
-def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:
-    """Middle and half size (L, 1, 2) of the images; infinite where a resolution is unknown."""
+def _image_bounds(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:
+    """Return centres and half sizes (L, 1, 2) of images; infinite for an unknown resolution."""
     lower = np.array([camera.lower for camera in cameras])[:, None]
     upper = np.array([camera.upper for camera in cameras])[:, None]
     bounded = np.isfinite(upper)
@@ -170,7 +170,7 @@ def _is_tilted(camera: PinholeCamera) -> bool:
 
 
 def _lenses(cameras: Sequence[PinholeCamera]) -> LensDistortion | None:
-    """The lenses of all cameras with a column of coefficients each; None without any."""
+    """Return the lenses of all cameras as one, with a column per camera; None without any."""
     if all(camera.lens is None for camera in cameras):
         return None
     coefficients = np.zeros((14, len(cameras), 1))

@@ -1,6 +1,6 @@
-"""What cameras have in common: where they stand, how large their images are, their lines of sight.
+"""Base classes of cameras: pose, size of images and lines of sight.
 
-Fields that are declared here are those of the dataclasses that cameras are.
+Fields declared here are set by the dataclasses that inherit them.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
 from mixpose.sensors.base import Rays
 
-_WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
+_WORST_ROUND_TRIP = 1.0  # px between a detection and the projection of its ray
 
 
 class PlacedSensor:
-    """A sensor that stands somewhere and looks somewhere."""
+    """A sensor with a position and an orientation."""
 
     T_sensor_world: Floats  # (4, 4)
 
     def moved(self, motion: Floats) -> Self:
-        """The sensor that measures of points x what this one measures of ``motion @ x``."""
+        """Return a sensor whose reading of points x is this one's of ``motion @ x``."""
         return replace(self, T_sensor_world=self.T_sensor_world @ motion)  # type: ignore[type-var]
 
     def _as_floats(self, *names: str) -> None:
-        """Make fields arrays of float64."""
+        """Convert fields to arrays of float64."""
         for name in names:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
 
@@ -42,12 +42,12 @@ class Camera(PlacedSensor):
 
     @cached_property
     def lower(self) -> Floats:
-        """The image's upper left corner (2,) in pixel coordinates."""
+        """Upper left corner (2,) of the image in pixel coordinates."""
         return np.full(2, -np.inf if self.resolution is None else -0.5)
 
     @cached_property
     def upper(self) -> Floats:
-        """The image's lower right corner (2,) in pixel coordinates."""
+        """Lower right corner (2,) of the image in pixel coordinates."""
         if self.resolution is None:
             return np.full(2, np.inf)
         return np.asarray(self.resolution, dtype=np.float64) - 0.5
@@ -59,22 +59,22 @@ class CentralCamera(Camera):
     camera_matrix: Floats  # (3, 3)
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        """Return pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         raise NotImplementedError
 
     def towards(self, points_world: Floats) -> Floats:
-        """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
+        """Return vectors (..., 3) from world points (..., 3) to the centre of projection."""
         centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
         return np.asarray(centre - points_world)
 
     def _rays_along(self, directions: Floats, pixels: Floats) -> Rays:
-        """Rays along directions (M, 3) in the camera's axes, as far as the lens model explains."""
+        """Return rays along directions (M, 3), in camera axes, that project to their pixels."""
         T_world_sensor = inverse(self.T_sensor_world)
         directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         directions = directions @ T_world_sensor[:3, :3].T
         origin = T_world_sensor[:3, 3]
         focal = float(np.sqrt(abs(np.linalg.det(self.camera_matrix[:2, :2]))))
         rays = Rays(np.tile(origin, (len(pixels), 1)), directions, pixels, True, 0.0, 1.0 / focal)
-        again, visible = self.project(origin + directions)
-        error = np.linalg.norm(again - pixels, axis=1)
+        projected, visible = self.project(origin + directions)
+        error = np.linalg.norm(projected - pixels, axis=1)
         return rays.select(visible & (error < _WORST_ROUND_TRIP))

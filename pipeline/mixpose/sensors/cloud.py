@@ -1,9 +1,9 @@
-"""Points in space as a sensor: what a system that triangulates gives, without labels.
+"""A sensor of unlabelled points in space, such as a system that triangulates gives.
 
-An objective of images knows such points by three of them: along z, x and y.  A shift of a point by
-d moves it by 2 |d|² in the three together, whichever way, so that what fits them best fits best in
-space.  What belongs together in them is told by `clouds_among`: then one detection is met in all
-three, by its distance in space.
+Objectives of images see such points in three images: along z, x and y.  A shift of a point by d
+adds up to squared offsets of 2 |d|² in the three, in any direction, so that the best fit to the
+images is the best fit in space.  `clouds_among` finds the images of a cloud: a detection is then
+met in all three, by its distance in space.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from mixpose.sensors.camera import PlacedSensor
 from mixpose.sensors.parallel import ParallelBeam
 
 PLANES: tuple[tuple[str, tuple[int, int]], ...] = (("xy", (0, 1)), ("yz", (1, 2)), ("zx", (2, 0)))
-"""What the three images are called, and the axes of the cloud that are theirs, u first."""
+"""Names of the three images, and the axes of the cloud that they show, u first."""
 
 
 @dataclass(frozen=True, eq=False)
 class CloudPlane(ParallelBeam):
-    """One of the three images of a cloud, in its units of length."""
+    """One of the three images of a cloud, in the cloud's unit of length."""
 
-    cloud: object = None  # the same for the three of one cloud, and for nothing else
+    cloud: object = None  # token shared by the three images of a cloud only
 
     def rays(self, y: Floats) -> Rays:
-        """Lines of sight of places (M, 2), which say what cloud they are of."""
+        """Return lines of sight of places (M, 2), with the token of the cloud."""
         return replace(super().rays(y), cloud=self.cloud)
 
 
@@ -49,12 +49,12 @@ class CloudSensor(PlacedSensor):
 
     @property
     def lower(self) -> Floats:
-        """Smallest measurable coordinates (3,): none."""
+        """Smallest measurable coordinates (3,): minus infinity."""
         return np.full(3, -np.inf)
 
     @property
     def upper(self) -> Floats:
-        """Largest measurable coordinates (3,): none."""
+        """Largest measurable coordinates (3,): infinity."""
         return np.full(3, np.inf)
 
     @cached_property
@@ -62,33 +62,33 @@ class CloudSensor(PlacedSensor):
         """The three images, in the order of `PLANES`."""
         token = object()
         return tuple(
-            CloudPlane(1.0, np.zeros(2), None, _turned(axes) @ self.T_sensor_world, cloud=token)
+            CloudPlane(1.0, np.zeros(2), None, _plane_axes(axes) @ self.T_sensor_world, cloud=token)
             for _, axes in PLANES
         )
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Points (..., 3) in the cloud's axes of world points (..., 3); all are seen."""
+        """Return world points (..., 3) in the cloud's axes; all are visible."""
         T = self.T_sensor_world
         y = np.asarray(points_world @ T[:3, :3].T + T[:3, 3])
         return y, np.ones(y.shape[:-1], dtype=np.bool_)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 3, 3) in between."""
+        """Return points as `project`, their Jacobian (..., 3, 3), and visibility."""
         y, visible = self.project(points_world)
         return y, np.broadcast_to(self.T_sensor_world[:3, :3], (*y.shape, 3)).copy(), visible
 
     def towards(self, points_world: Floats) -> Floats:
-        """Directions (..., 3) to the sensor: none, it is nowhere."""
+        """Return zero directions (..., 3), as the sensor has no position."""
         return np.zeros(np.shape(points_world))
 
     def rays(self, y: Floats) -> None:
-        """None: a detection is a point, not a line."""
+        """Return None: a detection is a point, not a line."""
         return
 
 
 @lru_cache(maxsize=64)
 def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
-    """Where the three images of each cloud are among sensors, in the order of `PLANES`."""
+    """Return the indices of the three images of each cloud, in the order of `PLANES`."""
     groups: dict[object, list[int]] = {}
     for k, sensor in enumerate(sensors):
         if isinstance(sensor, CloudPlane):
@@ -99,20 +99,20 @@ def clouds_among(sensors: tuple[Sensor, ...]) -> Sequence[Sequence[int]]:
 def as_images(
     sensors: Sequence[Sensor], deviations: Sequence[float]
 ) -> tuple[tuple[Sensor, ...], Floats, list[int]]:
-    """Sensors with clouds as their images, which tell as much at as many deviations along an axis.
+    """Return sensors with clouds replaced by their images, with deviations, and first indices.
 
-    These are √2 times the cloud's, as each coordinate is in two images. The last are the places of
-    the sensors given, or of their first images.
+    Deviations of images are √2 times the cloud's, as each coordinate is in two images. First
+    indices are those of the given sensors, or of their first images.
     """
-    parts = [one.planes if isinstance(one, CloudSensor) else (one,) for one in sensors]
-    counts = [len(part) for part in parts]
-    each = np.array(deviations, dtype=float) * np.where(np.array(counts) > 1, np.sqrt(2), 1.0)
-    first = np.cumsum([0, *counts])[:-1].tolist()
-    return tuple(one for part in parts for one in part), each.repeat(counts), first
+    groups = [sensor.planes if isinstance(sensor, CloudSensor) else (sensor,) for sensor in sensors]
+    counts = [len(group) for group in groups]
+    widened = np.array(deviations, dtype=float) * np.where(np.array(counts) > 1, np.sqrt(2), 1.0)
+    firsts = np.cumsum([0, *counts])[:-1].tolist()
+    return tuple(sensor for group in groups for sensor in group), widened.repeat(counts), firsts
 
 
 def from_planes(planes: Floats) -> Floats:
-    """Points (..., 3) in the axes of a cloud of places (3, ..., 2) in its three images."""
+    """Return points (..., 3) in a cloud's axes from places (3, ..., 2) in its three images."""
     first, second, _ = planes
     return np.concatenate([first, second[..., 1:]], axis=-1)
 
@@ -124,10 +124,10 @@ def facing(
     normals: Floats | None,
     edge_on: float = 0.0,
 ) -> Mask:
-    """Which features (..., n, 3) turn their face to a sensor: (..., n), true without normals.
+    """Test which features (..., n, 3) face a sensor: (..., n), true without normals.
 
-    Normals (n, 3) are in the object's frame, poses (..., 4, 4). In images a feature is `edge_on`
-    from that cosine of the angle to its normal; ranges are measured from all of its front. All
+    Normals (n, 3) are in the object's frame, poses (..., 4, 4). A camera sees features whose
+    normal has a cosine above `edge_on` with the direction to it; a range sensor, above 0. All
     features face a cloud, whose system sees them from several sides.
     """
     if normals is None or isinstance(sensor, CloudPlane | CloudSensor):
@@ -138,8 +138,8 @@ def facing(
     return np.asarray(cosines > (edge_on if sensor.dimension > 1 else 0.0))
 
 
-def _turned(axes: tuple[int, int]) -> Floats:
-    """From the axes of a cloud (4, 4) to those of an image that shows two of them."""
+def _plane_axes(axes: tuple[int, int]) -> Floats:
+    """Return the motion (4, 4) from a cloud's axes to those of the image that shows these two."""
     T: Floats = np.eye(4)
     T[:3, :3] = np.eye(3)[[*axes, 3 - sum(axes)]]
     return T

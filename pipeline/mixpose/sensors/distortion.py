@@ -23,33 +23,33 @@ class LensDistortion:
     """OpenCV's distortion of a pinhole camera."""
 
     coefficients: Floats  # (14,) in OpenCV's order, or (14, L, 1) of L lenses side by side
-    # up to which the radial polynomial grows: beyond it a model fitted to the image folds back
+    # radius up to which the radial polynomial grows: beyond it the fitted model folds back
     radius_limit: float | Floats
 
     @classmethod
     def from_coefficients(cls, coefficients: ArrayLike) -> LensDistortion | None:
-        """Build from 4, 5, 8, 12 or 14 coefficients; None when nothing is distorted."""
-        given = np.asarray(coefficients, dtype=np.float64).ravel()
-        if given.size not in ALLOWED_COUNTS:
-            raise ValueError(f"{given.size} distortion coefficients, allowed are 4, 5, 8, 12 or 14")
-        if not given.any():
+        """Build from 0, 4, 5, 8, 12 or 14 coefficients; return None without distortion."""
+        k = np.asarray(coefficients, dtype=np.float64).ravel()
+        if k.size not in ALLOWED_COUNTS:
+            raise ValueError(f"{k.size} distortion coefficients, allowed are 4, 5, 8, 12 or 14")
+        if not k.any():
             return None
         full = np.zeros(_COUNT)
-        full[: given.size] = given
+        full[: k.size] = k
         return cls(full, _monotonic_radius(tuple(full.tolist())))
 
     @cached_property
     def _parts(self) -> tuple[bool, bool, bool]:
-        """Whether a denominator, thin prisms and a tilted sensor are there."""
+        """Whether the model has a denominator, thin prisms and a tilted sensor."""
         k = self.coefficients
         return bool(k[5:8].any()), bool(k[8:12].any()), bool(k[12:].any())
 
     @cached_property
     def _tangential(self) -> tuple[Floats, Floats]:
-        """What products of coordinates add to these (..., 2, 4), and they to slopes (..., 4, 2)."""
+        """Matrices of tangential terms (..., 2, 4), by products, and slopes (..., 4, 2), by xy."""
         p1, p2 = self.coefficients[2:4]
-        none = np.zeros_like(p1)
-        by_products = [[3 * p2, 2 * p1, none, p2], [p1, 2 * p2, none, 3 * p1]]
+        zero = np.zeros_like(p1)
+        by_products = [[3 * p2, 2 * p1, zero, p2], [p1, 2 * p2, zero, 3 * p1]]
         by_places = [[6 * p2, 2 * p1], [2 * p1, 2 * p2], [2 * p1, 2 * p2], [2 * p2, 6 * p1]]
         first, second = (
             np.moveaxis(rows[..., 0] if rows.ndim > 2 else rows, [0, 1], [-2, -1])
@@ -62,7 +62,7 @@ class LensDistortion:
         return self.linearise(xy)[0]
 
     def linearise(self, xy: Floats) -> tuple[Floats, Floats]:
-        """As `apply`, with its Jacobian (..., 2, 2, n)."""
+        """Return distorted coordinates as `apply`, and their Jacobian (..., 2, 2, n)."""
         k, (is_rational, has_prisms, is_tilted) = self.coefficients, self._parts
         products = xy[..., :, None, :] * xy[..., None, :, :]
         products = products.reshape(*xy.shape[:-2], 4, -1)  # x², xy, xy and y²
@@ -74,7 +74,7 @@ class LensDistortion:
             slope = (slope - radial * _derivative(r2, k[5], k[6], k[7])) / bottom
         by_products, by_places = self._tangential
         y = radial[..., None, :] * xy + by_products @ products
-        # of the radial factor, by r², and by x and y
+        # slopes of the radial factor, by r², and of the tangential terms, by x and y
         D = 2 * slope[..., None, :] * products + by_places @ xy
         D[..., ::3, :] += radial[..., None, :]
         D = D.reshape(*xy.shape[:-1], 2, -1)
@@ -86,7 +86,7 @@ class LensDistortion:
         return self._tilted(y, D) if is_tilted else (y, D)
 
     def _tilted(self, y: Floats, D: Floats) -> tuple[Floats, Floats]:
-        """Coordinates (2, n) on a tilted sensor by those on a flat one, with the Jacobian."""
+        """Map coordinates (2, n) on a flat sensor, with Jacobian, to those on the tilted one."""
         M = _tilt_matrix(self.coefficients[12], self.coefficients[13])
         h = M[:, :2] @ y + M[:, 2:]
         tilted = h[:2] / h[2]

@@ -10,16 +10,16 @@ from mixpose.records import Floats, Mask
 from mixpose.sensors.base import Rays, hide, within
 from mixpose.sensors.camera import CentralCamera
 
-_WIDEST = np.radians(140.0)  # from the axis: no lens shows more, whatever its image has room for
-_NEWTON = 4  # steps from a table of angles, which is right to 1e-6
+_WIDEST = np.radians(140.0)  # from the axis: no lens shows more, however large its image is
+_NEWTON = 4  # Newton steps from a table of angles, whose error is 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class FisheyeCamera(CentralCamera):
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
 
-    It sees as far as the radius grows and the image goes, without a resolution up to 90° from its
-    axis. Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
+    It sees angles up to which the radius grows, at most 140°, inside the image; 90° at most if the
+    resolution is unknown. Raises `ValueError` if `distortion` has neither 0 nor 4 numbers.
     """
 
     camera_matrix: Floats  # (3, 3) px
@@ -41,26 +41,26 @@ class FisheyeCamera(CentralCamera):
         object.__setattr__(self, "theta_limit", float(theta[bad.argmax()]) if bad.any() else widest)
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        """Return pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         y, _, visible = self._map(points_world, want_jacobian=False)
         return y, visible
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        """Return pixels as `project`, their Jacobian (..., 2, 3), px per length, and the mask."""
         y, J, visible = self._map(points_world, want_jacobian=True)
         assert J is not None
         return y, J, visible
 
     def rays(self, y: Floats) -> Rays:
-        """Lines of sight of pixels (M, 2)."""
+        """Return lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
         xy = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
         radius = np.hypot(xy[:, 0], xy[:, 1])
         table = np.linspace(0, self.theta_limit, 2001)
         theta = np.interp(radius, self._radius(table)[0], table)
         for _ in range(_NEWTON):
-            there, slope = self._radius(theta)
-            theta = np.clip(theta - (there - radius) / np.maximum(slope, 1e-9), 0, self.theta_limit)
+            model, slope = self._radius(theta)
+            theta = np.clip(theta - (model - radius) / np.maximum(slope, 1e-9), 0, self.theta_limit)
         across = np.sin(theta) / np.where(radius > 0, radius, 1.0)
         return self._rays_along(np.column_stack([xy * across[:, None], np.cos(theta)]), y)
 
@@ -92,9 +92,9 @@ class FisheyeCamera(CentralCamera):
         if want_jacobian:
             direction = xy / safe_rho[..., None]
             distance2 = np.maximum(rho * rho + z * z, 1e-300)
-            along = (slope * z / distance2 - scale)[..., None, None]
+            radial = (slope * z / distance2 - scale)[..., None, None]
             by_sensor = np.empty((*xy.shape, 3))
-            by_sensor[..., :2] = along * direction[..., :, None] * direction[..., None, :]
+            by_sensor[..., :2] = radial * direction[..., :, None] * direction[..., None, :]
             by_sensor[..., :2] += scale[..., None, None] * np.eye(2)
             by_sensor[..., 2] = direction * (-slope * rho / distance2)[..., None]
             J = K @ by_sensor @ R

@@ -31,14 +31,14 @@ class RangeSensor:
         object.__setattr__(self, "upper", np.array([high], dtype=np.float64))
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Ranges (..., 1) of world points (..., 3), and which of them lie within the limits."""
+        """Return ranges (..., 1) of world points (..., 3), and which lie within the limits."""
         y = np.linalg.norm(points_world - self.position, axis=-1, keepdims=True) + self.range_bias
         visible = within(y, self.lower, self.upper)
         hide(y, visible)
         return np.asarray(y), visible
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 1, 3), the unit vector to the point, between."""
+        """Return ranges, their Jacobian (..., 1, 3): unit vectors to the points, and the mask."""
         away = points_world - self.position
         distance = np.linalg.norm(away, axis=-1, keepdims=True)
         y = distance + self.range_bias
@@ -48,14 +48,14 @@ class RangeSensor:
         return np.asarray(y), np.asarray(J), visible
 
     def towards(self, points_world: Floats) -> Floats:
-        """Vectors (..., 3) from world points (..., 3) to the lateration source."""
+        """Return vectors (..., 3) from world points (..., 3) to the lateration source."""
         return np.asarray(self.position - points_world)
 
     def rays(self, y: Floats) -> None:
-        """None: a range leaves a sphere, not a line."""
+        """Return None: a range defines a sphere, not a line."""
         return
 
     def moved(self, motion: Floats) -> Self:
-        """The sensor that measures of points x what this one measures of ``motion @ x``."""
-        # distances stay when the source moves back in place of the points
+        """Return a sensor whose ranges of points x are this one's of ``motion @ x``."""
+        # distances are the same if the source moves back instead of the points moving
         return replace(self, position=motion[:3, :3].T @ (self.position - motion[:3, 3]))

@@ -29,13 +29,13 @@ class ParallelBeam(Camera):
 
     @property
     def affine(self) -> Floats:
-        """Pixels as rows (2, 4) that are multiplied by (x, y, z, 1) in the world."""
+        """Matrix (2, 4) that maps homogeneous world points (x, y, z, 1) to pixels."""
         rows = self.T_sensor_world[:2] / self.pixel_size
         rows[:, 3] += self.principal_point
         return np.asarray(rows)
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        """Return pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         T = self.T_sensor_world
         y = (points_world @ T[:2, :3].T + T[:2, 3]) / self.pixel_size + self.principal_point
         visible = within(y, self.lower, self.upper)
@@ -43,7 +43,7 @@ class ParallelBeam(Camera):
         return y, visible
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        """Return pixels as `project`, their Jacobian (..., 2, 3), px per length, and the mask."""
         y, visible = self.project(points_world)
         J = np.empty((*y.shape, 3))
         J[...] = self.T_sensor_world[:2, :3] / self.pixel_size
@@ -51,11 +51,11 @@ class ParallelBeam(Camera):
         return y, J, visible
 
     def towards(self, points_world: Floats) -> Floats:
-        """Unit vectors (..., 3) against the beam, the same for all world points (..., 3)."""
+        """Return unit vectors (..., 3) against the beam, the same for all world points (..., 3)."""
         return np.broadcast_to(-self.T_sensor_world[2, :3], points_world.shape)
 
     def rays(self, y: Floats) -> Rays:
-        """Lines of sight of pixels (M, 2), all parallel."""
+        """Return the parallel lines of sight of pixels (M, 2)."""
         T_world_sensor = inverse(self.T_sensor_world)
         across = (y - self.principal_point) * self.pixel_size
         origins = across @ T_world_sensor[:3, :2].T + T_world_sensor[:3, 3]

@@ -12,8 +12,8 @@ from mixpose.sensors.base import Rays, hide, within
 from mixpose.sensors.camera import CentralCamera
 from mixpose.sensors.distortion import LensDistortion
 
-# Of a strong lens OpenCV's five rounds leave a pixel.
-_UNDONE = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+# OpenCV's default of five iterations leaves errors of a pixel for strong lenses.
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
 
 
@@ -35,7 +35,7 @@ class PinholeCamera(CentralCamera):
         object.__setattr__(self, "lens", LensDistortion.from_coefficients(self.distortion))
 
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
-        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        """Return pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         xy, _, visible = self._normalised(points_world)
         if self.lens:
             xy = self.lens.apply(xy.reshape(-1, 2).T).T.reshape(xy.shape)
@@ -46,7 +46,7 @@ class PinholeCamera(CentralCamera):
         return y, visible
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        """Return pixels as `project`, their Jacobian (..., 2, 3), px per length, and the mask."""
         xy, inverse_depth, visible = self._normalised(points_world)
         y, D = xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))
         if self.lens:
@@ -61,14 +61,14 @@ class PinholeCamera(CentralCamera):
         return y, J, visible
 
     def rays(self, y: Floats) -> Rays:
-        """Lines of sight of pixels (M, 2)."""
+        """Return lines of sight of pixels (M, 2)."""
         K = self.camera_matrix
-        # cv2 ignores skew, so that the camera matrix is taken off before
-        distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
-        xy = distorted
+        # cv2 ignores skew, so the camera matrix is removed before
+        xy = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
         if self.lens is not None and len(y):  # OpenCV has no empty arrays
-            given = distorted.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
-            xy = np.asarray(cv2.undistortPoints(*given, criteria=_UNDONE).reshape(-1, 2), float)
+            arguments = xy.reshape(-1, 1, 2), np.eye(3), self.lens.coefficients
+            points = cv2.undistortPoints(*arguments, criteria=_UNDISTORT_CRITERIA)
+            xy = np.asarray(points.reshape(-1, 2), float)
         return self._rays_along(np.column_stack([xy, np.ones(len(xy))]), y)
 
     def _normalised(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:

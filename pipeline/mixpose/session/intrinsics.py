@@ -1,4 +1,4 @@
-"""What calibrations have in them, wherever it was read: matrix, distortion, size and motion."""
+"""Read the parts of a calibration, in any format: matrix, distortion, image size and motion."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
-from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 from mixpose.session.motion import rigid, rotation_of_vector
-from mixpose.session.values import MATRIX_FORM, numbers, resolution
+from mixpose.session.values import MATRIX_FORM, numbers, read_resolution
 
 CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 
 DISTORTION_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
 
-# Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
+# Names of Kalibr (radtan, equidistant) and ROS (the others); all have OpenCV's coefficients.
 MODELS: dict[str, CameraModel] = {
     "radtan": "pinhole",
     "plumb_bob": "pinhole",
@@ -28,32 +28,32 @@ MODELS: dict[str, CameraModel] = {
     "fisheye": "fisheye",
 }
 
-# No camera is near these; beyond them the squares of directions are no numbers.
+# No real camera is near these limits; beyond them squares of directions overflow.
 SHORTEST_FOCAL_PX, LONGEST_FOCAL_PX = 1e-3, 1e9
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What a calibration says about a camera."""
+    """The intrinsic parameters of a camera in a calibration."""
 
     camera_matrix: Floats  # (3, 3)
     distortion: Floats  # (k,), OpenCV's order; empty for none
-    resolution: tuple[int, int] | None = None  # width and height, px; None where it is not said
-    model: CameraModel | None = None  # the kind of camera; None where the calibration does not say
+    resolution: tuple[int, int] | None = None  # width and height, px; None: not stated
+    model: CameraModel | None = None  # the kind of camera; None: not stated
 
 
-def camera_matrix(value: Any) -> Floats:
-    """Read a camera matrix, three rows or nine numbers, and see that it can be one."""
+def read_camera_matrix(value: Any) -> Floats:
+    """Read a camera matrix, three rows or nine numbers; raise BadKeyError if it cannot be one."""
     if isinstance(value, list) and len(value) == 9:
         K = numbers(value, (9,), f"nine numbers, {MATRIX_FORM} row by row").reshape(3, 3)
     else:
         K = numbers(value, (3, 3), MATRIX_FORM)
     if not np.allclose(K[2], [0, 0, 1], rtol=0, atol=1e-9) or K[1, 0] != 0:
-        turned = np.allclose(K[:, 2], [0, 0, 1], rtol=0, atol=1e-9)
-        hint = "; transpose it" if turned and not np.allclose(K[2, :2], 0) else ""
-        raise BadKeyError(found(K.tolist(), MATRIX_FORM) + hint)
+        is_transposed = np.allclose(K[:, 2], [0, 0, 1], rtol=0, atol=1e-9)
+        hint = "; transpose it" if is_transposed and not np.allclose(K[2, :2], 0) else ""
+        raise BadKeyError(mismatch(K.tolist(), MATRIX_FORM) + hint)
     if K[0, 1] != 0 and K[0, 2] == 0:
-        raise BadKeyError(found(K.tolist(), MATRIX_FORM) + "; cx comes third")
+        raise BadKeyError(mismatch(K.tolist(), MATRIX_FORM) + "; cx comes third")
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not SHORTEST_FOCAL_PX <= focal <= LONGEST_FOCAL_PX:
             raise BadKeyError(
@@ -63,8 +63,8 @@ def camera_matrix(value: Any) -> Floats:
     return K
 
 
-def distortion(value: Any, model: str) -> Floats:
-    """Read as many coefficients as the model may have: a list, or a matrix of one row or column."""
+def read_distortion(value: Any, model: str) -> Floats:
+    """Read distortion coefficients of a model: a list, or a matrix of one row or column."""
     is_row = isinstance(value, list) and len(value) == 1 and isinstance(value[0], list)
     flat = value[0] if is_row else column_as_list(value)
     if flat is None or flat == []:
@@ -78,14 +78,14 @@ def distortion(value: Any, model: str) -> Floats:
 
 
 def column_as_list(value: Any) -> Any:
-    """The numbers of a matrix of one column; anything else as it is."""
+    """Return the numbers of a matrix of one column as a list; other values unchanged."""
     if isinstance(value, list) and all(isinstance(row, list) and len(row) == 1 for row in value):
         return [row[0] for row in value]
     return value
 
 
 def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floats:
-    """A rigid motion (4, 4) of a rotation matrix or vector and a translation, as lists."""
+    """Return the rigid motion (4, 4) of lists: a rotation matrix or vector, and a translation."""
     with under("translation"):
         t = numbers(column_as_list(translation), (3,), "[x, y, z]")
     rotation = column_as_list(rotation)
@@ -101,30 +101,30 @@ def motion_of(rotation: Any, translation: Any, *, key: str = "rotation") -> Floa
 
 
 def model_of_distortion(name: object) -> CameraModel | None:
-    """The camera model that a distortion model of Kalibr or ROS belongs to."""
-    if name is None or name == "":  # as ROS writes for a camera without distortion
+    """Return the camera model of a distortion model of Kalibr or ROS; None if it is not stated."""
+    if name is None or name == "":  # ROS writes "" for a camera without distortion
         return None
     if isinstance(name, str) and name in MODELS:
         return MODELS[name]
-    raise BadKeyError(found(name, one_of(MODELS)))
+    raise BadKeyError(mismatch(name, one_of(MODELS)))
 
 
-def present(content: dict[str, Any], key: str) -> Any:
-    """A key without which a camera would silently count as free of distortion."""
+def required(content: dict[str, Any], key: str) -> Any:
+    """Return the value of a key; raise BadKeyError if it is missing, never assume no distortion."""
     if key not in content:
         raise BadKeyError(f"missing; keys in the file: {', '.join(map(str, content))[:80]}")
     return content[key]
 
 
-def plain(value: Any) -> Any:
-    """Turn text such as 1e-05, which YAML does not take for a number, into numbers."""
+def with_numbers(value: Any) -> Any:
+    """Return a value with text such as 1e-05, which YAML reads as text, converted to numbers."""
     if isinstance(value, list):
-        return [plain(item) for item in value]
+        return [with_numbers(item) for item in value]
     with suppress(ValueError):
         return float(value) if isinstance(value, str) else value
     return value
 
 
 def size_of(value: Any) -> tuple[int, int] | None:
-    """Width and height; None where they are missing or, as some drivers write, zero."""
-    return None if value in (None, [0, 0]) else resolution(value)
+    """Return width and height; None if they are missing or, as some drivers write, zero."""
+    return None if value in (None, [0, 0]) else read_resolution(value)

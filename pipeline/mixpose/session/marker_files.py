@@ -1,11 +1,11 @@
-"""Marker tables, ``name,x,y,z`` and optionally the spread of each marker; bodies of other systems.
+"""Read marker tables, ``name,x,y,z`` and optionally spreads of markers, and other systems' bodies.
 
 NDI's .rom (SROM): a binary file of 752 bytes with up to 20 markers, in mm. Little-endian: "NDI", a
 checksum at byte 4 (the sum of all bytes after it), the number of markers at byte 28, positions as
 three float32 each from byte 72.
 Vicon's .vsk: XML in which positions of markers name parameters, in mm; a rigid body is one segment.
-AsterTrack's .obj: a mesh in metres. Each face of a group whose name has "marker" in it, or of a
-file without groups, is a flat marker: at the middle of the face, looking along its normal.
+AsterTrack's .obj: a mesh in metres. Each face of a group whose name contains "marker", or of a file
+without groups, is a flat marker at the centre of the face, with the normal of the face.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.session.messages import BadKeyError, found, in_file, under
+from mixpose.session.messages import BadKeyError, in_file, mismatch, under
 from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.values import as_number, is_number
 from mixpose.units import Unit, length_ratio
@@ -35,15 +35,15 @@ _MOST_NDI = 20
 _VICON_TARGET = "TargetLocalPointToWorldPoint"
 _HEADER = ["name", "x", "y", "z"]
 _SIGMA_COLUMNS = (0, 1, 3, 9)
-# of a table that `mixpose learn` wrote: how well markers are known, for people
+# columns of `mixpose learn` for the user, not used here: how well markers are known
 LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
 
 
 def read_marker_file(path: Path, unit: Unit) -> Markers:
-    """Read a table of markers, whose lengths are in `unit`, or the body of another program."""
+    """Read a table of markers in `unit`, or the body of another program, converted to `unit`."""
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml", ".json", ".xml", ".stl"):
-        raise BadKeyError(found(path.name, _ALLOWED))
+        raise BadKeyError(mismatch(path.name, _ALLOWED))
     content = read_bytes(path)
     if suffix not in READERS:
         with in_file(path.name):
@@ -55,12 +55,12 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
         markers = read(content)
         for number in markers.points.ravel().tolist():
             if not is_number(number):
-                raise BadKeyError(found(number, "finite coordinates of markers"))
+                raise BadKeyError(mismatch(number, "finite coordinates of markers"))
     return replace(markers, points=markers.points * length_ratio(stated, unit))
 
 
 def read_rom(content: bytes) -> Markers:
-    """Read the markers of an NDI tool; BadKeyError if the file is none or damaged."""
+    """Read the markers of an NDI tool; raise BadKeyError if the file is no .rom or damaged."""
     if not content.startswith(NDI_MARK):
         raise BadKeyError('not an NDI .rom file, which begins with "NDI"')
     if len(content) < _POSITIONS + 12 * _MOST_NDI:
@@ -76,7 +76,7 @@ def read_rom(content: bytes) -> Markers:
 
 
 def read_vsk(content: bytes) -> Markers:
-    """Read the markers of a Vicon subject; BadKeyError if the file is not that of a rigid body."""
+    """Read the markers of a Vicon subject; raise BadKeyError if it is not a rigid body."""
     text = as_text(content)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise BadKeyError("found a DOCTYPE or ENTITY, which a .vsk file does not have")
@@ -85,8 +85,8 @@ def read_vsk(content: bytes) -> Markers:
     except ET.ParseError as error:
         raise BadKeyError(f"not XML: {error}") from error
     if root.tag != "KinematicModel":
-        raise BadKeyError(found(f"<{root.tag}>", "<KinematicModel>, as a Vicon .vsk begins"))
-    parameters = {each.get("NAME", ""): each.get("VALUE", "") for each in root.iter("Parameter")}
+        raise BadKeyError(mismatch(f"<{root.tag}>", "<KinematicModel>, as a Vicon .vsk begins"))
+    parameters = {p.get("NAME", ""): p.get("VALUE", "") for p in root.iter("Parameter")}
     targets = list(root.iter(_VICON_TARGET))
     segments = {target.get("SEGMENT") for target in targets}
     if len(segments) > 1:
@@ -104,7 +104,7 @@ def read_vsk(content: bytes) -> Markers:
 
 
 def _position(text: str, parameters: dict[str, str]) -> list[float]:
-    """Three numbers, or three names of parameters in quotes."""
+    """Return the three coordinates that numbers, or names of parameters in quotes, stand for."""
     values = []
     for word in text.split():
         name = word.strip("'\"")
@@ -113,14 +113,14 @@ def _position(text: str, parameters: dict[str, str]) -> list[float]:
         try:
             values.append(float(parameters.get(name, name)))
         except ValueError as error:
-            raise BadKeyError(found(parameters.get(name, name), "a number")) from error
+            raise BadKeyError(mismatch(parameters.get(name, name), "a number")) from error
     if len(values) != 3:
-        raise BadKeyError(found(text, "POSITION with three coordinates"))
+        raise BadKeyError(mismatch(text, "POSITION with three coordinates"))
     return values
 
 
 def read_astertrack(content: bytes) -> Markers:
-    """Read the flat markers of an AsterTrack target. Raises BadKeyError naming the line."""
+    """Read the flat markers of an AsterTrack target; raise BadKeyError that names the line."""
     vertices: list[list[float]] = []
     faces: list[tuple[str, int, list[int]]] = []
     group = ""
@@ -129,7 +129,7 @@ def read_astertrack(content: bytes) -> Markers:
         if word == "v":
             vertices.append([as_number(cell) for cell in cells[:3]])
             if len(vertices[-1]) != 3 or not all(map(is_number, vertices[-1])):
-                raise BadKeyError(f"line {number}: {found(' '.join(cells), 'v x y z')}")
+                raise BadKeyError(f"line {number}: {mismatch(' '.join(cells), 'v x y z')}")
         elif word in ("g", "o"):
             group = " ".join(cells)
         elif word == "f":
@@ -143,8 +143,8 @@ def read_astertrack(content: bytes) -> Markers:
             f"found the groups {', '.join(groups)[:60]}; allowed: markers in groups whose name "
             'has "Marker" in it'
         )
-    found_faces = [face for face in faces if not of_markers or face[0] in of_markers]
-    placed = [_centre_and_normal(np.array(vertices), *face[1:]) for face in found_faces]
+    marker_faces = [face for face in faces if not of_markers or face[0] in of_markers]
+    placed = [_centre_and_normal(np.array(vertices), *face[1:]) for face in marker_faces]
     points, normals = (np.array(part) for part in zip(*placed, strict=True))
     names = tuple(str(k + 1) for k in range(len(points)))
     return Markers(points, None, names, normals)
@@ -156,7 +156,8 @@ def _corners(cells: list[str], line: int) -> list[int]:
     except ValueError:
         corners = []
     if len(corners) < 3:
-        raise BadKeyError(f"line {line}: {found(' '.join(cells), 'f and three corners or more')}")
+        text = mismatch(" ".join(cells), "f and three corners or more")
+        raise BadKeyError(f"line {line}: {text}")
     return corners
 
 
@@ -166,12 +167,12 @@ def _centre_and_normal(vertices: Floats, line: int, corners: list[int]) -> tuple
     if not all(0 <= place < count for place in places):
         raise BadKeyError(f"line {line}: names a vertex that is not there; the file has {count}")
     ring = vertices[places]
-    # twice the area of the face along its normal, by the corners' order
-    across = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
-    length = np.linalg.norm(across)
+    # the normal by the order of the corners, as long as twice the area of the face
+    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
+    length = np.linalg.norm(normal)
     if not length > 0:
         raise BadKeyError(f"line {line}: found a face without area")
-    return ring.mean(axis=0), np.asarray(across / length)
+    return ring.mean(axis=0), np.asarray(normal / length)
 
 
 READERS: dict[str, tuple[Callable[[bytes], Markers], Unit]] = {
@@ -179,24 +180,24 @@ READERS: dict[str, tuple[Callable[[bytes], Markers], Unit]] = {
     ".vsk": (read_vsk, "mm"),
     ".obj": (read_astertrack, "m"),
 }
-"""By ending: what reads a file, and the unit that its format fixes."""
+"""Reader and unit of each format, by the ending of its files."""
 
 
 @dataclass(frozen=True)
 class Markers:
-    """What a marker table holds."""
+    """The contents of a marker table."""
 
     points: Floats  # (N, 3)
-    sigma: list[Any] | None  # of each, as the key ``sigma`` has it; None without such columns
-    names: tuple[str, ...] = ()  # of the markers, where the file has names
-    normals: Floats | None = None  # (N, 3), outward, of flat markers, where the file has them
+    sigma: list[Any] | None  # one per marker, as in the key ``sigma``; None without such columns
+    names: tuple[str, ...] = ()  # of the markers, if the file has names
+    normals: Floats | None = None  # (N, 3), outward, if the file has flat markers
 
 
 def read_markers(path: Path) -> Markers:
-    """Read a marker table, a CSV file; problems name line and column.
+    """Read a marker table, a CSV file; raise BadKeyError that names line and column.
 
-    The header ``name,x,y,z`` is followed by no column, one (σ), three (σ along x, y and z) or nine
-    (the covariance, row by row), and perhaps by `LEARNT_COLUMNS`.
+    After ``name,x,y,z`` the header has no column, one (σ), three (σ along x, y and z) or nine (the
+    covariance, row by row), and may end with `LEARNT_COLUMNS`.
     """
     content = read_bytes(path)
     with in_file(path.name):
@@ -210,10 +211,8 @@ def read_markers(path: Path) -> Markers:
         header = [cell.strip() for cell in rows[0][1]]
         words = [name.lower() for name in header]
         if words[:4] != _HEADER or len(words) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
-            raise BadKeyError(
-                f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
-                "columns of sigma"
-            )
+            text = mismatch(",".join(header), "name,x,y,z and then no, one, three or nine")
+            raise BadKeyError(f"line 1: {text} columns of sigma")
         if len(rows) == 1:
             raise BadKeyError("found no markers below the header")
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
@@ -225,12 +224,12 @@ def read_markers(path: Path) -> Markers:
 
 
 def _learnt(header: list[str]) -> int:
-    """How many columns at the end are those of a body that was learnt."""
+    """Return the number of `LEARNT_COLUMNS` at the end of a header: all or none."""
     return len(LEARNT_COLUMNS) if tuple(header[-len(LEARNT_COLUMNS) :]) == LEARNT_COLUMNS else 0
 
 
 def _names_of(cells: list[tuple[int, str]]) -> tuple[str, ...]:
-    """Names of markers, of cells with their lines; no two the same."""
+    """Return the names in cells with line numbers; raise BadKeyError if two are the same."""
     lines: dict[str, int] = {}
     for line, cell in cells:
         name = " ".join(cell.split())
@@ -250,7 +249,7 @@ def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:
         value = as_number(cell)
         if not is_number(value):
             raise BadKeyError(
-                f"line {line}, column {column}: {found(cell.strip(), 'a finite number')}"
+                f"line {line}, column {column}: {mismatch(cell.strip(), 'a finite number')}"
             )
         values.append(value)
     return values

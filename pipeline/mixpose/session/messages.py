@@ -1,4 +1,4 @@
-"""From a wrong value to one line: which file, which key, what was found, what is allowed."""
+"""Messages about wrong values: one line with file, key, what was found and what is allowed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Key = tuple[str | int, ...]
 
 
 class BadKeyError(ValueError):
-    """What is wrong with one key: all that readers raise here, before the file's name is known.
+    """The problem of one key; all readers of this package raise it before the file is known.
 
-    A ValueError, which pydantic collects. `text` says what was found and what is allowed; `key`
-    leads to the value from where the problem was noticed, list items by number, from 0.
+    A ValueError, which pydantic collects. `text` says what was found and what is allowed; `key` is
+    the path to the value from where the problem was noticed, list items by number, from 0.
     """
 
     def __init__(self, text: str, *key: str | int) -> None:
@@ -29,7 +29,7 @@ class BadKeyError(ValueError):
 
 @contextmanager
 def under(*key: str | int) -> Iterator[None]:
-    """Put a table's own key before the key of every problem noticed inside."""
+    """Prepend the key of a table to the key of every problem raised inside."""
     try:
         yield
     except BadKeyError as problem:
@@ -38,7 +38,7 @@ def under(*key: str | int) -> Iterator[None]:
 
 @contextmanager
 def in_file(name: str) -> Iterator[None]:
-    """Name the file that a problem was noticed in, where that is not the session file."""
+    """Prepend the name of a file, other than the session file, to problems raised inside."""
     try:
         yield
     except BadKeyError as problem:
@@ -46,13 +46,13 @@ def in_file(name: str) -> Iterator[None]:
         raise BadKeyError(f"{name}: {where}{problem.text}") from problem
 
 
-def found(value: object, allowed: str) -> str:
-    """Say what stands there and what may."""
+def mismatch(value: object, allowed: str) -> str:
+    """Return the text of a message: the value that was found and what is allowed."""
     return f"found {show(value)}; allowed: {allowed}"
 
 
 def show(value: object) -> str:
-    """Write a value as in the file, on one line and shortened."""
+    """Return a value as TOML on one line, shortened if it is long."""
     text = _toml(value)
     if len(text) > _LONGEST:
         size = f" ({len(value)} items)" if isinstance(value, list) else ""
@@ -75,10 +75,10 @@ def _toml(value: object) -> str:
 
 
 def dotted(key: Key, named: Iterable[object] = ()) -> str:
-    """Write a key as ``sensor["left"].T_sensor_world[2]``.
+    """Return a key as text, such as ``sensor["left"].T_sensor_world[2]``.
 
-    `named` are the names of the session's sensors, or bodies, whichever the key is of; one that is
-    unique text stands in place of the number.
+    `named` are the names of the sensors or bodies that the key counts; a name replaces the number
+    if it is a text and unique.
     """
     names = list(named)
     text = ""
@@ -94,33 +94,33 @@ def dotted(key: Key, named: Iterable[object] = ()) -> str:
 
 
 def nearest(word: str, known: Iterable[str], *, cutoff: float = CLOSE) -> str | None:
-    """The known word that another is most likely a misspelling of, whatever its case."""
+    """Return the known word that `word` most likely misspells, whatever its case; None if none."""
     by_lower = {k.lower(): k for k in known}
-    close = get_close_matches(word.lower(), by_lower, n=1, cutoff=cutoff)
-    return by_lower[close[0]] if close else None
+    matches = get_close_matches(word.lower(), by_lower, n=1, cutoff=cutoff)
+    return by_lower[matches[0]] if matches else None
 
 
 def one_of(words: Iterable[str]) -> str:
-    """List the words that are allowed."""
+    """Return words in quotes, separated by commas."""
     return ", ".join(f'"{word}"' for word in words)
 
 
 def did_you_mean(value: object, words: Iterable[str]) -> str:
-    """Hint at the nearest allowed word; empty when none is near."""
+    """Return a hint at the nearest of the allowed words; empty if none is near."""
     close = nearest(value, words) if isinstance(value, str) else None
     return f'; did you mean "{close}"?' if close else ""
 
 
 def one_line(file: object, key: Key, text: str, session: Any = None) -> str:
-    """Put a message about a key of a file together, on a single line.
+    """Return the whole message about a key of a file, on a single line.
 
-    `session` is the file as parsed, to call sensors and bodies by their names.
+    `session` is the parsed file, from which the message takes names of sensors and bodies.
     """
     first = key[0] if key else None
-    found = session.get(first) if isinstance(session, dict) else None
-    if first == "object" and not isinstance(found, list):
-        key = (first, *key[2:])  # the only one has no number
-    tables = found if isinstance(found, list) and first in ("sensor", "object") else []
+    entry = session.get(first) if isinstance(session, dict) else None
+    if first == "object" and not isinstance(entry, list):
+        key = (first, *key[2:])  # a single body has no number
+    tables = entry if isinstance(entry, list) and first in ("sensor", "object") else []
     names = [table.get("name") if isinstance(table, dict) else None for table in tables]
     where = f"{dotted(key, names)}: " if key else ""
     return " ".join(f"{file}: {where}{text}".split())

@@ -1,4 +1,4 @@
-"""Rigid motions as a session file writes them: a matrix, or a rotation with a translation."""
+"""Read rigid motions of a session file: a matrix, or a rotation and a translation."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from mixpose.session.messages import BadKeyError, one_of
 from mixpose.session.schema_sensors import Placement
 
 ROUNDING = 2e-4  # a rotation of four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4
-_QUATERNION_LENGTH = 2e-3  # scaling one leaves its rotation as it is: three decimals will do
+_QUATERNION_LENGTH = 2e-3  # three decimals suffice, as the length does not change the rotation
 _ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
 
 
 def read_motion(table: Placement, matrix_key: str) -> Floats | None:
-    """Read the one form of a rigid motion (4, 4) that a table holds, made exactly rigid, or None.
+    """Read the rigid motion (4, 4) in a table, made exactly rigid; None if there is none.
 
-    `matrix_key` is that of the 4x4 form: "T_world_object" or "T_sensor_world". Two forms, half a
-    form, and a matrix that is no rigid motion are refused.
+    `matrix_key` is the key of the 4x4 form: "T_world_object" or "T_sensor_world". Raises
+    BadKeyError for two forms, an incomplete form, and a matrix that is no rigid motion.
     """
-    known = [key for key in _ROTATIONS if key in type(table).model_fields]
-    rotations = [key for key in known if getattr(table, key) is not None]
+    possible = [key for key in _ROTATIONS if key in type(table).model_fields]
+    rotations = [key for key in possible if getattr(table, key) is not None]
     matrix = getattr(table, matrix_key)
-    given = [matrix_key] * (matrix is not None) + rotations
-    if len(given) > 1:
-        raise BadKeyError(f"stands beside {given[0]}; allowed: one of the two", given[1])
+    forms = [matrix_key] * (matrix is not None) + rotations
+    if len(forms) > 1:
+        raise BadKeyError(f"stands beside {forms[0]}; allowed: one of the two", forms[1])
     if matrix is not None:
         if table.translation is not None:
             raise BadKeyError(f"stands beside {matrix_key}, which holds one too", "translation")
@@ -34,7 +34,7 @@ def read_motion(table: Placement, matrix_key: str) -> Floats | None:
     if not rotations:
         if table.translation is not None:
             raise BadKeyError(
-                f"stands without a rotation; add one of {one_of(known)}", "translation"
+                f"stands without a rotation; add one of {one_of(possible)}", "translation"
             )
         return None
     if table.translation is None:
@@ -44,7 +44,7 @@ def read_motion(table: Placement, matrix_key: str) -> Floats | None:
 
 
 def rigid(matrix: Floats, key: str) -> Floats:
-    """Rid a 4x4 matrix of rounding errors, or say why it is no rigid motion."""
+    """Return a matrix (4, 4) without rounding errors; raise BadKeyError if it is not rigid."""
     if is_rigid(matrix, ROUNDING):
         return nearest_rigid(matrix)
     R = matrix[:3, :3]
@@ -63,7 +63,7 @@ def rigid(matrix: Floats, key: str) -> Floats:
 
 
 def rotation_of_vector(values: Floats, key: str) -> Rotation:
-    """The rotation of a vector (3,), refused where it must be in degrees."""
+    """Return the rotation of a vector (3,); refuse one that is so long that it is in degrees."""
     angle = float(np.linalg.norm(values))
     if angle > 2 * np.pi:
         raise BadKeyError(
@@ -78,7 +78,7 @@ def _rotation(key: str, values: Floats) -> Rotation:
     if key == "rotation_vector":
         return rotation_of_vector(values, key)
     if key == "euler_xyz_deg":
-        # about the fixed axes, x first, as the paper's R3 R2 R1
+        # turns about the fixed axes, x first: the paper's R3 R2 R1
         return Rotation.from_euler("xyz", values, degrees=True)
     length = float(np.linalg.norm(values))
     if abs(length - 1) > _QUATERNION_LENGTH:

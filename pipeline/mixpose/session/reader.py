@@ -1,4 +1,4 @@
-"""Reading a session file."""
+"""Read a session file."""
 
 from __future__ import annotations
 
@@ -21,48 +21,48 @@ from mixpose.session.setup import ObjectSetup, Session, Start
 from mixpose.session.text_files import as_text, parse_toml, read_bytes
 from mixpose.session.validation import validate
 
-_LISTED = 5  # files that are named
-_STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
+_LISTED = 5  # session files that a message names
+_PLACEHOLDER = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
 
 
 def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
-    """Read what a session file says of sensors and recordings, whatever it says of bodies.
+    """Read the sensors and recordings of a session file, and ignore its bodies.
 
-    As `load_session`, but that `[start]` and `[estimator]` do not count, and the body is a
-    stand-in: `[object]` may be missing, or name a file that is still to be made.
+    As `load_session`, but `[start]` and `[estimator]` are ignored, and the body is a placeholder:
+    `[object]` may be missing, or name a file that does not exist yet.
     """
-    return _loaded(Path(path), allow_code=allow_code, bodies=False)
+    return _load(Path(path), allow_code=allow_code, bodies=False)
 
 
 def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read a session file, a TOML file, and the calibration and marker files that it names.
 
     Recordings are not opened. Lengths are in the session's unit, rigid motions exactly rigid.
-    `allow_code` says whether functions that the file names (``method = "module:function"``) may be
-    run when features are extracted; reading a session runs none.
+    `allow_code` permits functions that the file names (``method = "module:function"``) to be run
+    when features are extracted; reading a session runs none.
 
     Raises SessionError if a file is missing or anything in it is wrong: one line with the file, the
     key, what was found and what is allowed.
     """
-    return _loaded(Path(path), allow_code=allow_code, bodies=True)
+    return _load(Path(path), allow_code=allow_code, bodies=True)
 
 
 def _no_such_file(path: Path) -> str:
-    """In words, with what else is in its folder."""
-    others = sorted(other.name for other in path.parent.glob("*.toml"))
-    more = f" and {len(others) - _LISTED} more" if len(others) > _LISTED else ""
-    found = f"{', '.join(others[:_LISTED])}{more}" if others else "no .toml file"
-    return f"{path}: no such file; in {path.parent} there is {found}"
+    """Return the message about a missing session file, with the session files in its folder."""
+    names = sorted(other.name for other in path.parent.glob("*.toml"))
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    listed = f"{', '.join(names[:_LISTED])}{more}" if names else "no .toml file"
+    return f"{path}: no such file; in {path.parent} there is {listed}"
 
 
-def _loaded(path: Path, *, allow_code: bool, bodies: bool) -> Session:
+def _load(path: Path, *, allow_code: bool, bodies: bool) -> Session:
     data: dict[str, Any] = {}
     try:
         content = read_bytes(path)
         data = parse_toml(as_text(content))
         if not bodies:
-            rest = {key: one for key, one in data.items() if key not in ("start", "estimator")}
-            data = {**rest, "object": _STAND_IN}
+            data = {k: v for k, v in data.items() if k not in ("start", "estimator")}
+            data["object"] = _PLACEHOLDER
         session = _build(path, hashlib.sha256(content).hexdigest(), data)
         return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
@@ -78,10 +78,10 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
     objects = _objects(table, path.parent)
     with under("estimator"):
         estimator = _estimator(table.estimator, objects)
-    for one in objects:  # all samples are to fit into memory
-        if not one.body.is_exact and len(one.body) * estimator.samples > MOST_SAMPLES:
+    for body in [setup.body for setup in objects]:  # all samples must fit into memory
+        if not body.is_exact and len(body) * estimator.samples > MOST_SAMPLES:
             raise BadKeyError(
-                f"found {estimator.samples} for {len(one.body)} features of {one.body.name}; "
+                f"found {estimator.samples} for {len(body)} features of {body.name}; "
                 f"allowed: {MOST_SAMPLES} together",
                 "estimator",
                 "samples",
@@ -95,12 +95,12 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
         estimator=estimator,
         sensors=build_sensors(table.sensor, table.extract, path.parent, table.unit),
         count=objects[0].count,
-        others=objects[1:],
+        other_objects=objects[1:],
     )
 
 
 def _objects(table: SessionTable, folder: Path) -> tuple[ObjectSetup, ...]:
-    """All bodies, no two of a name."""
+    """Build all bodies; raise BadKeyError if two have the same name."""
     if table.start is not None and len(table.object) > 1:
         raise BadKeyError(
             f"found one for {len(table.object)} bodies; allowed: [object.start] below each "
@@ -108,23 +108,23 @@ def _objects(table: SessionTable, folder: Path) -> tuple[ObjectSetup, ...]:
             "start",
         )
     objects: list[ObjectSetup] = []
-    for k, each in enumerate(table.object):
+    for k, entry in enumerate(table.object):
         with under("object", k):
-            if table.start is not None and each.start is not None:
+            if table.start is not None and entry.start is not None:
                 raise BadKeyError("stands beside [start]; allowed: one of the two", "start")
-            body = build_body(each, folder, table.unit)
+            body = build_body(entry, folder, table.unit)
             with under("start"):
-                start = _start(each.start)
-            new = ObjectSetup(body, start, each.count)
-            known = {label for one in objects for label in (one.body.name, *one.labels)}
-            twins = known & {body.name, *new.labels}
-            if twins:
+                start = _start(entry.start)
+            added = ObjectSetup(body, start, entry.count)
+            taken = {name for setup in objects for name in (setup.body.name, *setup.labels)}
+            repeated = taken & {body.name, *added.labels}
+            if repeated:
                 raise BadKeyError(
-                    f'found "{body.name}", and {sorted(twins)[0]!r} is the name of another one; '
+                    f'found "{body.name}", and {sorted(repeated)[0]!r} is the name of another one; '
                     "allowed: a name of its own for each body, and count for identical ones",
                     "name",
                 )
-            objects.append(new)
+            objects.append(added)
     if table.start is not None:
         with under("start"):
             objects[0] = replace(objects[0], start=_start(table.start))
@@ -146,7 +146,7 @@ def _start(table: StartTable | None) -> Start | None:
 
 def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> EstimatorOptions:
     held = [name for name in TWIST_NAMES if name not in table.free]
-    if held and any(one.start is None for one in objects):
+    if held and any(setup.start is None for setup in objects):
         raise BadKeyError(
             f"leaves out {one_of(held)}, which are held where [start] has them, and there is no "
             "[start]; add one with the pose they are held at, or leave free out to estimate all",

@@ -1,4 +1,4 @@
-"""A session file with other values: comments, and keys that are not changed, stay as they are."""
+"""Change values in a session file; its comments and all other keys stay unchanged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.setup import Session
 
-ALL_DIGITS = 17  # of float64
+ALL_DIGITS = 17  # significant digits that determine a float64
 Role: TypeAlias = Literal["source", "times", "file"]
 _BOM = "\ufeff"
 _MOTION = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation")
@@ -25,14 +25,14 @@ _BARE_END = re.compile(r"(?<!\r)\n")
 
 
 def document_of(session: Session, target: Path) -> Any:
-    """The TOML document of a session, with paths as they are from where it will be written."""
-    document = tomlkit.parse(_written(session).removeprefix(_BOM))
-    _lead_back(document, session.folder, target.parent)
+    """Return the TOML document of a session, with paths relative to the folder of `target`."""
+    document = tomlkit.parse(_text(session).removeprefix(_BOM))
+    _redirect_paths(document, session.folder, target.parent)
     return document
 
 
 def refuse_lost_code(session: Session, target: Path) -> None:
-    """Raise a SessionError where functions of the session's own are not found from a target."""
+    """Raise a SessionError if modules beside the session are missing beside `target`."""
     for setup in session.sensors:
         module, colon, _ = setup.extract.method.partition(":")
         name = module.partition(".")[0]
@@ -49,68 +49,68 @@ def _has_module(folder: Path, name: str) -> bool:
 
 
 def text_of(document: Any, session: Session, head: str = "") -> str:
-    """The text of a TOML document below a head; byte order mark and ends of lines stay."""
-    written, text = _written(session), head + str(tomlkit.dumps(document))
-    if "\r\n" in written and not _BARE_END.search(written):
+    """Return the text of a document below `head`, with the session's BOM and line ends."""
+    original, text = _text(session), head + str(tomlkit.dumps(document))
+    if "\r\n" in original and not _BARE_END.search(original):
         text = _BARE_END.sub("\r\n", text)
-    return _BOM + text if written.startswith(_BOM) else text
+    return _BOM + text if original.startswith(_BOM) else text
 
 
-def _written(session: Session) -> str:
-    """The text of the session file, with a byte order mark and line ends as they are."""
+def _text(session: Session) -> str:
+    """Return the text of the session file with its byte order mark and line ends."""
     return session.path.read_bytes().decode("utf-8")
 
 
 def objects_of(document: Any) -> Iterator[Any]:
-    """The table of each body."""
+    """Yield the table of each body."""
     objects = document["object"]
     yield from objects if isinstance(objects, list) else [objects]
 
 
-def put(table: Any, key: str, value: Any, said: str | None = None) -> None:
-    """Set a key of a table, with a comment behind it."""
+def put(table: Any, key: str, value: Any, note: str | None = None) -> None:
+    """Set a key of a table, with a note as a comment after its value."""
     item = tomlkit.item(value)
-    if said:
-        item.comment(said)
+    if note:
+        item.comment(note)
     table[key] = item
 
 
-def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits: int = 10) -> None:
-    """Set a rigid motion (4, 4), in place of what says it otherwise."""
-    for other in _MOTION:
-        table.pop(other, None)
-    put(table, key, plain(T, digits), said)
+def put_motion(table: Any, key: str, T: Floats, note: str | None = None, digits: int = 10) -> None:
+    """Set a rigid motion (4, 4), in place of its other forms."""
+    for form in _MOTION:
+        table.pop(form, None)
+    put(table, key, rounded(T, digits), note)
 
 
 def put_starts(document: Any, session: Session, T_new_old: Floats, scale: float = 1.0) -> None:
-    """Where bodies are at first, in another frame of a world whose lengths were scaled before."""
-    for table, one in zip(objects_of(document), session.objects, strict=True):
-        home = document if "start" in document else table
-        if one.start is None or "start" not in home:
+    """Set the starts of bodies, scaled and then moved to another frame of the world."""
+    for table, setup in zip(objects_of(document), session.objects, strict=True):
+        parent = document if "start" in document else table
+        if setup.start is None or "start" not in parent:
             continue
-        T = one.start.T_world_object.copy()
+        T = setup.start.T_world_object.copy()
         T[:3, 3] *= scale
-        told = home["start"].unwrap()
+        old = parent["start"].unwrap()
         try:
-            put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
-        except (IndexError, NonExistentKey):  # of keys as start.translation none can be taken out
-            del home["start"]
-            home["start"] = {key: told[key] for key in told.keys() - {*_MOTION, "T_world_object"}}
-            put_motion(home["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
-        if scale != 1 and one.start.distance is not None:
-            put(home["start"], "distance", plain(scale * one.start.distance))
+            put_motion(parent["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        except (IndexError, NonExistentKey):  # dotted keys as start.translation cannot be removed
+            del parent["start"]
+            parent["start"] = {key: old[key] for key in old.keys() - {*_MOTION, "T_world_object"}}
+            put_motion(parent["start"], "T_world_object", T_new_old @ T, digits=ALL_DIGITS)
+        if scale != 1 and setup.start.distance is not None:
+            put(parent["start"], "distance", rounded(scale * setup.start.distance))
 
 
 def put_gravity(document: Any, session: Session, T_new_old: Floats) -> None:
-    """Where gravity points, in another frame of the world."""
-    for table, one in zip(objects_of(document), session.objects, strict=True):
-        if one.body.gravity is not None:
-            direction = T_new_old[:3, :3] @ one.body.gravity.direction
-            put(table["gravity"], "direction", plain(direction, ALL_DIGITS))
+    """Set the directions of gravity in another frame of the world."""
+    for table, setup in zip(objects_of(document), session.objects, strict=True):
+        if setup.body.gravity is not None:
+            direction = T_new_old[:3, :3] @ setup.body.gravity.direction
+            put(table["gravity"], "direction", rounded(direction, ALL_DIGITS))
 
 
-def refuse_held(session: Session) -> None:
-    """Raise a SessionError where directions of the world are held, which is to be another one."""
+def refuse_held_directions(session: Session) -> None:
+    """Raise a SessionError if world directions are held, as these change with the world frame."""
     if len(session.estimator.free) < len(TWIST_NAMES):
         raise SessionError(
             f"{session.path}: estimator.free: found {', '.join(session.estimator.free)}, "
@@ -118,31 +118,31 @@ def refuse_held(session: Session) -> None:
         )
 
 
-def plain(values: Floats | float, digits: int = 10) -> Any:
-    """Nested lists of numbers with so many digits."""
+def rounded(values: Floats | float, digits: int = 10) -> Any:
+    """Return a number, or an array as nested lists, rounded to significant digits."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim == 0:
         return float(f"{float(array):.{digits}g}") + 0.0
-    return [plain(each, digits) for each in array]
+    return [rounded(row, digits) for row in array]
 
 
-def _lead_back(document: Any, old: Path, new: Path) -> None:
-    """Let relative paths lead from a new folder to where they led from the old one."""
+def _redirect_paths(document: Any, old: Path, new: Path) -> None:
+    """Rewrite paths relative to the folder `old` as paths relative to the folder `new`."""
     if old.resolve() == new.resolve():
         return
-    for table, key, *_ in places_of(document):
+    for table, key, *_ in paths_in(document):
         value = str(table[key])
         if not (Path(value).is_absolute() or "://" in value or value.startswith("camera:")):
             path = os.path.relpath(old.resolve() / value, new.resolve())
             table[key] = Path(path).as_posix()
 
 
-def places_of(document: Any) -> Iterator[tuple[Any, str | int, Role, str]]:
-    """Where a session file holds paths: container, key, what the path is for, and what has it."""
+def paths_in(document: Any) -> Iterator[tuple[Any, str | int, Role, str]]:
+    """Yield container, key, role and owner of each path in a session file."""
     objects = list(objects_of(document))
-    for one in objects:
-        if "file" in one:
-            yield one, "file", "file", "object" if len(objects) == 1 else one["name"]
+    for table in objects:
+        if "file" in table:
+            yield table, "file", "file", "object" if len(objects) == 1 else table["name"]
     for sensor in document["sensor"]:
         name, source, calibration = sensor["name"], sensor.get("source"), sensor.get("calibration")
         if isinstance(source, list):

@@ -1,8 +1,8 @@
-"""The tables and keys of a session file: what `docs/session.md` is made from.
+"""The tables and keys of a session file, from which `docs/session.md` is generated.
 
-The description of a key is what is allowed, and what an error message says, where its type does not
-say it; the docstring below it is what the key means, in which unit, with an example.  Both are
-written for the user.  What depends on several keys at once is checked where they are put together.
+The description of a key says what is allowed, in the reference and in error messages, if its type
+does not; the docstring below says what the key means, with unit and example.  Both are written for
+the user.  Rules about several keys are checked by the functions that use their values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mixpose.session.schema_sensors import ExtractTable, Motion, Placement, Posi
 from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED, Free, array_of
 from mixpose.units import Unit
 
-MOST_ALIKE = 1000  # identical bodies that a session may have
+MOST_ALIKE = 1000  # most identical bodies in a session
 
 
 class GravityTable(Table):
@@ -75,8 +75,8 @@ class ObjectTable(Table):
     """Features in the body's own coordinates, in `unit`, in any order.
     Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`"""
     names: list[Text] | None = Field(None, description="a list of names, one per point")
-    """What the points are called, each otherwise, where there is no `file` with names; else their
-    numbers from 1.
+    """Names of the points, all different; not together with `file`, which has names. Left out:
+    their numbers from 1.
     Example: `names = ["base", "tip", "mast"]`"""
     file: str | None = Field(
         None, min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"
@@ -102,18 +102,18 @@ class ObjectTable(Table):
     as wide; a sphere at up to 90°.
     Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`"""
     shape: Shape = "point"
-    """What the markers are: points, or spheres or flat disks of a `radius`, the centres of whose
-    images are not where their own centres are seen. Disks lie across their `normals`.
+    """Shape of the markers: points, or spheres or flat disks of a `radius`, whose centres are not
+    projected to the centres of their images. Disks are perpendicular to their `normals`.
     Example: `shape = "sphere"`"""
     radius: Any = Field(None, description=RADIUS_ALLOWED)
-    """Radius of the spheres or disks, in `unit`; what shines or is dark counts, to its edge.
+    """Radius of the spheres or disks, in `unit`, to the edge of what shines or is dark.
     Example: `radius = 7.0`"""
     spread: Spread = "gaussian"
     """Density of the displacements that `sigma` states.
     Example: `spread = "uniform"`"""
     tip: Annotated[Floats | None, array_of((3,), "a point [x, y, z] of the body")] = None
-    """A point of the body that each pose line tells in the world, as `tip`, with its covariance:
-    the tip of a tool. It need not be a feature; `mixpose pivot` finds it.
+    """A point of the body whose place in the world each pose line has, as `tip`, with its
+    covariance: the tip of a tool. It need not be a feature; `mixpose pivot` finds it.
     Example: `tip = [0.2, -1.4, -148.6]`"""
     gravity: GravityTable | None = Field(None, description="a table with direction and sigma")
     """See `[object.gravity]`.
@@ -168,14 +168,14 @@ class EstimatorTable(Table):
 
 
 class SessionTable(Table):
-    """What stands before the first table."""
+    """The keys before the first table."""
 
     unit: Unit
     """Unit of every length in this file, in the files of markers and recordings that it names,
     and in the poses.
     Example: `unit = "mm"`"""
     object: Annotated[
-        list[ObjectTable], BeforeValidator(lambda one: [one] if isinstance(one, dict) else one)
+        list[ObjectTable], BeforeValidator(lambda item: [item] if isinstance(item, dict) else item)
     ] = Field(min_length=1, description="a table [object], or [[object]] for each of several")
     """See `[object]`; of several bodies `[[object]]`, one for each."""
     start: StartTable | None = Field(None, description="a table [start]")

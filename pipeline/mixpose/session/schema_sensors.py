@@ -1,6 +1,6 @@
-"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor, and ``[extract]``.
+"""The tables ``[[sensor]]`` of a session file, one per kind of sensor, and ``[extract]``.
 
-How keys are described is said in `schema`.
+`mixpose.session.schema` says how keys are described.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Motion: TypeAlias = Annotated[
 
 
 class Table(BaseModel):
-    """A TOML table: no keys but these, no text for numbers, no NaN and no infinity."""
+    """A TOML table without other keys, text for numbers, NaN and infinity."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 class Placement(Table):
-    """The forms of a rigid motion beside the 4x4 matrix."""
+    """The forms of a rigid motion other than the 4x4 matrix."""
 
     rotation_vector: Annotated[
         Floats | None, array_of((3,), "three numbers: axis times angle in radians")
@@ -124,9 +124,9 @@ class CalibrationTable(Table):
 
 
 class CalibrationErrorTable(Table):
-    """How far off a calibration may be, as standard deviations. Poses stay as they are; their
-    covariances know of it, to first order. `mixpose calibrate` prints such numbers; where a rig was
-    bumped or a lens refocused, they are yours to guess (`docs/sensors-in-time.md`).
+    """How far off a calibration may be, as standard deviations. Poses do not change; their
+    covariances include it, to first order. `mixpose calibrate` prints such numbers; for a rig that
+    was bumped or a lens that was refocused, guess them (`docs/sensors-in-time.md`).
     """
 
     focal: float = Field(0.0, ge=0, le=0.5, description="a share, from 0 to 0.5")
@@ -147,7 +147,7 @@ class CalibrationErrorTable(Table):
 
 
 class SensorTable(Table):
-    """What every `[[sensor]]` has, whatever its `model`."""
+    """Keys of every `[[sensor]]`, whatever its `model`."""
 
     name: values.SensorName
     """Name of the sensor, a different one for each.
@@ -173,8 +173,8 @@ class SensorTable(Table):
     calibration_error: CalibrationErrorTable | None = Field(
         None, description="a table like { rotation_deg = 0.05 }"
     )
-    """How far off the calibration may be: standard deviations that covariances are to know of. Left
-    out: what residuals show of it.
+    """How far off the calibration may be: standard deviations that covariances include. Left out:
+    what residuals show of it.
     Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`"""
     extract: ExtractTable | None = Field(None, description="a table [sensor.extract]")
     """Keys of `[extract]` that differ for this sensor.
@@ -182,7 +182,7 @@ class SensorTable(Table):
 
 
 class PlacedTable(SensorTable, Placement):
-    """A sensor that stands somewhere and looks somewhere."""
+    """A sensor with a position and an orientation."""
 
     T_sensor_world: Motion = None
     """Maps coordinates of the world to those of the sensor, which looks along +z with x to the
@@ -248,7 +248,7 @@ class LaterationTable(SensorTable):
     """Where ranges are measured from, in `unit`.
     Example: `position = [0, -1000, 0]`"""
     range_bias: Number = Field(0.0, description="a length")
-    """What every reading is too long by, in `unit`.
+    """Length by which every reading is too long, in `unit`.
     Example: `range_bias = 0.15`"""
     range_min: Number | None = Field(None, description="a length: range of a profile's first bin")
     """For range profiles: the range that their first bin stands for, in `unit`.
@@ -259,8 +259,8 @@ class LaterationTable(SensorTable):
 
 
 class CloudTable(SensorTable, Placement):
-    """Points in space that nobody has labelled, from a system that triangulates by itself. The
-    source is a table with columns `x,y,z`, in `unit`.
+    """Unlabelled points in space, from a system that triangulates by itself. The source is a table
+    with columns `x,y,z`, in `unit`.
     """
 
     model: Literal["cloud"]

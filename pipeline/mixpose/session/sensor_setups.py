@@ -1,4 +1,4 @@
-"""From a ``[[sensor]]`` table to the sensor and its frames' source."""
+"""Build the sensors of a session from its ``[[sensor]]`` tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import Intrinsics, camera_matrix, distortion
+from mixpose.session.intrinsics import Intrinsics, read_camera_matrix, read_distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
 from mixpose.session.schema_sensors import (
@@ -32,9 +32,9 @@ from mixpose.units import Unit, length_ratio
 
 _WIDEST_PX = 1000
 _WIDEST_BINS = 100_000
-_NARROWEST = 1000  # of a bin
-# keys that are taken over as they are, by tables that have them
-_TAKEN = {"name", "model", "source", "fps", "range_min", "bin_size", "delay", "readout", "exposure"}
+_NARROWEST = 1000  # widths are at least a 1000th of a bin
+# keys that are copied unchanged from tables that have them
+_KEPT = {"name", "model", "source", "fps", "range_min", "bin_size", "delay", "readout", "exposure"}
 
 
 def build_sensors(
@@ -49,11 +49,11 @@ def build_sensors(
     setups: list[SensorSetup] = []
     for i, table in enumerate(tables):
         with under("sensor", i):
-            twins = [j for j, setup in enumerate(setups) if setup.name == table.name]
-            if twins:
+            namesakes = [j for j, setup in enumerate(setups) if setup.name == table.name]
+            if namesakes:
                 raise BadKeyError(
-                    f'found "{table.name}", the name of sensor[{twins[0]}] too; allowed: a name '
-                    "of its own for each sensor",
+                    f'found "{table.name}", the name of sensor[{namesakes[0]}] too; allowed: a '
+                    "name of its own for each sensor",
                     "name",
                 )
             setups.append(_build_sensor(table, defaults, folder, unit))
@@ -67,11 +67,11 @@ def build_sensors(
     return tuple(setups)
 
 
-def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOptions:
-    """Put a sensor's own extraction keys over the defaults of all sensors."""
-    tables = [defaults] if own is None else [defaults, own]
-    given = {k: v for each in tables for k, v in each.model_dump(exclude_unset=True).items()}
-    options = ExtractOptions(**given)
+def merge_extract(defaults: ExtractTable, overrides: ExtractTable | None) -> ExtractOptions:
+    """Return the extraction options of a sensor whose keys override those of all sensors."""
+    tables = [defaults] if overrides is None else [defaults, overrides]
+    merged = {k: v for table in tables for k, v in table.model_dump(exclude_unset=True).items()}
+    options = ExtractOptions(**merged)
     if options.max_area is not None and options.max_area <= options.min_area:
         raise BadKeyError(
             f"found {options.max_area:g}; allowed: more than min_area, which is "
@@ -98,7 +98,7 @@ def _build_sensor(
             if (table.range_min is None) != (table.bin_size is None):
                 missing = "range_min" if table.range_min is None else "bin_size"
                 raise BadKeyError("missing; a profile needs range_min and bin_size", missing)
-            # the far end of a profile is known only when its bins are counted
+            # the last range of a profile is unknown until its bins are counted
             sensor = sensors.RangeSensor(table.position, table.range_bias)
         case CloudTable():
             if table.delay == "estimate":
@@ -113,25 +113,25 @@ def _build_sensor(
         extract = merge_extract(defaults, table.extract)
         _check_widths(extract, table)
         if not isinstance(table, LaterationTable | CloudTable):
-            try:  # say now what would fail on the first image
-                check_options(extract)  # without a folder: reading a session runs nobody's code
+            try:  # refuse now what would fail on the first image
+                check_options(extract)  # without a folder: reading a session runs no user code
             except SessionError as error:
                 key, _, text = str(error).partition(": ")
                 raise BadKeyError(text, key.removeprefix("extract.")) from error
-    given = type(table).model_fields.keys() & _TAKEN
+    copied = type(table).model_fields.keys() & _KEPT
     return SensorSetup(
-        **{key: getattr(table, key) for key in given},
+        **{key: getattr(table, key) for key in copied},
         sensor=sensor,
         times=None if table.times is None else folder / table.times,
         extract=extract,
         resolution=resolution,
         calibration_error=_calibration_error(table),
-        own=frozenset() if table.extract is None else frozenset(table.extract.model_fields_set),
+        overridden=frozenset(table.extract.model_fields_set if table.extract else ()),
     )
 
 
 def _calibration_error(table: AnySensorTable) -> CalibrationError | None:
-    """What may be off, of things that such a sensor has."""
+    """Return the calibration errors of a sensor; refuse those that its model does not have."""
     if table.calibration_error is None:
         return None
     if isinstance(table, CloudTable):
@@ -167,7 +167,7 @@ def _camera(table: CameraTable, folder: Path, unit: Unit) -> PinholeCamera | Fis
 def _pose_in_file(
     camera: CalibratedCamera, wanted: schema_sensors.CalibrationTable | None, unit: Unit
 ) -> Floats:
-    """Where the calibration says that the camera stands; the origin where it does not."""
+    """Return T_sensor_world of a calibration file, in `unit`; the identity if it has none."""
     T = camera.T_camera_rig
     if T is None or wanted is None:
         return np.eye(4)
@@ -192,14 +192,14 @@ def _calibrated(table: CameraTable, folder: Path) -> CalibratedCamera:
     if table.camera_matrix is None:
         raise BadKeyError(f"missing; allowed: {MATRIX_FORM}, or calibration", "camera_matrix")
     with under("camera_matrix"):
-        K = camera_matrix(table.camera_matrix.tolist())
+        K = read_camera_matrix(table.camera_matrix.tolist())
     with under("distortion"):
-        D = distortion(table.distortion, table.model)
+        D = read_distortion(table.distortion, table.model)
     return CalibratedCamera(table.name, Intrinsics(K, D))
 
 
 def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
-    """A density is as wide as its widths: without limits it would outgrow all memory."""
+    """Refuse widths, too large or far below a bin, whose density would not fit into memory."""
     if isinstance(table, CloudTable):
         return
     if not isinstance(table, LaterationTable):

@@ -1,4 +1,4 @@
-"""What a session file says, checked and frozen."""
+"""A session: the checked, immutable contents of a session file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mixpose.units import Unit, length_ratio
 
 @dataclass(frozen=True)
 class Start:
-    """Where the object is at first, ``[start]``."""
+    """The pose of a body in the first frame, ``[start]``."""
 
     T_world_object: Floats  # (4, 4)
-    rotation_deg: float | None = None  # half-width in degrees; None where not given
-    distance: float | None = None  # half-width in length units; None where the file gives none
+    rotation_deg: float | None = None  # half-width in degrees; None: not given
+    distance: float | None = None  # half-width in length units; None: not given
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class ObjectSetup:
     """One ``[[object]]``."""
 
     body: Body
-    start: Start | None = None  # of identical ones, where the first is
-    count: int = 1  # how many identical ones there are
+    start: Start | None = None  # of the first, if there are several identical bodies
+    count: int = 1  # number of identical bodies
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What each of them is called where one word has to do."""
+        """Names of the identical bodies, numbered if there are several."""
         return tuple(label_of(self.body.name, instance) for instance in self.instances)
 
     @property
     def instances(self) -> tuple[int | None, ...]:
-        """The numbers of identical ones; None where there is one only."""
+        """Numbers of the identical bodies; None for a single body."""
         return tuple(range(self.count)) if self.count > 1 else (None,)
 
 
@@ -49,59 +49,59 @@ class SensorSetup:
     name: str  # unique in the session
     model: str
     sensor: Sensor  # the calibrated geometry
-    source: str | tuple[str, ...]  # as written, relative to `Session.folder`; empty: none is named
+    source: str | tuple[str, ...]  # as written, relative to `Session.folder`; empty: none
     times: Path | None  # table of frame times, relative paths resolved
     fps: float | None  # frames per second
     extract: ExtractOptions  # ``[extract]`` with what ``[sensor.extract]`` overrides
     range_min: float | None = None  # range of a profile's first bin, length units
-    bin_size: float | None = None  # from bin to bin; both or neither
+    bin_size: float | None = None  # from bin to bin; None if and only if `range_min` is
     resolution: tuple[int, int] | None = None  # width and height of a camera's images in px
-    delay: float | Literal["estimate"] = 0.0  # s by which frames are later than their times
+    delay: float | Literal["estimate"] = 0.0  # s by which frames are taken later than their times
     readout: float = 0.0  # s from a camera's first row to its last
     exposure: float = 0.0  # s for which a row collects light
     calibration_error: CalibrationError | None = None  # of the geometry; None: exact
-    own: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets, whatever ``[extract]``
+    overridden: frozenset[str] = frozenset()  # keys that ``[sensor.extract]`` sets
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Its source as a list, as the file may have it."""
+        """The source as a tuple, even if it is a single text."""
         return (self.source,) if isinstance(self.source, str) else self.source
 
     def table_of(self, key: str) -> str:
-        """The table of the session file in which a key of extraction takes effect, in words."""
-        return "its own [sensor.extract]" if key in self.own else "[extract]"
+        """Name the table of the session file from which a key of extraction takes its value."""
+        return "its own [sensor.extract]" if key in self.overridden else "[extract]"
 
 
 @dataclass(frozen=True)
 class Session:
-    """A whole set-up, as read from one session file."""
+    """The whole set-up that a session file describes."""
 
-    path: Path  # the session file, as it was named
+    path: Path  # the session file, as the user named it
     sha256: str  # of the file's bytes, in hexadecimal
     unit: Unit  # of every length; nothing is converted on reading
-    # the first body, where it is at first, and below how many there are of it
+    # the first body and its start; `count` is its number of identical copies
     body: Body
     start: Start | None
     estimator: EstimatorOptions
     sensors: tuple[SensorSetup, ...]
-    allow_code: bool = False  # whether functions that the file names may be run
+    allow_code: bool = False  # whether functions named in the file may be run
     count: int = 1
-    others: tuple[ObjectSetup, ...] = ()  # bodies after the first, in the order of the file
+    other_objects: tuple[ObjectSetup, ...] = ()  # bodies after the first, in the order of the file
 
     @property
     def objects(self) -> tuple[ObjectSetup, ...]:
         """All bodies, in the order of the file."""
-        return (ObjectSetup(self.body, self.start, self.count), *self.others)
+        return (ObjectSetup(self.body, self.start, self.count), *self.other_objects)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of all bodies, identical ones numbered, in the order of their pose lines."""
-        return tuple(label for one in self.objects for label in one.labels)
+        return tuple(label for setup in self.objects for label in setup.labels)
 
-    def alone(self, name: str) -> Session:
-        """The session of one of its bodies, by name, as if there were no other."""
-        one = next(each for each in self.objects if each.body.name == name)
-        return replace(self, body=one.body, start=one.start, count=1, others=())
+    def with_only(self, name: str) -> Session:
+        """Return the session with a single one of its bodies, by name."""
+        chosen = next(setup for setup in self.objects if setup.body.name == name)
+        return replace(self, body=chosen.body, start=chosen.start, count=1, other_objects=())
 
     @property
     def folder(self) -> Path:

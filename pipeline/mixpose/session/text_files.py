@@ -1,4 +1,4 @@
-"""Reading the text files that a session consists of, TOML and YAML among them."""
+"""Read the text files of a session, TOML and YAML among them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from mixpose.limits import MOST_BYTES, MOST_YAML_CHARACTERS, MOST_YAML_NODES
 from mixpose.session.messages import BadKeyError
 
-_NO_TEXT = tuple(
+_BINARY_FORMATS = tuple(
     (re.compile(start, re.DOTALL), name)
     for start, name in (
         (rb"\x89PNG|\xff\xd8\xff|BM....\x00\x00|II\*\x00|MM\x00\*|GIF8", "an image"),
@@ -19,7 +19,7 @@ _NO_TEXT = tuple(
         (rb"PK\x03\x04|\x1f\x8b", "a packed file"),
     )
 )
-"""How files begin that are given in place of text by mistake."""
+"""First bytes, and names, of binary files that users name by mistake."""
 
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")
 _TABLE = re.compile(r"\[\[?\s*(sensor|object)\s*\]")
@@ -30,13 +30,13 @@ _SLIPS = (
     (r"\s*([\w.-]+)\s*=\s*([-+]?\d+),(\d+)\s*(?:#.*)?", r"a decimal point, \1 = \2.\3"),
     (r"\s*([\w.-]+)\s*:(?=.)\s*(.*?)\s*", r"an equals sign, \1 = \2"),
 )
-"""Lines that are no TOML, and as what they would be."""
+"""Patterns of lines that are no TOML, and hints at what is allowed instead."""
 
 _OPENCV_HEAD = re.compile(r"\A\s*%YAML:?[ \d.]*[^\n]*\n(---[^\n]*\n)?")
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file; BadKeyError if that cannot be done, or it is larger than any session needs."""
+    """Read a file; raise BadKeyError if that fails or the file has more than `MOST_BYTES`."""
     try:
         is_other = path.exists() and not path.is_file()
         size = path.stat().st_size
@@ -55,8 +55,8 @@ def read_bytes(path: Path) -> bytes:
 
 
 def as_text(content: bytes) -> str:
-    """Decode UTF-8, with or without the mark that some editors put in front, or a BadKeyError."""
-    kind = next((name for start, name in _NO_TEXT if start.match(content)), None)
+    """Decode UTF-8, with or without a byte order mark; raise BadKeyError if it is not text."""
+    kind = next((name for start, name in _BINARY_FORMATS if start.match(content)), None)
     if kind is not None:
         raise BadKeyError(f"found {kind}; allowed: a text file in UTF-8")
     try:
@@ -67,18 +67,18 @@ def as_text(content: bytes) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML. Raises BadKeyError in one line, with what is most likely meant."""
+    """Parse TOML; raise BadKeyError with a hint at what was most likely meant."""
     try:
         return tomllib.loads(text)
-    except ValueError as error:  # of TOML, or a number of thousands of digits
+    except ValueError as error:  # invalid TOML, or a number of thousands of digits
         raise BadKeyError(f"not TOML: {error}{_hint(text, str(error))}") from error
 
 
 def _hint(text: str, reason: str) -> str:
-    """What is most likely meant; empty where nothing is."""
-    at = _LINE.search(reason)
+    """Return a hint at what was most likely meant; empty if that is unknown."""
+    place = _LINE.search(reason)
     lines = text.splitlines()
-    line = lines[int(at[1]) - 1] if at is not None and 0 < int(at[1]) <= len(lines) else ""
+    line = lines[int(place[1]) - 1] if place and 0 < int(place[1]) <= len(lines) else ""
     table = _TABLE.match(line.strip())
     if table is not None and ("twice" in reason or "overwrite" in reason):
         return f"; allowed for each of several: [[{table[1]}]] in two brackets, the first too"
@@ -86,13 +86,13 @@ def _hint(text: str, reason: str) -> str:
         return '; allowed: straight quotes, "..."'
     if "\\" in line and ("in a string" in reason or "hex value" in reason):
         return "; allowed: paths with / , or in single quotes, '...'"
-    found = ((re.fullmatch(pattern, line), meant) for pattern, meant in _SLIPS)
-    return next((f"; allowed: {slip.expand(meant)}" for slip, meant in found if slip), "")
+    matches = ((re.fullmatch(pattern, line), meant) for pattern, meant in _SLIPS)
+    return next((f"; allowed: {match.expand(meant)}" for match, meant in matches if match), "")
 
 
 def parse_yaml(text: str) -> Any:
-    """Parse the first document of a YAML text."""
-    import yaml  # noqa: PLC0415  # only sessions with such a calibration need it
+    """Return the first document of a YAML text that is not empty; None if there is none."""
+    import yaml  # noqa: PLC0415  # only calibrations in YAML need it
 
     if len(text) > MOST_YAML_CHARACTERS:
         raise BadKeyError(
@@ -120,17 +120,17 @@ def parse_yaml(text: str) -> Any:
 
 
 def _is_large(root: Any) -> bool:
-    """Whether aliases make a document large: a few bytes may stand for gigabytes."""
+    """Test whether aliases make a document large: a few bytes may stand for gigabytes."""
     sizes: dict[int, float] = {}
 
     def size_of(node: Any) -> float:
         known = sizes.get(id(node))
         if known is not None:
             return known
-        sizes[id(node)] = float("inf")  # met again inside of itself: without end
-        parts = [] if isinstance(node.value, str) else node.value
-        flat = [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
-        sizes[id(node)] = 1 + sum(map(size_of, flat))
+        sizes[id(node)] = float("inf")  # a node that contains itself is infinite
+        items = [] if isinstance(node.value, str) else node.value
+        parts = [part for item in items for part in (item if isinstance(item, tuple) else (item,))]
+        sizes[id(node)] = 1 + sum(map(size_of, parts))
         return sizes[id(node)]
 
     return root is not None and size_of(root) > MOST_YAML_NODES

@@ -1,4 +1,4 @@
-"""Pydantic's findings about a session file, as one problem with one key."""
+"""Validate a session file with pydantic, and turn its errors into one BadKeyError."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from mixpose.session.messages import BadKeyError, Key, did_you_mean, found, nearest, one_of
-from mixpose.session.values import limits
+from mixpose.session.messages import BadKeyError, Key, did_you_mean, mismatch, nearest, one_of
+from mixpose.session.values import limit_hint
 
-_TAG = "model"  # the key that tells the kinds of sensor apart
+_TAG = "model"  # the key that distinguishes the kinds of sensor
 _TOP = "the top of the file, before its first [table]"
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Where an error sits: its key without pydantic's own steps, its table and its field."""
+    """The place of an error: its key in the file, the class of its table, and its field."""
 
     key: Key
     table: type[BaseModel]
@@ -27,10 +27,10 @@ class _Place:
 
 
 def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
-    """Check parsed TOML against the table of the whole file.
+    """Return the validated table of the whole file.
 
-    Raises BadKeyError the first finding, an unknown key before any other: a misspelt key often is
-    the reason why another is missing.
+    Raises BadKeyError for the first error, unknown keys first: a misspelt key is often the reason
+    why another one is missing.
     """
     try:
         return root.model_validate(data)
@@ -58,12 +58,12 @@ def _problem(root: type[BaseModel], finding: ErrorDetails) -> BadKeyError:
             return BadKeyError(reason.text, *place.key, *reason.key)
     hint = did_you_mean(value, _literals(place.field)) if kind == "literal_error" else ""
     if kind in ("greater_than_equal", "less_than_equal"):
-        hint = limits(value)
-    return BadKeyError(found(value, allowed or finding["msg"]) + hint, *place.key)
+        hint = limit_hint(value)
+    return BadKeyError(mismatch(value, allowed or finding["msg"]) + hint, *place.key)
 
 
 def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
-    """Follow an error's location through the tables, dropping the tags of unions."""
+    """Follow pydantic's location of an error through the tables, without the tags of unions."""
     key: list[str | int] = []
     table, field = root, None
     choices: list[type[BaseModel]] = [root]
@@ -82,41 +82,41 @@ def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
-    """An annotation, and all that it is made of, at any depth."""
+    """Yield an annotation and all its arguments, at any depth."""
     yield annotation
     for part in get_args(annotation):
         yield from _parts(part)
 
 
 def _tables(annotation: Any) -> list[type[BaseModel]]:
-    """The tables that an annotation names."""
+    """Return the classes of tables in an annotation."""
     parts = _parts(annotation)
     return [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
 
 
 def _literals(field: FieldInfo | None) -> list[str]:
-    """The words that a field's annotation lists."""
+    """Return the literal texts in a field's annotation."""
     return [part for part in _parts(field and field.annotation) if isinstance(part, str)]
 
 
 def allowed_for(field: FieldInfo | None) -> str:
-    """What a key may be, for people; what its type says where nothing else does."""
+    """Return the text that says what a key may be: its description, else its literals."""
     if field is None:
         return ""
     if field.annotation is bool:
         return "true or false"
-    carried = [getattr(mark, "description", None) for mark in field.metadata]
-    said = (text for text in [field.description, *carried] if text)
-    return next(said, one_of(_literals(field)))
+    annotated = [getattr(mark, "description", None) for mark in field.metadata]
+    descriptions = (text for text in [field.description, *annotated] if text)
+    return next(descriptions, one_of(_literals(field)))
 
 
 def _tag_problem(place: _Place, value: Any) -> BadKeyError:
-    """A sensor whose model is unknown or missing: nothing else in it could be checked."""
+    """Return the problem of a sensor whose model is unknown or missing."""
     tables = _tables(place.field and place.field.annotation)
     models = [word for table in tables for word in _literals(table.model_fields[_TAG])]
     keys = {key for table in tables for key in table.model_fields}
     if _TAG in value:
-        text = found(value[_TAG], one_of(models)) + did_you_mean(value[_TAG], models)
+        text = mismatch(value[_TAG], one_of(models)) + did_you_mean(value[_TAG], models)
         return BadKeyError(text, *place.key, _TAG)
     for key in value:
         if key not in keys and nearest(key, keys) == _TAG:
@@ -124,14 +124,14 @@ def _tag_problem(place: _Place, value: Any) -> BadKeyError:
     return BadKeyError(f"missing; allowed: {one_of(models)}", *place.key, _TAG)
 
 
-_SENSORS = ("camera", "cameras")  # as other programs call their tables of sensors
+_SENSORS = ("camera", "cameras")  # names of the tables of sensors in other programs' files
 
 
 def _unknown_key(root: type[BaseModel], place: _Place) -> str:
-    """Suggest the nearest key of the same table, else say where the key is at home."""
+    """Return a message with the nearest key of the same table, else with tables that have it."""
     key, known = str(place.key[-1]), list(place.table.model_fields)
     homes = _homes(root, key)
-    # a key that is right elsewhere is more likely misplaced than misspelt
+    # a key that another table has is more likely misplaced than misspelt
     if len(place.key) == 1 and key.casefold() in _SENSORS:
         return "unknown key; did you mean [[sensor]]? Each camera is one of these"
     close = nearest(key, known, cutoff=0.8) if homes else nearest(key, known)
@@ -142,7 +142,7 @@ def _unknown_key(root: type[BaseModel], place: _Place) -> str:
 
 
 def _if_inverse(key: str, close: str) -> str:
-    """A remark where the right key has the names of a transform the other way round."""
+    """Return a remark if a key names the inverse of the transform of the `close` key."""
     _, *names = close.split("_")
     if len(names) < 2 or key.lower() != "_".join(["t", *reversed(names)]):
         return ""
@@ -150,10 +150,10 @@ def _if_inverse(key: str, close: str) -> str:
 
 
 def _homes(root: type[BaseModel], key: str) -> list[str]:
-    """Tables that have a key, sensors of all models as one."""
-    every = dict.fromkeys(path for path, _ in _all_tables(root))
+    """Return names of the tables that have a key; one name if sensors of all models have it."""
+    paths = dict.fromkeys(path for path, _ in _all_tables(root))
     homes = dict.fromkeys(path for path, table in _all_tables(root) if key in table.model_fields)
-    models = [path for path in every if path.startswith("[[sensor]]")]
+    models = [path for path in paths if path.startswith("[[sensor]]")]
     if all(model in homes for model in models):
         homes = {("[[sensor]]" if home in models else home): None for home in homes}
     return list(homes)
@@ -169,7 +169,7 @@ def _all_tables(table: type[BaseModel], path: str = _TOP) -> Iterator[tuple[str,
             elif path == _TOP:
                 name = f"[{key}]"
             else:
-                # [[sensor]] of any model: [sensor.extract]
+                # without the model: [sensor.extract]
                 outer = path.strip("[]").partition("]")[0]
                 name = f"[{outer}.{key}]"
             yield from _all_tables(inner, name)

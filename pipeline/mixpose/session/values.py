@@ -1,4 +1,4 @@
-"""Values of a session file that need more than a type: how they are read and what is allowed."""
+"""Read values of a session file that need more checks than a type; say what is allowed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pydantic_core import core_schema
 from mixpose.limits import MOST_PIXELS
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
-from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of, under
+from mixpose.session.messages import BadKeyError, did_you_mean, mismatch, one_of, under
 
 EXTRACT_METHODS = ("blobs", "corners", "intensity", "log")
 THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
@@ -35,14 +35,14 @@ _THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
 MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 RESOLUTION_FORM = "[width, height], two positive integers"
 
-LARGEST = 1e12  # powers of larger numbers would overflow to infinity unseen
-SMALLEST = 1e-12  # of what must be greater than 0; powers of smaller ones would come to 0
+LARGEST = 1e12  # powers of larger numbers would silently overflow to infinity
+SMALLEST = 1e-12  # of keys greater than 0; powers of smaller numbers would underflow to 0
 _WIDEST = 1_000_000  # px; more than any image library reads
 
 
 @dataclass(frozen=True)
 class ReadBy:
-    """Annotation of a key: what reads the value in the file, and what it may be."""
+    """Annotation of a key: the function that reads its value, and a description of valid values."""
 
     read: Callable[[Any], Any]
     description: str
@@ -54,14 +54,14 @@ class ReadBy:
 
 
 def array_of(shape: tuple[int | None, ...], description: str) -> ReadBy:
-    """Annotation of a key that holds nested lists of numbers, see `numbers`."""
+    """Return the annotation of a key that holds nested lists of numbers, see `numbers`."""
     return ReadBy(partial(numbers, shape=shape, allowed=description), description)
 
 
 def _read_sensor_name(name: str) -> str:
     if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
         raise BadKeyError(
-            found(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
+            mismatch(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
         )
     return name
 
@@ -69,7 +69,7 @@ def _read_sensor_name(name: str) -> str:
 def _read_method(value: Any) -> str:
     if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
         return value
-    raise BadKeyError(found(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
+    raise BadKeyError(mismatch(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
 
 
 def _read_threshold(value: Any) -> str | float:
@@ -77,16 +77,16 @@ def _read_threshold(value: Any) -> str | float:
         return value
     if is_number(value):
         return float(value)
-    raise BadKeyError(found(value, _THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
+    raise BadKeyError(mismatch(value, _THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
 
 
 def _read_source(value: Any) -> str | tuple[str, ...]:
-    """Text, or a list of texts as a tuple; the number of a camera as text."""
+    """Return a text, a list of texts as a tuple, or the number of a camera as text."""
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return f"camera:{value}"
     texts = value if isinstance(value, list) else [value]
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
-        raise BadKeyError(found(value, _SOURCE_ALLOWED))
+        raise BadKeyError(mismatch(value, _SOURCE_ALLOWED))
     return tuple(texts) if isinstance(value, list) else str(value)
 
 
@@ -94,26 +94,26 @@ def _read_delay(value: Any) -> float | Literal["estimate"]:
     if value == "estimate":
         return "estimate"
     if not is_number(value) or not -LONGEST_DELAY_S <= value <= LONGEST_DELAY_S:
-        raise BadKeyError(found(value, _DELAY_ALLOWED))
+        raise BadKeyError(mismatch(value, _DELAY_ALLOWED))
     return float(value)
 
 
 def _read_free(value: Any) -> tuple[str, ...]:
-    """Directions in the order of the twist."""
+    """Return the names of directions in the order of the twist."""
     if not isinstance(value, list) or not value:
-        raise BadKeyError(found(value, _FREE_ALLOWED))
+        raise BadKeyError(mismatch(value, _FREE_ALLOWED))
     for i, name in enumerate(value):
         if name not in TWIST_NAMES:
-            raise BadKeyError(found(name, one_of(TWIST_NAMES)), i)
+            raise BadKeyError(mismatch(name, one_of(TWIST_NAMES)), i)
         if name in value[:i]:
-            raise BadKeyError(found(value, _FREE_ALLOWED) + f'; "{name}" stands there twice')
+            raise BadKeyError(mismatch(value, _FREE_ALLOWED) + f'; "{name}" stands there twice')
     return tuple(name for name in TWIST_NAMES if name in value)
 
 
 SensorName: TypeAlias = Annotated[
     str, AfterValidator(_read_sensor_name), Field(description="a name for the sensor, as text")
 ]
-"""It can stand in NAME=PATH."""
+"""Valid as NAME in NAME=PATH."""
 Method: TypeAlias = Annotated[str | None, ReadBy(_read_method, _METHOD_ALLOWED)]
 Threshold: TypeAlias = Annotated[str | float | None, ReadBy(_read_threshold, _THRESHOLD_ALLOWED)]
 Source: TypeAlias = Annotated[str | tuple[str, ...], ReadBy(_read_source, _SOURCE_ALLOWED)]
@@ -121,7 +121,7 @@ Delay: TypeAlias = Annotated[float | Literal["estimate"], ReadBy(_read_delay, _D
 Free: TypeAlias = Annotated[tuple[str, ...], ReadBy(_read_free, _FREE_ALLOWED)]
 
 
-def resolution(value: Any) -> tuple[int, int]:
+def read_resolution(value: Any) -> tuple[int, int]:
     """Read the width and height of an image in px."""
     match value:
         case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
@@ -131,34 +131,34 @@ def resolution(value: Any) -> tuple[int, int]:
                 raise BadKeyError(
                     f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
                 )
-    raise BadKeyError(found(value, RESOLUTION_FORM))
+    raise BadKeyError(mismatch(value, RESOLUTION_FORM))
 
 
-Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(resolution, RESOLUTION_FORM)]
+Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(read_resolution, RESOLUTION_FORM)]
 
 
 def read_calibration_key(value: Any) -> Any:
-    """A file alone is short for a table."""
+    """Return the table that a file name alone abbreviates; other values unchanged."""
     return {"file": value} if isinstance(value, str) else value
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Whether a value is a finite number (true and false are none)."""
+    """Test whether a value is a number within ±LARGEST (true and false are no numbers)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64
 
 
 def as_number(text: str) -> float:
-    """A text as a number; NaN where it is none."""
+    """Return the number that a text states; NaN if it is no number."""
     try:
         return float(text)
     except ValueError:
         return math.nan
 
 
-def limits(value: object) -> str:
-    """What to say where a number is beyond the limits that all numbers have; else nothing."""
+def limit_hint(value: object) -> str:
+    """Return a hint that a number is too large or too small for any key; else an empty text."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         if LARGEST < abs(value) < math.inf:
             return f"; the largest number is {LARGEST:g}"
@@ -168,20 +168,20 @@ def limits(value: object) -> str:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
-    """Read nested lists of numbers as a float64 array; a problem points at the first misfit.
+    """Read nested lists of numbers as a float64 array; raise BadKeyError at the first bad item.
 
-    `shape` has the length of the list at each depth, None for any length but zero; `allowed` is
-    what to tell the user.
+    `shape` has the length of the lists at each depth, None for any length but zero; `allowed` says
+    in the message what is allowed.
     """
     if not shape:
         if not is_number(value):
             raise BadKeyError(
-                found(value, f"a finite number, as part of {allowed}") + limits(value)
+                mismatch(value, f"a finite number, as part of {allowed}") + limit_hint(value)
             )
         return np.float64(value)  # type: ignore[return-value]
     length, inner = shape[0], shape[1:]
     if not isinstance(value, list) or not value or (length is not None and len(value) != length):
-        raise BadKeyError(found(value, allowed))
+        raise BadKeyError(mismatch(value, allowed))
     rows = []
     for i, item in enumerate(value):
         with under(i):

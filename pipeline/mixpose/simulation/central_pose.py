@@ -178,7 +178,7 @@ def plan_companions(
     placed = [(_middle(first.T_world_object, session.body), session.body.radius)]
     companions = []
     for k, (entry, instance) in enumerate(members, start=1):
-        alone = session.alone(entry.body.name)
+        alone = session.with_only(entry.body.name)
         seed = options.seed + _SEEDS_APART * k
         T = central_pose(alone, seed)
         if entry.start is None or instance:

@@ -16,7 +16,7 @@ import tomlkit
 
 from mixpose.errors import SessionError, reporting
 from mixpose.session import Session
-from mixpose.session.rewriting import places_of
+from mixpose.session.rewriting import paths_in
 
 SESSION_NAME = "session.toml"
 
@@ -51,7 +51,7 @@ def copy_session(session: Session) -> SessionCopy:
     moved = _moved(session, document)
     files: dict[str, Path] = {}
     times: dict[str, str] = {}
-    for container, key, role, owner in places_of(document):
+    for container, key, role, owner in paths_in(document):
         old = str(container[key])
         new = moved.get(old, old)
         if old in moved:
@@ -79,7 +79,7 @@ def copy_session(session: Session) -> SessionCopy:
 def _moved(session: Session, document: Any) -> dict[str, str]:
     """Return new paths for those that lead out of the session's folder."""
     moved: dict[str, str] = {}
-    for container, key, role, owner in places_of(document):
+    for container, key, role, owner in paths_in(document):
         old = str(container[key])
         path = PurePath(old)
         leads_out = path.is_absolute() or ".." in path.parts

@@ -23,7 +23,7 @@ from mixpose.objective import View
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
-from mixpose.sensors import Motion, moments
+from mixpose.sensors import Motion, read_times
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.motion import ExpectedVelocity
 from mixpose.tracking.track import DelayEvidence
@@ -190,7 +190,7 @@ def _feature_sigmas(
 def _seconds(views: Sequence[View], places: Floats, seen: Mask) -> Floats:
     """Return when features at places (L, N, 2) are seen (L, N), after the common time."""
     pairs = zip(views, places, strict=True)
-    seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in pairs]
+    seconds = [read_times(view.sensor, y, view.delay, view.readout) for view, y in pairs]
     return np.where(seen, seconds, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Calibration files, told apart by content: a module per format, and the list of them."""
+"""Read calibration files, whose format is recognised by content; each format has a module."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from mixpose.session.schema_sensors import CalibrationTable
 __all__ = ["FORMATS", "CalibratedCamera", "Rig", "read_calibration", "read_rigs"]
 
 FORMATS = (KALIBR, OPENCV, PYCALIB, ROS, ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP)
-"""In the order in which they are tried: Kalibr's files may begin like OpenCV's."""
+"""Formats in the order in which they are tried: Kalibr's files may begin like OpenCV's."""
 
 
 def read_calibration(
     wanted: CalibrationTable, folder: Path, model: CameraModel
 ) -> CalibratedCamera:
-    """Read the camera that a session names: its file, relative to `folder`, and what to read in it.
+    """Read the camera that a session names, by its file, relative to `folder`, and names in it.
 
-    Raises BadKeyError if it is in none of the formats, lacks that, or is of another model.
+    Raises BadKeyError if the file has no known format, lacks the camera, or has another model.
     """
     content = read_content(folder / wanted.file, wanted.file)
     with in_file(wanted.file):
@@ -42,23 +42,23 @@ def read_calibration(
 
 
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
-    """Read all cameras of several files, among which may be some that belong together.
+    """Read all cameras of several files, and group the files that belong together into rigs.
 
-    `also` says what may be given besides, for the message about a file in no known format.
+    `also` ends the list of what is allowed in the message about a file of no known format.
     """
-    formats: dict[str, tuple[Format, list[Content]]] = {}
+    by_format: dict[str, tuple[Format, list[Content]]] = {}
     for path in paths:
         content = read_content(path, str(path))
         with in_file(content.name):
-            format_found = format_of(content, also)
-        formats.setdefault(format_found.name, (format_found, []))[1].append(content)
+            form = format_of(content, also)
+        by_format.setdefault(form.name, (form, []))[1].append(content)
     rigs: list[Rig] = []
-    for each, contents in formats.values():
+    for form, contents in by_format.values():
         with in_file(_names_of(contents)):
-            groups = each.groups(contents) if each.groups else [[one] for one in contents]
+            groups = form.groups(contents) if form.groups else [[content] for content in contents]
         for group in groups:
             with in_file(_names_of(group)):
-                cameras = tuple(read("pinhole") for read in each.cameras(group).values())
+                cameras = tuple(read("pinhole") for read in form.cameras(group).values())
             rigs.append(Rig(tuple(content.name for content in group), cameras))
     return rigs
 
@@ -68,25 +68,25 @@ def _names_of(contents: Sequence[Content]) -> str:
 
 
 def format_of(content: Content, also: str = "") -> Format:
-    """The format that a file is in. Raises BadKeyError if it is in none."""
-    for each in FORMATS:
-        if each.recognises(content):
-            return each
-    known = ", ".join(each.shown for each in FORMATS)
+    """Return the format of a file; raise BadKeyError if it is unknown."""
+    for form in FORMATS:
+        if form.recognises(content):
+            return form
+    known = ", ".join(form.shown for form in FORMATS)
     keys = content.toml or content.parsed()
     shown = ", ".join(map(str, keys)) if isinstance(keys, dict) and keys else "no keys"
     raise BadKeyError(f"found {shown[:80]}; allowed: {known}{also}")
 
 
 def _read(content: Content, wanted: CalibrationTable, model: CameraModel) -> CalibratedCamera:
-    each = format_of(content)
+    form = format_of(content)
     nodes = {"camera_matrix": wanted.camera_matrix, "distortion": wanted.distortion}
-    if each is OPENCV and any(value is not None for value in nodes.values()):
+    if form is OPENCV and any(value is not None for value in nodes.values()):
         return read_nodes(content, model, wanted.camera_matrix, wanted.distortion)
-    _only_for("an OpenCV file", each.name, **nodes)
-    if not each.holds_several:
-        _only_for("a file of several cameras", each.name, camera=wanted.camera)
-    cameras = each.cameras([content])
+    _only_for("an OpenCV file", form.name, **nodes)
+    if not form.holds_several:
+        _only_for("a file of several cameras", form.name, camera=wanted.camera)
+    cameras = form.cameras([content])
     first, names = next(iter(cameras), ""), ", ".join(cameras)
     if wanted.camera is None and len(cameras) > 1:
         raise BadKeyError(
@@ -96,15 +96,15 @@ def _read(content: Content, wanted: CalibrationTable, model: CameraModel) -> Cal
     name = first if wanted.camera is None else wanted.camera
     if name not in cameras:
         raise BadKeyError(
-            f'found no camera "{name}"; cameras in the file: {names}; this is {each.name}'
+            f'found no camera "{name}"; cameras in the file: {names}; this is {form.name}'
         )
     return cameras[name](model)
 
 
-def _only_for(format_with: str, format_found: str, **keys: str | None) -> None:
-    """Refuse a key that the file's format has no use for."""
+def _only_for(other_format: str, format_name: str, **keys: str | None) -> None:
+    """Refuse keys that only another format than the file's uses."""
     for key, value in keys.items():
         if value is not None:
             raise BadKeyError(
-                f'{key} = "{value}" is for {format_with}, this is {format_found}; drop the key'
+                f'{key} = "{value}" is for {other_format}, this is {format_name}; drop the key'
             )

@@ -1,4 +1,4 @@
-"""A calibration file, what it says of a camera, and how a format of such files is registered."""
+"""Calibration files, their cameras and rigs, and the record that describes a format."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Group: TypeAlias = "Sequence[Content]"
 """Files that belong together."""
 
 Reader: TypeAlias = "Callable[[CameraModel], CalibratedCamera]"
-"""What reads a camera; the session's model helps where files do not state one."""
+"""Function that reads a camera; its argument is the model if the file does not state one."""
 
-# how a NumPy array, an archive of them, and a pickle of Python begin
-_NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
+# first bytes of a NumPy array, an archive of arrays, and a pickle of Python
+_BINARY = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class CalibratedCamera:
 
     name: str
     intrinsics: Intrinsics
-    T_camera_rig: Floats | None = None  # (4, 4), from what the file's cameras share; None: not said
-    unit: Unit | None = None  # of the translation; None where the format does not fix it
-    note: str = ""  # what a person should know of it; mostly empty
+    T_camera_rig: Floats | None = None  # (4, 4), rig: what cameras share; None: not stated
+    unit: Unit | None = None  # of the translation; None: the format does not fix it
+    note: str = ""  # a remark for the user; mostly empty
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras of files that belong together, and so of one world."""
+    """Cameras of files that belong together and share a world frame."""
 
     files: tuple[str, ...]
     cameras: tuple[CalibratedCamera, ...]
@@ -49,11 +49,11 @@ class Rig:
 class Format:
     """A format of calibration files."""
 
-    name: str  # with its article, as in "this is a Kalibr file"
-    shown: str  # for the list of what is allowed
+    name: str  # with an article, as in "this is a Kalibr file"
+    shown: str  # in the list of allowed formats
     recognises: Callable[[Content], bool]  # whether a file is in this format
-    cameras: Callable[[Group], Mapping[str, Reader]]  # those of a group by name
-    # groups of files; None for formats whose files stand alone
+    cameras: Callable[[Group], Mapping[str, Reader]]  # readers of the cameras of a group, by name
+    # sorts files into groups; None for formats whose files do not refer to each other
     groups: Callable[[Group], list[Group]] | None = None
     holds_several: bool = True  # whether one file can hold several cameras
 
@@ -67,35 +67,35 @@ class Content:
 
     @property
     def stem(self) -> str:
-        """The file's name without folder and ending."""
+        """Name of the file without folder and ending."""
         return Path(self.name).stem
 
     @cached_property
     def lines(self) -> list[str]:
-        """Lines of the text without blanks around them."""
+        """Lines of the text, stripped."""
         return [line.strip() for line in self.text.splitlines()]
 
     def parsed(self) -> Any:
-        """What the text says as JSON or YAML, or why it is neither, by its name's ending."""
-        no_json = ""
+        """Return JSON or YAML; raise BadKeyError, chosen by the file's ending, if it is neither."""
+        json_problem = ""
         if self.text.lstrip().startswith("{"):
             try:
                 return json.loads(self.text)
             except (ValueError, RecursionError) as error:
-                no_json = f"not JSON: {error}"  # YAML allows braces too
+                json_problem = f"not JSON: {error}"  # YAML allows braces too
         try:
             return parse_yaml(self.text)
         except BadKeyError:
             ending = Path(self.name).suffix.lower()
             if ending == ".toml":
                 parse_toml(self.text)
-            if ending == ".json" and no_json:
-                raise BadKeyError(no_json) from None
+            if ending == ".json" and json_problem:
+                raise BadKeyError(json_problem) from None
             raise
 
     @cached_property
     def mapping(self) -> dict[Any, Any]:
-        """Keys and values of JSON or YAML; empty where it is neither, or OpenCV's own dialect."""
+        """Content as JSON or YAML; empty if it is neither, no mapping, or OpenCV's dialect."""
         if "opencv-matrix" in self.text or self.text.lstrip().startswith("<"):
             return {}
         try:
@@ -106,7 +106,7 @@ class Content:
 
     @cached_property
     def toml(self) -> dict[str, Any]:
-        """Tables of TOML; empty where it is none."""
+        """Content as TOML; empty if it is not TOML."""
         try:
             return tomllib.loads(self.text)
         except (ValueError, RecursionError):
@@ -114,10 +114,10 @@ class Content:
 
 
 def read_content(path: Path, name: str) -> Content:
-    """Read a calibration file. Raises BadKeyError if it is missing or no text."""
+    """Read a calibration file; raise BadKeyError if it is missing or not text."""
     content = read_bytes(path)
     with in_file(name):
-        if content.startswith(_NO_TEXT):
+        if content.startswith(_BINARY):
             raise BadKeyError(
                 "a NumPy or pickle file; write camera matrix and distortion with cv2.FileStorage, "
                 "or as numbers into camera_matrix and distortion in place of calibration"

@@ -1,7 +1,7 @@
-"""COLMAP's text models: cameras.txt, with images.txt or rigs.txt for where cameras stand.
+"""Read COLMAP's text models: cameras.txt, with poses of cameras in images.txt or rigs.txt.
 
-COLMAP counts pixels from the corner of the first one, mixpose from its centre: principal points
-lose half a pixel.  Lengths are in no unit, as structure from motion has none.
+COLMAP measures pixels from the corner of the first one, mixpose from its centre: half a pixel is
+subtracted from principal points.  Lengths have no unit, as structure from motion has no scale.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, size_of
-from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.intrinsics import CameraModel, Intrinsics, read_camera_matrix, size_of
+from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 from mixpose.session.values import LARGEST, as_number
 
 _MOST_IMAGES = 100
 _LONGEST = 18  # digits of an integer
-_CENTRE = 0.5  # px, of a pixel from its corner
+_CENTRE = 0.5  # px from the corner of a pixel to its centre
 
 _Placed: TypeAlias = dict[str, tuple[str, Floats | None]]
-"""By name: the number of the camera, and where it stands."""
+"""Number and pose of each camera, by name."""
 
 
-# of a model: that of OpenCV; how many focal lengths and coefficients it has, and of how many these
-# are the first, the others being zero
+# model, number of focal lengths, number of coefficients, number of OpenCV's coefficients: COLMAP's
+# are the first of these, and the others are zero
 _LENSES: dict[str, tuple[CameraModel, int, int, int]] = {
     "SIMPLE_PINHOLE": ("pinhole", 1, 0, 0),
     "PINHOLE": ("pinhole", 2, 0, 0),
@@ -53,7 +53,7 @@ def _rows(content: Content) -> list[list[str]]:
 
 
 def _kind(content: Content) -> str:
-    """Which of COLMAP's files this is; empty where it is none."""
+    """Return which of COLMAP's files this is; empty if it is none."""
     row = next(iter(_rows(content)), [])
     match row:
         case [number, model, width, height, *_] if model.isupper() and model.isascii():
@@ -62,7 +62,7 @@ def _kind(content: Content) -> str:
         case [number, count, "CAMERA" | "IMU", *_] if _is_integer(number) and _is_integer(count):
             return "rigs"
         case [number, _, _, _, _, _, _, _, camera, name, *_] if _is_integer(number):
-            if _is_integer(camera) and not _is_integer(name):  # which may have blanks
+            if _is_integer(camera) and not _is_integer(name):  # names may have blanks
                 return "images"
     return ""
 
@@ -88,7 +88,7 @@ def _placed(group: Group) -> _Placed:
 
 
 def _from_images(content: Content) -> _Placed:
-    """A sensor for each image: a camera that was moved was at several places."""
+    """Return the camera and pose of each image: a camera that was moved has several poses."""
     lines = [line for line in content.lines if not line.startswith("#")]
     while lines and not lines[0]:
         lines.pop(0)
@@ -112,18 +112,18 @@ def _from_images(content: Content) -> _Placed:
 
 
 def _from_rigs(content: Content) -> _Placed:
-    """Sensors of the only rig: the reference at its origin, the others where they say."""
-    rigs = [row for row in _rows(content) if len(row) > 3 and _whole(row[1]) > 1]
+    """Return poses in the only rig, whose reference sensor is at the origin."""
+    rigs = [row for row in _rows(content) if len(row) > 3 and _integer(row[1]) > 1]
     if len(rigs) > 1:
         raise BadKeyError(f"found {len(rigs)} rigs of several sensors; allowed: one")
     placed: _Placed = {}
     for row in rigs:
-        kind, number, *rest = row[2:]
+        kind, number, *cells = row[2:]
         if kind == "CAMERA":
             placed[f"camera{number}"] = (number, np.eye(4))
-        while len(rest) >= 3:
-            kind, number, has_pose, *rest = rest
-            pose, rest = (rest[:7], rest[7:]) if has_pose == "1" else (None, rest)
+        while len(cells) >= 3:
+            kind, number, has_pose, *cells = cells
+            pose, cells = (cells[:7], cells[7:]) if has_pose == "1" else (None, cells)
             if kind == "CAMERA":
                 with under("rig", row[0], f"camera{number}"):
                     placed[f"camera{number}"] = (number, _motion(pose) if pose else None)
@@ -133,7 +133,7 @@ def _from_rigs(content: Content) -> _Placed:
 def _motion(cells: Sequence[str]) -> Floats:
     values = _floats(cells)
     if len(values) != 7:
-        raise BadKeyError(found(" ".join(cells), "QW QX QY QZ TX TY TZ"))
+        raise BadKeyError(mismatch(" ".join(cells), "QW QX QY QZ TX TY TZ"))
     length = np.linalg.norm(values[:4])
     if not 0.5 < length < 2:
         raise BadKeyError(f"found a quaternion of length {length:.3g}; allowed: 1")
@@ -141,9 +141,9 @@ def _motion(cells: Sequence[str]) -> Floats:
     return from_parts(R, np.asarray(values[4:]))
 
 
-def _whole(cell: str) -> int:
+def _integer(cell: str) -> int:
     if not _is_integer(cell) or len(cell) > _LONGEST:
-        raise BadKeyError(found(cell, "an integer"))
+        raise BadKeyError(mismatch(cell, "an integer"))
     return int(cell)
 
 
@@ -151,7 +151,7 @@ def _floats(cells: Sequence[str]) -> list[float]:
     values = [as_number(cell) for cell in cells]
     for cell, value in zip(cells, values, strict=True):
         if not abs(value) < LARGEST:
-            raise BadKeyError(found(cell, "a finite number"))
+            raise BadKeyError(mismatch(cell, "a finite number"))
     return values
 
 
@@ -178,18 +178,18 @@ def _read(group: Group, placed: _Placed, name: str, _: CameraModel) -> Calibrate
 
 def _intrinsics(row: list[str]) -> Intrinsics:
     if len(row) < 5:
-        raise BadKeyError(found(" ".join(row), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"))
+        raise BadKeyError(mismatch(" ".join(row), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"))
     if row[1] not in _LENSES:
-        raise BadKeyError(found(row[1], one_of(_LENSES)))
-    model, focal_lengths, given, of = _LENSES[row[1]]
-    values, count = _floats(row[4:]), focal_lengths + 2 + given
+        raise BadKeyError(mismatch(row[1], one_of(_LENSES)))
+    model, focal_lengths, stated, total = _LENSES[row[1]]
+    values, count = _floats(row[4:]), focal_lengths + 2 + stated
     if len(values) != count:
         raise BadKeyError(f"found {len(values)} parameters of {row[1]}; allowed: {count} of them")
     fx, fy = values[0], values[focal_lengths - 1]
-    cx, cy, *rest = values[focal_lengths:]
-    K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
-    D = np.array([*rest, *[0.0] * (of - given)])
-    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), model)
+    cx, cy, *coefficients = values[focal_lengths:]
+    K = read_camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
+    D = np.array([*coefficients, *[0.0] * (total - stated)])
+    return Intrinsics(K, D, size_of([_integer(cell) for cell in row[2:4]]), model)
 
 
 COLMAP = Format(

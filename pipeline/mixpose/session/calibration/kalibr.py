@@ -1,7 +1,7 @@
-"""Kalibr's camchain: pinhole cameras with radtan or equidistant distortion, in metres.
+"""Read Kalibr's camchain: pinhole cameras with radtan or equidistant distortion, in metres.
 
-Each camera has ``T_cn_cnm1``, from the coordinates of the one before it.  Files of visual-inertial
-programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` in its place.
+Each camera has ``T_cn_cnm1``, from the coordinates of the camera before it.  Files of
+visual-inertial programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` instead.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mixpose.rigid import inverse
 from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
 from mixpose.session.intrinsics import CameraModel, Intrinsics
-from mixpose.session.messages import BadKeyError, found, under
+from mixpose.session.messages import BadKeyError, mismatch, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
 
@@ -32,7 +32,7 @@ def _cameras(group: Group) -> dict[str, Reader]:
         for name, camera in chain.items()
         if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
     ]
-    # YAML's writers put cam10 before cam2, and the one before it is cam9
+    # YAML writers put cam10 before cam2, but the camera before cam10 is cam9
     names = sorted(named, key=lambda name: int(re.sub("[^0-9]", "", name)[-9:] or 0))
     return {name: partial(_read, chain, names, name) for name in names}
 
@@ -43,40 +43,40 @@ def _read(
     camera = chain[name]
     with under(name):
         if camera.get("camera_model", "pinhole") != "pinhole":
-            raise BadKeyError(found(camera["camera_model"], '"pinhole"'), "camera_model")
+            raise BadKeyError(mismatch(camera["camera_model"], '"pinhole"'), "camera_model")
         with under("distortion_model"):
-            stated = pieces.present(camera, "distortion_model")
+            stated = pieces.required(camera, "distortion_model")
             model = pieces.model_of_distortion(stated) or "pinhole"
         with under("intrinsics"):
-            intrinsics = pieces.plain(camera["intrinsics"])
+            intrinsics = pieces.with_numbers(camera["intrinsics"])
             if not isinstance(intrinsics, list) or len(intrinsics) != 4:
-                raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
+                raise BadKeyError(mismatch(intrinsics, "[fu, fv, pu, pv]"))
             fu, fv, pu, pv = intrinsics
-            K = pieces.camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+            K = pieces.read_camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
         with under("distortion_coeffs"):
-            coefficients = [] if stated == "none" else pieces.present(camera, "distortion_coeffs")
-            D = pieces.distortion(pieces.plain(coefficients), model)
+            coefficients = [] if stated == "none" else pieces.required(camera, "distortion_coeffs")
+            D = pieces.read_distortion(pieces.with_numbers(coefficients), model)
         with under("resolution"):
             size = pieces.size_of(camera.get("resolution"))
     return CalibratedCamera(name, Intrinsics(K, D, size, model), _pose(chain, names, name), "m")
 
 
 def _pose(chain: dict[str, Any], names: list[str], wanted: str) -> Floats | None:
-    """From the first camera's coordinates to those of another; None where a link is missing."""
+    """Return the motion from the first camera's frame to another's; None if a link is missing."""
     T = np.eye(4)
     for before, name in pairwise(names[: names.index(wanted) + 1]):
         step = _step(chain, before, name)
         if step is None:
             return None
         T = step @ T
-    # a camera alone has no place in anything
+    # a single camera has no rig
     return T if len(names) > 1 else None
 
 
 def _step(chain: dict[str, Any], before: str, name: str) -> Floats | None:
-    own = _motion(chain, name, "T_cn_cnm1")
-    if own is not None:
-        return own
+    T_camera_before = _motion(chain, name, "T_cn_cnm1")
+    if T_camera_before is not None:
+        return T_camera_before
     first, second = _from_imu(chain, before), _from_imu(chain, name)
     return None if first is None or second is None else second @ inverse(first)
 
@@ -94,7 +94,7 @@ def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
         return None
     with under(name):
         with under(key):
-            matrix = numbers(pieces.plain(chain[name][key]), (4, 4), _MATRIX)
+            matrix = numbers(pieces.with_numbers(chain[name][key]), (4, 4), _MATRIX)
         return rigid(matrix, key)
 
 

@@ -1,8 +1,8 @@
-"""Calibrations in OpenCV's FileStorage format: YAML, XML or JSON.
+"""Read calibrations in OpenCV's FileStorage format: YAML, XML or JSON.
 
-A file holds one camera under usual names (``camera_matrix``), several numbered ones (``M1``,
-``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a file of their
-own), or a map for each (MC-Calib's ``camera_0``).
+A file holds one camera under common names (``camera_matrix``), several numbered ones (``M1``,
+``D1``, ``M2``, ``D2`` with ``R`` and ``T`` from the first to the second, perhaps in a separate
+file), or a map per camera (MC-Calib's ``camera_0``).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
 
-# What OpenCV's samples and common calibration programs call their nodes, tried in order.
+# Names of nodes in files of OpenCV's samples and common calibration programs, tried in order.
 MATRIX_NODES = ("camera_matrix", "Camera_Matrix", "K", "M", "cameraMatrix", "mtx")
 DISTORTION_NODES = (
     "distortion_coefficients",
@@ -49,10 +49,10 @@ _NUMBERED = re.compile(rf"({'|'.join(MATRIX_NODES)})_?(\d+|left|right)")
 
 @dataclass
 class _Nodes:
-    """Named nodes of files that belong together; of a camera's own map, that of it."""
+    """Named nodes of files that belong together, or of the map of a single camera."""
 
     nodes: dict[str, cv2.FileNode]
-    # nodes point into what was read: it must live as long as they
+    # nodes point into their storages, which must live as long as they
     storages: list[cv2.FileStorage] = field(default_factory=list)
 
 
@@ -78,7 +78,7 @@ def _open(group: Iterable[Content]) -> _Nodes:
 
 
 def _require_shallow(content: Content) -> None:
-    """Refuse lists within lists without end, which would end the process."""
+    """Refuse deeply nested lists, on which OpenCV would crash the process."""
     brackets = sum(map(content.text.count, "[{<"))
     dashes = max((len(_DASH.findall(line)) for line in content.lines), default=0)
     opened = max(brackets, dashes)
@@ -89,16 +89,16 @@ def _require_shallow(content: Content) -> None:
 
 
 def _groups(contents: Group) -> list[Group]:
-    """Files with cameras; one without belongs to the only other."""
-    with_cameras = [content for content in contents if _places(_open([content]), content.stem)]
+    """Return groups of files; those without cameras belong to the file with cameras, if single."""
+    with_cameras = [content for content in contents if _entries(_open([content]), content.stem)]
     others = [content for content in contents if content not in with_cameras]
     if len(with_cameras) == 1:
         return [[*with_cameras, *others]]
     return [[content] for content in contents]
 
 
-def _places(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
-    """By name: the map of a camera, or its nodes of matrix and distortion."""
+def _entries(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
+    """Return the map of each camera, or its nodes of matrix and distortion, by name."""
     nested: dict[str, str | tuple[str, str]] = {
         name: name
         for name, node in opened.nodes.items()
@@ -106,55 +106,55 @@ def _places(opened: _Nodes, stem: str) -> dict[str, str | tuple[str, str]]:
     }
     if nested:
         return nested
-    matrix = _usual(opened, MATRIX_NODES)
+    matrix = _first_present(opened, MATRIX_NODES)
     if matrix:
-        return {stem: (matrix, _usual(opened, DISTORTION_NODES) or "")}
+        return {stem: (matrix, _first_present(opened, DISTORTION_NODES))}
     numbered: dict[str, str | tuple[str, str]] = {}
     for name, node in opened.nodes.items():
         match = _NUMBERED.fullmatch(name)
         if match and (node.isMap() or node.isSeq()):
             suffix = name[len(match[1]) :]
-            pairs = [f"{usual}{suffix}" for usual in DISTORTION_NODES]
+            distortions = [f"{common}{suffix}" for common in DISTORTION_NODES]
             label = match[2] if match[2].isalpha() else f"camera{match[2]}"
-            numbered[label] = (name, next((each for each in pairs if each in opened.nodes), ""))
-    # R and T lead from the first, which need not come first
-    return dict(sorted(numbered.items(), key=lambda each: (len(each[0]), each[0])))
+            numbered[label] = (name, _first_present(opened, distortions))
+    # R and T lead from the first camera by number, which need not be the first in the file
+    return dict(sorted(numbered.items(), key=lambda item: (len(item[0]), item[0])))
 
 
-def _usual(opened: _Nodes, names: tuple[str, ...]) -> str | None:
-    return next((name for name in names if name in opened.nodes), None)
+def _first_present(opened: _Nodes, names: Iterable[str]) -> str:
+    return next((name for name in names if name in opened.nodes), "")
 
 
 def _cameras(group: Group) -> dict[str, Reader]:
     opened = _open(group)
-    places = _places(opened, group[0].stem)
-    if not places and {"R", "T"} <= set(opened.nodes):
+    entries = _entries(opened, group[0].stem)
+    if not entries and {"R", "T"} <= set(opened.nodes):
         raise BadKeyError(
             "holds R and T, where one camera stands to another, and no camera matrix; allowed: "
             "beside it the file that has the matrices of the two"
         )
-    if not places:  # which says what is there and how to name it
+    if not entries:  # raises a BadKeyError that lists the nodes of the file
         choose_node(opened, "camera_matrix", None)
-    names = list(places)
-    return {name: partial(_read, opened, names, name, place) for name, place in places.items()}
+    names = list(entries)
+    return {name: partial(_read, opened, names, name, entry) for name, entry in entries.items()}
 
 
 def _read(
-    opened: _Nodes, names: list[str], name: str, place: str | tuple[str, str], model: CameraModel
+    opened: _Nodes, names: list[str], name: str, entry: str | tuple[str, str], model: CameraModel
 ) -> CalibratedCamera:
-    if not isinstance(place, str):
-        intrinsics = _intrinsics(opened, model, place[0], place[1] or None)
+    if not isinstance(entry, str):
+        intrinsics = _intrinsics(opened, model, entry[0], entry[1] or None)
         return CalibratedCamera(name, intrinsics, _stereo_pose(opened, names, name))
-    node = opened.nodes[place]
-    own = _Nodes({key: node.getNode(key) for key in list(node.keys())}, opened.storages)
-    with under(place):
-        return CalibratedCamera(name, _intrinsics(own, model), _own_pose(own))
+    node = opened.nodes[entry]
+    camera = _Nodes({key: node.getNode(key) for key in list(node.keys())}, opened.storages)
+    with under(entry):
+        return CalibratedCamera(name, _intrinsics(camera, model), _mc_calib_pose(camera))
 
 
 def read_nodes(
     content: Content, model: CameraModel, matrix: str | None, distortion_name: str | None
 ) -> CalibratedCamera:
-    """Read the camera whose nodes the user names; BadKeyError if they are not there or not such."""
+    """Read the camera whose nodes the user names; raise BadKeyError if they are not valid."""
     intrinsics = _intrinsics(_open([content]), model, matrix, distortion_name)
     return CalibratedCamera(content.stem, intrinsics)
 
@@ -166,23 +166,23 @@ def _intrinsics(
     distortion_node = choose_node(opened, "distortion", coefficients)
     stated = _stated_model(opened)
     with under(matrix_node):
-        K = pieces.camera_matrix(_values(opened.nodes[matrix_node]))
+        K = pieces.read_camera_matrix(_values(opened.nodes[matrix_node]))
     with under(distortion_node):
-        D = pieces.distortion(_values(opened.nodes[distortion_node]), stated or model)
+        D = pieces.read_distortion(_values(opened.nodes[distortion_node]), stated or model)
     return Intrinsics(K, D, _resolution(opened), stated)
 
 
 def choose_node(opened: _Nodes, key: str, named: str | None) -> str:
-    """The node that the user names, else the first of the usual names that is there."""
-    usual = MATRIX_NODES if key == "camera_matrix" else DISTORTION_NODES
+    """Return the node that the user names, else the first of the common names in the file."""
+    common = MATRIX_NODES if key == "camera_matrix" else DISTORTION_NODES
     present = list(opened.nodes)
-    for name in usual if named is None else (named,):
+    for name in common if named is None else (named,):
         if name in present:
             return name
     nodes = f"nodes in the file: {', '.join(present) or 'none'}"
     if named is None:
         raise BadKeyError(
-            f"found none of the nodes {', '.join(usual)}; name it as "
+            f"found none of the nodes {', '.join(common)}; name it as "
             f'calibration = {{ file = "...", {key} = "..." }}; {nodes}'
         )
     close = nearest(named, present)
@@ -191,7 +191,7 @@ def choose_node(opened: _Nodes, key: str, named: str | None) -> str:
 
 
 def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
-    """As cv2.stereoCalibrate has it: R and T map the first camera's coordinates to the second's."""
+    """Return T_camera_rig by R and T of cv2.stereoCalibrate, from the first to the second."""
     if len(names) != 2 or not {"R", "T"} <= set(opened.nodes):
         return None
     if name == names[0]:
@@ -199,9 +199,9 @@ def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
     return pieces.motion_of(_values(opened.nodes["R"]), _values(opened.nodes["T"]), key="R")
 
 
-def _own_pose(own: _Nodes) -> Floats | None:
-    """MC-Calib's pose of a camera in the coordinates of the first."""
-    node = own.nodes.get("camera_pose_matrix")
+def _mc_calib_pose(camera: _Nodes) -> Floats | None:
+    """Return T_camera_rig from MC-Calib's pose of a camera in the frame of the first."""
+    node = camera.nodes.get("camera_pose_matrix")
     if node is None:
         return None
     with under("camera_pose_matrix"):
@@ -210,7 +210,7 @@ def _own_pose(own: _Nodes) -> Floats | None:
 
 
 def _values(node: cv2.FileNode) -> Any:
-    """A node as lists of numbers: a matrix row by row, a sequence as it is nested."""
+    """Return a node as lists of numbers: a matrix row by row, a sequence as it is nested."""
     if node.isMap():
         return _matrix(node)
     if node.isSeq():
@@ -223,19 +223,19 @@ def _values(node: cv2.FileNode) -> Any:
 def _matrix(node: cv2.FileNode) -> list[Any]:
     # FileNode.mat trusts rows and cols and overwrites memory where they are missing or wrong
     values: Any = _values(node.getNode("data"))
-    sizes = node.getNode("sizes")  # of an array that is no matrix, like a vector
+    sizes = node.getNode("sizes")  # of an array that is no matrix, such as a vector
     if sizes.empty():
         sides = [node.getNode("rows"), node.getNode("cols")]
-    else:  # in XML a list of one number is a plain number
+    else:  # in XML a list of one number is written as a number
         sides = [sizes.at(i) for i in range(sizes.size())] if sizes.isSeq() else [sizes]
-    whole = all(side.isInt() for side in sides) and isinstance(values, list)
-    if not whole or len(values) != math.prod(int(side.real()) for side in sides):
+    is_valid = all(side.isInt() for side in sides) and isinstance(values, list)
+    if not is_valid or len(values) != math.prod(int(side.real()) for side in sides):
         raise BadKeyError("found a matrix whose data is not rows x cols numbers")
     return list(values)
 
 
 def _stated_model(opened: _Nodes) -> CameraModel | None:
-    """The camera model, where the file states one (OpenCV's calibration sample does)."""
+    """Return the camera model if the file states it, as OpenCV's calibration sample does."""
     for key in ("fisheye_model", "distortion_type"):  # the latter is MC-Calib's
         flag = opened.nodes.get(key)
         if flag is not None and flag.isInt():

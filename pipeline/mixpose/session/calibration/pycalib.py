@@ -1,15 +1,16 @@
-"""pycalib's JSON: lists K, d, R and t with an entry per camera."""
+"""Read pycalib's JSON: lists K, d, R and t with an entry per camera."""
 
 from __future__ import annotations
 
 from functools import partial
 from typing import Any
 
+from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion, motion_of
+from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, under
 
-_DEEP = 3  # a list of matrices; one matrix alone is a camera of another format
+_DEEP = 3  # nesting of a list of matrices; a single matrix is a camera of another format
 
 
 def _depth(value: Any) -> int:
@@ -28,15 +29,15 @@ def _cameras(group: Group) -> dict[str, Reader]:
 
 def _read(content: dict[str, Any], k: int, name: str, model: CameraModel) -> CalibratedCamera:
     with under("K", k):
-        K = camera_matrix(content["K"][k])
+        K = pieces.read_camera_matrix(content["K"][k])
     coefficients = _entry(content, "d", k)
     with under("d", k):
-        D = distortion(coefficients, model)
+        D = pieces.read_distortion(coefficients, model)
     pose = None
     if "R" in content or "t" in content:
         rotation, translation = _entry(content, "R", k), _entry(content, "t", k)
         with under(name):
-            pose = motion_of(rotation, translation, key="R")
+            pose = pieces.motion_of(rotation, translation, key="R")
     return CalibratedCamera(name, Intrinsics(K, D), pose)
 
 

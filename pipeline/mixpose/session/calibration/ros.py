@@ -1,6 +1,6 @@
-"""ROS's camera_info: YAML as camera_calibration saves it, a message as printed, or the older INI.
+"""Read ROS's camera_info: YAML of camera_calibration, a printed message, or the older INI.
 
-The INI form has headings in words, and numbers in the lines below.
+The INI form has headings of words, with numbers in the lines below them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from mixpose.session import intrinsics as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
 from mixpose.session.intrinsics import CameraModel, Intrinsics
-from mixpose.session.messages import BadKeyError, found, one_of, under
+from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 
 _INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")
 
@@ -24,16 +24,16 @@ def _camera(group: Group) -> dict[str, Reader]:
 
 
 def _read(content: dict[str, Any], name: str, model: CameraModel) -> CalibratedCamera:
-    _whole_image(content)
+    _refuse_partial_image(content)
     with under("distortion_model"):
         stated = pieces.model_of_distortion(content.get("distortion_model"))
     matrix_key = _first(content, ("camera_matrix", "K", "k"))
     with under(matrix_key):
-        K = pieces.camera_matrix(_matrix_data(content[matrix_key]))
+        K = pieces.read_camera_matrix(_matrix_data(content[matrix_key]))
     distortion_key = _first(content, ("distortion_coefficients", "D", "d"))
     with under(distortion_key):
-        coefficients = _matrix_data(pieces.present(content, distortion_key))
-        D = pieces.distortion(coefficients, stated or model)
+        coefficients = _matrix_data(pieces.required(content, distortion_key))
+        D = pieces.read_distortion(coefficients, stated or model)
         if D.size and stated is None:
             raise BadKeyError(
                 f"found {D.size} coefficients without a distortion_model; "
@@ -46,7 +46,7 @@ def _read(content: dict[str, Any], name: str, model: CameraModel) -> CalibratedC
     return CalibratedCamera(name, Intrinsics(K, D, size, stated))
 
 
-def _whole_image(content: dict[str, Any]) -> None:
+def _refuse_partial_image(content: dict[str, Any]) -> None:
     roi = content.get("roi")
     roi = roi if isinstance(roi, dict) else {}
     for table, *where, key, whole, kind in (
@@ -58,7 +58,7 @@ def _whole_image(content: dict[str, Any]) -> None:
         if table.get(key, 0) not in whole:
             allowed = " or ".join(map(str, whole))
             raise BadKeyError(
-                f"{found(table[key], allowed)}; for {kind} images give camera_matrix and "
+                f"{mismatch(table[key], allowed)}; for {kind} images give camera_matrix and "
                 "resolution in the session file",
                 *where,
                 key,
@@ -70,8 +70,8 @@ def _first(content: dict[str, Any], keys: tuple[str, ...]) -> str:
 
 
 def _matrix_data(value: Any) -> Any:
-    """The numbers of a matrix, written as rows, cols and data or as a plain list."""
-    return pieces.plain(value.get("data") if isinstance(value, dict) else value)
+    """Return the numbers of a matrix, written as rows, cols and data or as a list."""
+    return pieces.with_numbers(value.get("data") if isinstance(value, dict) else value)
 
 
 def _ini_camera(group: Group) -> dict[str, Reader]:
@@ -83,17 +83,17 @@ def _ini_camera(group: Group) -> dict[str, Reader]:
 def _read_ini(content: Content, name: str, _: CameraModel) -> CalibratedCamera:
     values = _ini_values(content)
     with under("camera matrix"):
-        K = pieces.camera_matrix(values.get("camera matrix"))
+        K = pieces.read_camera_matrix(values.get("camera matrix"))
     with under("distortion"):
-        # five coefficients of the plumb bob, eight of the rational model: both are OpenCV's
-        D = pieces.distortion(values.get("distortion", []), "pinhole")
+        # five coefficients (plumb_bob) or eight (rational_polynomial), in OpenCV's order
+        D = pieces.read_distortion(values.get("distortion", []), "pinhole")
     with under("[image]"):
         size = pieces.size_of([_integer(values, word) for word in ("width", "height")])
     return CalibratedCamera(name, Intrinsics(K, D, size, "pinhole"))
 
 
 def _ini_values(content: Content) -> dict[str, list[float]]:
-    """Numbers below each heading."""
+    """Return the numbers below each heading."""
     values: dict[str, list[float]] = {}
     word = ""
     for line in content.lines:
@@ -104,7 +104,7 @@ def _ini_values(content: Content) -> dict[str, list[float]]:
             try:
                 values[word] += [float(cell) for cell in line.split()]
             except ValueError as error:
-                raise BadKeyError(found(line, "numbers"), word) from error
+                raise BadKeyError(mismatch(line, "numbers"), word) from error
     return values
 
 
