@@ -10,6 +10,7 @@ import pytest
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.records import Estimate, PointPattern, SensorReport
+from mixpose.rigid import from_rotation_vector
 from mixpose.sensors import PinholeCamera
 
 POINTS = np.array([[10.0, 20.0], [30.0, 40.0]])
@@ -65,8 +66,21 @@ K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
         (None, {"camera_matrix": np.eye(2)}, r"camera_matrix of its sensor: found shape \(2, 2\)"),
         (None, {"camera_matrix": K * np.nan}, "camera_matrix of its sensor: found NaN"),
         (None, {"T_sensor_world": np.diag([1, 1, -1, 1.0])}, "T_sensor_world of its sensor: not a"),
+        ([[1.0, 2.0, 3.0]] * 3, {}, "body 'wand': all features are at one place"),
+        (None, {"distortion": np.full(5, np.nan)}, "distortion of its sensor: found NaN"),
+        (None, {"resolution": (640, 0)}, "resolution of its sensor: allowed: pixels, 1 or more"),
     ],
-    ids=["no features", "NaN", "two numbers", "2x2", "NaN in a matrix", "mirrored"],
+    ids=[
+        "no features",
+        "NaN",
+        "two numbers",
+        "2x2",
+        "NaN in a matrix",
+        "mirrored",
+        "one place",
+        "NaN in a lens",
+        "no pixels",
+    ],
 )
 def test_a_single_estimate_refuses_bodies_and_cameras_that_cannot_be_meant(
     features: Any, camera: dict[str, Any], said: str
@@ -92,6 +106,20 @@ def test_a_single_estimate_refuses_a_view_that_is_given_twice_and_a_variance_bel
     below = Body("wand", (*body.features, PointFeature(np.ones(3), np.diag([1.0, -1.0, 1.0]))))
     with pytest.raises(ValueError, match="feature 4 of 'wand': a covariance with a variance below"):
         mixpose.estimate_pose([view], below)
+
+
+def test_views_of_a_single_estimate_may_come_one_by_one_but_not_be_missing() -> None:
+    rng = np.random.default_rng(3)
+    points, eye = rng.uniform(-50, 50, (6, 3)), PinholeCamera(K)
+    T = from_rotation_vector(np.array([0.2, -0.1, 0.3]), np.array([5.0, -8.0, 600.0]))
+    y, _ = eye.project(points @ T[:3, :3].T + T[:3, 3])
+    body = Body("wand", tuple(PointFeature(point) for point in points))
+    view = mixpose.View("camera", eye, mixpose.Observation(PointPattern(y, np.ones(6)), sigma=1.5))
+    found = mixpose.estimate_pose((each for each in [view]), body, T)
+    assert found.status == mixpose.estimate_pose([view], body, T).status == "ok"
+    assert found.T_world_object == pytest.approx(T, abs=1e-3)
+    with pytest.raises(ValueError, match="views: found none; allowed: one or more"):
+        mixpose.estimate_pose([], body)
 
 
 def test_estimates_that_took_another_time_are_the_same() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -70,7 +71,7 @@ Remember: TypeAlias = Callable[[Memory], None]
 def run(
     session: Session,
     *,
-    sources: Mapping[str, str] | None = None,
+    sources: Mapping[str, str | PathLike[str]] | None = None,
     opened: Mapping[str, Source] | None = None,
     selection: Selection = Selection(),
     T_start: Floats | Starts | None = None,
@@ -86,7 +87,7 @@ def run(
     Parameters
     ----------
     session : Session
-    sources : mapping of str to str or None
+    sources : mapping of str to str or path, or None
         Recordings that replace those of the session, by sensor name; relative to the working
         directory.
     opened : mapping of str to Source or None
@@ -179,7 +180,9 @@ def _tracker(
     )
 
 
-def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
+def open_sources(
+    session: Session, replaced: Mapping[str, str | PathLike[str]]
+) -> dict[str, Source]:
     """Open the recordings of all sensors.
 
     Raises SessionError if a replaced sensor is not in the session, or a sensor has no source.
@@ -196,7 +199,9 @@ def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Sou
     return paired_by_stamp(opened)
 
 
-def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> SourceSpec:
+def source_spec(
+    session: Session, setup: SensorSetup, replaced: str | PathLike[str] | None
+) -> SourceSpec:
     """Return the specification of the source that a sensor's frames are read from."""
     if replaced is None and not setup.source:
         raise SessionError(
@@ -205,7 +210,7 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
         )
     return SourceSpec(
         sensor=setup.name,
-        source=setup.source if replaced is None else replaced,
+        source=setup.source if replaced is None else fspath(replaced),
         base=session.folder if replaced is None else Path(),
         kind=_KINDS.get(setup.model, "camera"),
         resolution=setup.resolution,

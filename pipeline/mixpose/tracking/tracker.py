@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
@@ -249,17 +249,17 @@ class Tracker(Setup):
 
 
 def estimate_pose(
-    views: Sequence[View],
+    views: Iterable[View],
     model: Body,
     start: Floats | None = None,
     options: EstimatorOptions | None = None,
 ) -> Estimate:
     """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
 
-    Raises ValueError for invalid arrays: a start or sensor that is no rigid motion, NaN, other
-    shapes, features of a view that have not the dimension of its sensor.
+    Raises ValueError if there is no view, and for invalid arrays: a start or sensor that is no
+    rigid motion, NaN, other shapes, features of a view that have not the dimension of its sensor.
     """
-    require_valid(views, model)
+    require_valid(views := tuple(views), model)
     tracker = Tracker.about_centre(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     with one_blas_thread():
