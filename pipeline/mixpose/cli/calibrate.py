@@ -19,7 +19,7 @@ from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli import output
 from mixpose.cli.app import CalibrateRequest
-from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.notices import say, shown_progress, warn
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -71,7 +71,7 @@ def _calibrated(
     """Calibrate, for as long as what comes of it is written."""
     rules = CalibrationRules()
     with ExitStack() as kept:
-        with watched() as progress:
+        with shown_progress() as progress:
             task = task_of(session, request, rules, progress)
             say(f"free: {words.words_of(task.rig.names, task.free, task.body_free)}")
             if len(session.objects) > 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mixpose.cli import output
 from mixpose.cli.app import LearnRequest
-from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.notices import say, shown_progress, warn
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import Learnt, Lesson, by_markers, learn, like
@@ -27,7 +27,7 @@ def learn_session(request: LearnRequest) -> None:
     older = None if request.like is None else _older(request.like, session)
     if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
-    with watched() as progress:
+    with shown_progress() as progress:
         lesson = learn(session, named_sources(request.source or ()), progress)
     bodies = _in_frames(lesson, request, older)
     if len(bodies) > 1 and output.is_stdout(request.output):

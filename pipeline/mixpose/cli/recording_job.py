@@ -24,7 +24,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from mixpose.cli.lines import held, note_path
-from mixpose.cli.notices import told_frames
+from mixpose.cli.notices import parsed_frames
 from mixpose.errors import SessionError
 from mixpose.whole_files import appearing_whole
 
@@ -174,8 +174,8 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
         lines.append(f"mixpose: ended by signal {-status}")
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
-    told = [found for line in lines if (found := told_frames(line))]
-    frames, bodies = told[-1] if told else ({}, 1)  # as the run said in the end
+    parsed = [counts for line in lines if (counts := parsed_frames(line))]
+    frames, bodies = parsed[-1] if parsed else ({}, 1)
     if goes_on and state != FAILED:
         with suppress(OSError, ValueError, KeyError):
             frames = _statuses_in(poses)
