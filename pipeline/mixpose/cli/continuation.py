@@ -150,7 +150,7 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
 def _require_same_beginning(
     poses: Path, begun: int, wanted: Selection, opened: dict[str, Source]
 ) -> None:
-    """Raise SessionError if the poses written begin at another frame than this run would."""
+    """Raise SessionError if the written poses begin at another frame than this run would."""
     with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
         first = next(frames, None)
     if first is not None and first.number != begun:

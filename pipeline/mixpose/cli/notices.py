@@ -138,12 +138,12 @@ class Summary:
             )
         if estimate.status == "lost":
             return
-        reasons = {n: use.why for n, use in estimate.sensors.items() if use.why}
+        reasons = {n: report.why for n, report in estimate.sensors.items() if report.why}
         self.left_out.update((n, why) for n, why in reasons.items() if why != self.idle_for)
         shares = {
-            n: use.explained or 0.0
-            for n, use in estimate.sensors.items()
-            if use.used or use.why == self.idle_for
+            n: report.explained or 0.0
+            for n, report in estimate.sensors.items()
+            if report.used or report.why == self.idle_for
         }
         idle = [name for name, share in shares.items() if share < _NOTHING]
         self.posed.update(shares.keys())

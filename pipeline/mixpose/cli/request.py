@@ -156,9 +156,7 @@ def output_of(named: Path | None) -> Path | None:
 def by_suffix(output: Path | None, suffixes: Mapping[str, str]) -> str | None:
     """Return the format that belongs to the suffix of a file name; None if none does."""
     name = "" if output is None else output.name.casefold()
-    return next(
-        (format_name for suffix, format_name in suffixes.items() if name.endswith(suffix)), None
-    )
+    return next((word for end, word in suffixes.items() if name.endswith(end)), None)
 
 
 def _format_by_suffix(output: Path | None) -> str:

@@ -168,9 +168,8 @@ def header_of(
     sources: Mapping[str, str] | None = None,
     options: Mapping[str, int | bool] | None = None,
 ) -> Header:
-    """Return the header of a session's poses.
-
-    It names recordings that replace the session's (`sources`), and options that change pose lines.
+    """Return the header of a session's poses, with `sources` that replace the session's and those
+    `options` that change pose lines.
     """
     return Header(
         unit=session.unit,
