@@ -1,4 +1,4 @@
-"""What people type: commands and options.  Each command imports its work when it is called."""
+"""Commands and their options.  Each command imports its work when it is called."""
 
 from __future__ import annotations
 

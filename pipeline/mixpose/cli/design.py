@@ -1,4 +1,4 @@
-"""``mixpose design``: what planned systems will achieve."""
+"""``mixpose design``: predict the accuracy of planned systems."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def design_sessions(asked: DesignRequest) -> None:
     _require_room(asked, paths)
     for path, session in zip(paths, sessions, strict=True):
         if len(session.objects) > 1:
-            bodies = ", ".join(one.body.name for one in session.objects)
+            bodies = ", ".join(setup.body.name for setup in session.objects)
             warn(f"{path}: {session.body.name!r} alone is judged, the first of {bodies}")
-    # of each its own, or that of its folder
+    # named by the file or, if that is session.toml, by its folder
     stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
     names = [s if stems.count(s) == 1 else f"{s} ({k + 1})" for k, s in enumerate(stems)]
     request = Request(
@@ -54,27 +54,27 @@ def design_sessions(asked: DesignRequest) -> None:
         seed=asked.seed,
         tolerance=asked.tolerance,
     )
-    told = say if sys.stderr.isatty() else lambda text: None
-    # what does the simulated frames: this process, others, or a cluster
-    alone = not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None)
-    several = asked.workers if asked.workers > 1 else None
-    with nullcontext() if alone else executor(asked.scheduler, several) as workers:
-        found = study(list(zip(names, sessions, strict=True)), request, told, workers)
-    output.print_lines([study_text(found).removesuffix("\n")], asked.json)
+    progress = say if sys.stderr.isatty() else lambda text: None
+    # frames are simulated in this process, in others, or on a cluster
+    is_serial = not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None)
+    worker_count = asked.workers if asked.workers > 1 else None
+    with nullcontext() if is_serial else executor(asked.scheduler, worker_count) as workers:
+        results = study(list(zip(names, sessions, strict=True)), request, progress, workers)
+    output.print_lines([study_text(results).removesuffix("\n")], asked.json)
     if asked.json is not None:
-        output.write_text(asked.json, json.dumps(study_json(found), indent=1) + "\n", "--json")
+        output.write_text(asked.json, json.dumps(study_json(results), indent=1) + "\n", "--json")
     if asked.plot is not None:
         from mixpose.design.plot import draw_study  # noqa: PLC0415
 
         with appearing_whole(asked.plot) as draft:
-            draw_study(found, draft)
+            draw_study(results, draft)
             sign_figure(draft)
     if written := [output.shown(path) for path in (asked.json, asked.plot) if path is not None]:
         say(f"{counted(len(names), 'system')} -> {', '.join(written)}")
 
 
 def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
-    """See that what will be written is in nothing's way, before anything is computed."""
+    """Raise SessionError if an output cannot be written, before anything is computed."""
     if asked.json is not None:
         output.refuse_to_overwrite_but(asked.json, (*sessions, asked.poses), JSON_MARK, "--json")
     output.refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
@@ -103,17 +103,17 @@ def _poses(session: Session, asked: DesignRequest) -> Floats:
 
 
 def _read(path: Path, session: Session) -> list[Floats]:
-    """Poses of the session's body from a file; a SessionError if it has none of its unit."""
-    read = read_poses(path)
-    read.require_unit(session.unit, SessionError)
+    """Return poses of the session's body from a file; SessionError if none, or another unit."""
+    file = read_poses(path)
+    file.require_unit(session.unit, SessionError)
     name = session.body.name
     poses = [
         pose.T_world_object
-        for pose in read.poses
+        for pose in file.poses
         if pose.T_world_object is not None and pose.object == name
     ]
     if not poses:
-        others = ", ".join(dict.fromkeys(pose.object for pose in read.poses)) or "none"
+        others = ", ".join(dict.fromkeys(pose.object for pose in file.poses)) or "none"
         raise SessionError(
             f"--poses {path}: holds no pose of {name!r}, the body of {session.path}; found lines "
             f"of {others}"
@@ -131,9 +131,9 @@ def _three(option: str, text: str) -> Floats:
 def _noises(
     given: Sequence[str], sessions: Sequence[Session], names: Sequence[str]
 ) -> dict[tuple[int | None, str], float]:
-    """``SENSOR=NUMBER`` for all systems, ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
+    """Parse noise: ``SENSOR=NUMBER``, or ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
     noises: dict[tuple[int | None, str], float] = {}
-    # what is said of fewer systems and sensors counts more, wherever it stands
+    # texts for fewer systems or sensors override more general ones, in any order
     for text in sorted(given, key=lambda text: ("*" not in text, ":" in text)):
         place, _, number = text.rpartition("=")
         system, _, sensor = place.rpartition(":")
@@ -145,14 +145,14 @@ def _noises(
             )
         if system and system not in names:
             raise SessionError(f"--noise: found no system {system!r}; systems: {', '.join(names)}")
-        meant = [
+        selected = [
             (k, setup.name)
             for k, (name, session) in enumerate(zip(names, sessions, strict=True))
             for setup in session.sensors
             if system in ("", name) and sensor in ("*", setup.name)
         ]
-        noises |= dict.fromkeys(meant, value)
-        if not meant:
+        noises |= dict.fromkeys(selected, value)
+        if not selected:
             known = sorted({setup.name for session in sessions for setup in session.sensors})
             raise SessionError(f"--noise: found no sensor {sensor!r}; sensors: {', '.join(known)}")
     return noises

@@ -1,4 +1,4 @@
-"""``mixpose learn``: tables of markers from a recording in which bodies move."""
+"""``mixpose learn``: learn tables of markers from a recording in which bodies move."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mixpose.session.messages import BadKeyError
 
 
 def learn_session(request: LearnRequest) -> None:
-    """Learn the bodies of a recording, or a RecordingError if none moves; write a table of each."""
+    """Learn the bodies of a recording and write their tables; RecordingError if none moves."""
     path = request.session
     session = load_scene(path, allow_code=request.allow_code)
     inputs = path, request.like
     output.refuse_to_overwrite_but(request.output, inputs, MARK)
     output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
-    if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
+    if others := [setup.name for setup in session.sensors if setup.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
     with shown_progress() as progress:
         lesson = learn(session, named_sources(request.source or ()), progress)
@@ -51,25 +51,25 @@ def _older(path: Path, session: Session) -> Markers:
 
 
 def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> list[Learnt]:
-    """Bodies in the frame that was asked for; the one that is like an older one first."""
+    """Return the bodies in the requested axes, first the one that is like the older table."""
     bodies = list(lesson.bodies)
     if older is not None:
-        found = [(like(each, older.points, older.names), k) for k, each in enumerate(bodies)]
-        alike = [(-one.shared, one.off, k, one) for one, k in found if one is not None]
+        fits = [(like(body, older.points, older.names), k) for k, body in enumerate(bodies)]
+        alike = [(-fit.shared, fit.off, k, fit) for fit, k in fits if fit is not None]
         if not alike:
             raise RecordingError(
                 f"--like {request.like}: found bodies of "
-                f"{', '.join(str(len(each.points)) for each in bodies)} markers that move, none "
+                f"{', '.join(str(len(body.points)) for body in bodies)} markers that move, none "
                 "of which has those of the table; see without --like what they are"
             )
-        _, off, k, best = min(alike, key=lambda each: each[:3])
+        _, off, k, best = min(alike, key=lambda entry: entry[:3])
         say(f"like {request.like}: {best.shared} markers in both, {off:.3g} off at most")
         if best.others:
             warn(
                 f"--like {request.like}: the markers can be laid on it in {best.others} other "
                 f"way{'s' * (best.others > 1)} with as many of them; the closest is taken"
             )
-        bodies = [best.learnt, *(each for n, each in enumerate(bodies) if n != k)]
+        bodies = [best.learnt, *(body for n, body in enumerate(bodies) if n != k)]
     if request.axes is not None:
         bodies[0] = by_markers(bodies[0], request.axes)
     return bodies
@@ -91,15 +91,15 @@ def _tell(
     names = [file.name for file in called]
     pairs = zip(bodies, names, strict=True)
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
-    for doubt in (*doubts, *look_alikes(bodies, names), *_late_ones(session, bodies, names)):
+    for doubt in (*doubts, *look_alikes(bodies, names), *_late_warnings(session, bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
 
 
-def _late_ones(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
-    """Bodies whose motion is not known, where late sensors ask for it."""
-    late = [one.name for one in session.sensors if one.delay or one.readout]
+def _late_warnings(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+    """Return warnings of identical bodies, whose motion is unknown although sensors are late."""
+    late = [setup.name for setup in session.sensors if setup.delay or setup.readout]
     return [
         f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, of "
         "which none is followed: move slowly, or learn from a recording of one alone"

@@ -1,4 +1,4 @@
-"""``mixpose simulate``: a recording with its truth."""
+"""``mixpose simulate``: render a recording with its true poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mixpose.simulation.session_copy import SESSION_NAME
 
 
 def delays_of(given: list[str]) -> dict[str, float]:
-    """Seconds by sensor, of texts NAME=SECONDS. Raises SessionError if a text is not like that."""
+    """Return seconds by sensor from texts NAME=SECONDS; SessionError if a text has another form."""
     delays = {}
     for text in given:
         name, _, seconds = text.rpartition("=")
@@ -31,24 +31,24 @@ def delays_of(given: list[str]) -> dict[str, float]:
 
 def simulate_session(request: SimulateRequest) -> None:
     """Render the recording of a session into a folder."""
-    names = {one.name for one in fields(SimulationOptions)} - {"delay"}
+    names = {entry.name for entry in fields(SimulationOptions)} - {"delay"}
     given = {name: value for name, value in vars(request).items() if name in names}
     options = SimulationOptions(**given, delay=delays_of(request.delay or []))
     folder, overwrite = request.output, request.overwrite
     refuse_stdout(folder, "-o", "a recording", "a folder, as -o recording")
     session = load_session(request.session)
-    with bar("simulating", options.frames) as moved:
+    with bar("simulating", options.frames) as tick:
         unused = simulate(
             session,
             folder,
             options,
             overwrite=overwrite,
-            progress=lambda done: moved(completed=done),
+            progress=lambda done: tick(completed=done),
         )
     if unused:
-        typed = {one.name: option_name(one) for one in fields(SimulateRequest)}
-        told = ", ".join(typed[name] for name in unused)
-        warn(f"{told}: no sensor or body of this session has what that is about")
+        typed = {entry.name: option_name(entry) for entry in fields(SimulateRequest)}
+        listed = ", ".join(typed[name] for name in unused)
+        warn(f"{listed}: no sensor or body of this session has what that is about")
     count = counted(options.frames, "frame")
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr
