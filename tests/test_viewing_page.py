@@ -61,7 +61,7 @@ def server() -> Iterator[Any]:
 
 def moment(frame: int, *estimates: Estimate) -> Moment:
     pattern = PointPattern(np.array([[30.0, 20.0]]), np.ones(1))
-    seen = Shown(RawFrame(frame, None, pattern), found=pattern.points)
+    seen = Shown(RawFrame(frame, None, pattern), features=pattern.points)
     counts = Counter(one.status for one in estimates)
     return Moment(estimates, {"left": seen, "right": seen}, (row_of(estimates),), counts)
 

@@ -250,10 +250,10 @@ def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
     """Raise SessionError if the folder of a job exists and belongs to another session."""
     for job in jobs:
         for name in (job.name, f".{job.name}.{UNFINISHED}"):
-            found = recording_job.outcome_in(folder / name)
-            if found is not None and Path(found.session).resolve() != Path(job.session).resolve():
+            other = recording_job.outcome_in(folder / name)
+            if other is not None and Path(other.session).resolve() != Path(job.session).resolve():
                 raise SessionError(
-                    f"-o {folder}: {name} in it is of {found.session}, not of {job.session}; name "
+                    f"-o {folder}: {name} in it is of {other.session}, not of {job.session}; name "
                     "another folder, or remove that one"
                 )
 

@@ -39,11 +39,7 @@ def simulate_session(request: SimulateRequest) -> None:
     session = load_session(request.session)
     with bar("simulating", options.frames) as tick:
         unused = simulate(
-            session,
-            folder,
-            options,
-            overwrite=overwrite,
-            progress=lambda done: tick(completed=done),
+            session, folder, options, overwrite=overwrite, progress=lambda k: tick(completed=k)
         )
     if unused:
         typed = {entry.name: option_name(entry) for entry in fields(SimulateRequest)}

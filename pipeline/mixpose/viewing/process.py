@@ -1,4 +1,4 @@
-"""The process of the page: asks for moments as fast as somebody sees them, and draws them."""
+"""The process of the page: asks for moments as fast as browsers show them, and draws them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # an extra
     from mixpose.viewing.page import Page
 
 _LOOK_S = 0.05
-_NICENESS = 5  # the run goes first where there are few processors
+_NICENESS = 5  # the run has priority if there are few processors
 
 
 def show(
@@ -27,7 +27,7 @@ def show(
 ) -> None:
     """Show the moments that come through a pipe until it ends.
 
-    Runs `on_files` can be paused, and are `paused` to begin with or not.
+    Runs `on_files` can be paused, and may begin `paused`.
     """
     _be_quiet()
     from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
@@ -36,7 +36,7 @@ def show(
     wishes = Wishes(connection)
     with started(place, on_viewers=wishes.viewers_are) as server:
         page = Page(server, session, wishes.wish if on_files else None, paused=paused)
-        with suppress(EOFError, OSError):  # the run is gone
+        with suppress(EOFError, OSError):  # the run has ended
             _play(connection, wishes, page)
 
 
@@ -60,7 +60,7 @@ def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
 
 
 class Wishes:
-    """What the page tells the run, from any thread."""
+    """Messages of the page to the run, from any thread."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -68,18 +68,18 @@ class Wishes:
         self.viewers = 0
 
     def wish(self, what: Wish) -> None:
-        """Ask the run for something, or tell it."""
+        """Send a message to the run."""
         with self._lock:
             self._connection.send(what)
 
     def viewers_are(self, count: int) -> None:
-        """Tell how many browsers look."""
+        """Send the number of browsers that show the page."""
         self.viewers = count
         self.wish(count)
 
 
 def _be_quiet() -> None:
-    """Leave standard output, to which poses may go, and interrupts to the run."""
+    """Leave interrupts and standard output, which may take poses, to the run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

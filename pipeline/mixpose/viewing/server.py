@@ -1,4 +1,4 @@
-"""The server of the page: viser on a socket that is there already, behind a `Guard`."""
+"""The server of the page: viser on an existing socket, behind a `Guard`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from websockets.http11 import Request, Response
 
 from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Guard, Place
 
-_MADE_S = 0.01  # between two looks at whether the server is made
+_MADE_S = 0.01  # between two tests whether the server is made
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc]
-    """A server that never opens itself to the outside, whatever a browser asks of it."""
+    """A server that ignores requests of a browser to open itself to the outside."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -28,8 +28,8 @@ class _Server(viser.ViserServer):  # type: ignore[misc]
 
 @contextmanager
 def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.ViserServer]:
-    """A server that answers on a socket, and tells the number of browsers whenever it changes."""
-    # a browser that breaks off, or one that is refused, is nothing to report
+    """Run a server on a socket; it reports the number of browsers whenever that changes."""
+    # browsers that disconnect or are refused are not reported
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     ready = threading.Event()
     with _behind(place, ready):
@@ -49,11 +49,11 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 
 @contextmanager
 def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
-    """Let a server that begins here use the socket of a place, and ask its guard first.
+    """Let a server that starts in this context use the socket of a place, and ask its guard first.
 
-    viser offers neither, so what it serves with is replaced while it begins. The socket takes
-    browsers from the start, viser only once it is made: they are held until it is `ready`. A
-    `RuntimeError` if it began otherwise, and the guard was not asked.
+    viser offers neither, so the function that it serves with is replaced while it starts. The
+    socket accepts browsers from the start; they wait until viser is `ready`. Raises RuntimeError if
+    viser started in another way, without the guard.
     """
     usual = websockets.asyncio.server.serve
     guard = Guard(place.port, place.token)
