@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     _replace_closed_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _ended_like_interrupted():
+        with _signals_as_interrupts():
             status = _status(words)
     except KeyboardInterrupt:  # while the commands were being imported
         status = _interrupted(words)
@@ -51,7 +51,7 @@ def _replace_closed_streams() -> None:
 
 
 @contextmanager
-def _ended_like_interrupted() -> Iterator[None]:
+def _signals_as_interrupts() -> Iterator[None]:
     """Turn requests to end into interrupts, so that files are closed; keep ignored ones ignored."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -59,13 +59,13 @@ def _ended_like_interrupted() -> Iterator[None]:
 
     names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    taken = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
-    for number in taken:
+    handled = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in handled:
         signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for number in taken:
+        for number in handled:
             signal.signal(number, signal.SIG_DFL)
 
 

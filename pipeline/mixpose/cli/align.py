@@ -56,8 +56,8 @@ def _floor_poses(text: str, session: Session, sources: Sequence[str]) -> list[Es
         if not lines:
             raise RecordingError(f"--floor {text}: found no pose that is ok")
         return list(lines)
-    label, at, frame = text.rpartition("@")
-    if not at or label not in session.labels or not frame.isdecimal():
+    label, separator, frame = text.rpartition("@")
+    if not separator or label not in session.labels or not frame.isdecimal():
         raise SessionError(
             f"--floor {text}: no such file; allowed: a file of poses, or OBJECT@FRAME with one of "
             f"{', '.join(session.labels)}"

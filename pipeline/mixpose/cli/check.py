@@ -37,14 +37,14 @@ class _Report:
 
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    of_counts: list[str] = field(default_factory=list)  # warnings about numbers of features
-    of: str = ""  # prefix that names one of several bodies
+    count_warnings: list[str] = field(default_factory=list)  # warnings about numbers of features
+    prefix: str = ""  # the name of one of several bodies
 
     def say(self, title: str, text: str) -> None:
-        self.lines.append(f"{title:<10}{self.of}{text}")
+        self.lines.append(f"{title:<10}{self.prefix}{text}")
 
     def warn(self, text: str) -> None:
-        self.warnings.append(f"{self.of}{text}")
+        self.warnings.append(f"{self.prefix}{text}")
 
     def write(self, tried: str, qualifier: str = "") -> None:
         """Print all lines; without warnings, `tried` says what was tested, after a `qualifier`."""
@@ -88,9 +88,9 @@ def check_session(request: CheckRequest) -> None:
     placed = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
     report.lines += placed.lines
     if doubts.mended is None:
-        counts = keys.told_apart(report.of_counts, len(session.sensors))
+        counts = keys.told_apart(report.count_warnings, len(session.sensors))
         report.warnings = [*counts, *report.warnings, *placed.warnings, *doubts.warnings]
-        if doubts.unexplained and not (report.of_counts or doubts.warnings):
+        if doubts.unexplained and not (report.count_warnings or doubts.warnings):
             report.warnings.append(doubts.unexplained)
     else:  # the cause first, then what remains odd
         report.warnings = [*doubts.warnings, *report.warnings, *placed.warnings]
@@ -110,8 +110,8 @@ def check_session(request: CheckRequest) -> None:
     qualifier = " but for the error that follows" if damage else ""
     report.write(doubts.tried or not_tried, qualifier)
     if damage:
-        more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
-        raise RecordingError(f"{damage[0]}{more}")
+        suffix = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
+        raise RecordingError(f"{damage[0]}{suffix}")
 
 
 def _of_geometry(session: Session) -> _Report:
@@ -119,9 +119,9 @@ def _of_geometry(session: Session) -> _Report:
     report = _Report()
     report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
     for setup in session.objects:
-        report.of = f"{setup.body.name}: " if len(session.objects) > 1 else ""
+        report.prefix = f"{setup.body.name}: " if len(session.objects) > 1 else ""
         _say_accuracy(report, session.alone(setup.body.name))
-    report.of = ""
+    report.prefix = ""
     report.warnings += keys.shared_part_warnings(session)
     return report
 
@@ -130,16 +130,16 @@ def _say_object(report: _Report, session: Session, setup: ObjectSetup) -> None:
     body = setup.body
     spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
     extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
-    many = f", {setup.count} that are identical" if setup.count > 1 else ""
-    report.say("object", f"{body.name}: {extent}{spread}{many}")
-    alike, of = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
+    identical = f", {setup.count} that are identical" if setup.count > 1 else ""
+    report.say("object", f"{body.name}: {extent}{spread}{identical}")
+    count, prefix = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
     within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
-    same = f"{alike} orientations look the same{within}" if alike > 1 else "none"
+    symmetry = f"{count} orientations look the same{within}" if count > 1 else "none"
     points = body.nodes.points
     if free_mask(session.estimator)[3:].all() and is_on_a_line(points, default_tolerance(points)):
-        same = "all turns about the line of its features look the same: no frame has its pose"
-    written = "; the pose nearest to the previous one is written" if alike > 1 else ""
-    report.say("symmetry", f"{of}{same}{written}")
+        symmetry = "all turns about the line of its features look the same: no frame has its pose"
+    written = "; the pose nearest to the previous one is written" if count > 1 else ""
+    report.say("symmetry", f"{prefix}{symmetry}{written}")
 
 
 def _say_sensor(
@@ -203,21 +203,21 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
 def _say_features(
     report: _Report, session: Session, setup: SensorSetup, source: Source, survey: recordings.Survey
 ) -> None:
-    where = f"sensor {setup.name!r}"
+    sensor = f"sensor {setup.name!r}"
     singles = [(session.alone(table.body.name), table.count) for table in session.objects]
     expected = sum(count * placement.expected_count(setup, single) for single, count in singles)
     if not (survey.numbers or survey.damage):
-        report.warn(f"{where}: its recording has no frame")
+        report.warn(f"{sensor}: its recording has no frame")
     if survey.counts is None:
         if survey.numbers and survey.empty:
             frames = recordings.listed(survey.empty)
-            report.warn(f"{where}: nothing but one value in frame {frames}")
+            report.warn(f"{sensor}: nothing but one value in frame {frames}")
         return
     low, high = min(survey.counts), max(survey.counts)
     middle = float(np.median(survey.counts))
     counted = len(survey.counted)
-    of = "" if counted == len(survey.numbers) else f" of {counted} frames"
-    counts = f"{low} / {middle:g} / {high} (least / median / most{of})"
+    basis = "" if counted == len(survey.numbers) else f" of {counted} frames"
+    counts = f"{low} / {middle:g} / {high} (least / median / most{basis})"
     report.say("", f"features per frame: {counts}, expected: {expected}")
     fewest = min(placement.fewest_count(setup, single) for single, _ in singles)
     judgement = keys.judge(middle, expected, fewest if len(session.labels) == 1 else None)
@@ -226,12 +226,12 @@ def _say_features(
         assert typical is not None, "there are counts"
         image = recordings.image_of(source, typical)
         count = survey.counts[survey.counted.index(typical)]
-        report.of_counts.append(
-            f"{where}: {judgement} features, {count} in frame {typical} where "
+        report.count_warnings.append(
+            f"{sensor}: {judgement} features, {count} in frame {typical} where "
             f"{expected} are expected: {keys.advice(session, setup, typical, image, expected)}"
         )
     elif survey.empty:
-        report.warn(f"{where}: no feature in frame {recordings.listed(survey.empty)}")
+        report.warn(f"{sensor}: no feature in frame {recordings.listed(survey.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:
@@ -248,14 +248,14 @@ def _say_accuracy(report: _Report, session: Session) -> None:
     if session.start is not None:
         _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
         return
-    are_several = placement.depends_on_distance(session)
-    for away in _AWAY if are_several else _AWAY[:1]:
+    has_depth = placement.depends_on_distance(session)
+    for away in _AWAY if has_depth else _AWAY[:1]:
         poses = placement.typical_poses(session, _TYPICAL_POSES, away=away)
         if not poses:
             report.say("start", "none, and no place is in view of the sensors: add [start]")
             return
         where = "in the middle of the sensors' common view"
-        if are_several:
+        if has_depth:
             middle = transform(np.array(poses), session.body.means.mean(axis=0)[None])[:, 0]
             distance = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
             where = f"{float(f'{distance:.3g}'):g} {session.unit} away"

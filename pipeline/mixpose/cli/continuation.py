@@ -103,7 +103,7 @@ class Continuation:
     is_done: bool = False  # whether no frame remains to be estimated
 
 
-def continuation(request: RunRequest, header: Header, opened: dict[str, Source]) -> Continuation:
+def resume(request: RunRequest, header: Header, opened: dict[str, Source]) -> Continuation:
     """Find where a run resumes in its file of poses.
 
     Raises SessionError if no file is named, it belongs to another run, another run writes to it,
@@ -115,27 +115,27 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
                 f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
                 "and name another file with -o"
             )
-    poses, wanted = request.poses, request.selection
+    poses, requested = request.poses, request.selection
     if poses is None or request.format_name != "jsonl":
         raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
     if not poses.is_file():
-        return Continuation(None, wanted)
+        return Continuation(None, requested)
     file = LineFile(poses, afresh=False)  # locked: no other run writes from here on
     try:
         reached = resume_point(poses, header)
         if reached is None:
             file.close()
-            return Continuation(None, wanted)
-        _require_same_beginning(poses, reached.first, wanted, opened)
+            return Continuation(None, requested)
+        _require_same_beginning(poses, reached.first, requested, opened)
         file.rewind(reached.size, reached.checksum)
-        after = _after(wanted, reached.frame)
+        after = _after(requested, reached.frame)
         with closing(pair(opened, after.start, after.stop, after.step)) as frames:
             if next(frames, None) is None:
                 return Continuation(file, after, is_done=True)
         note = _note(poses)
         if note is not None:
             file.rewind(note.size, note.checksum)
-            return Continuation(file, _after(wanted, note.frame), note.memory)
+            return Continuation(file, _after(requested, note.frame), note.memory)
     except BaseException:
         with suppress(OSError):
             file.close()
@@ -144,14 +144,14 @@ def continuation(request: RunRequest, header: Header, opened: dict[str, Source])
         f"{poses}: what the run knew is not written beside it; its frames up to {reached.frame} "
         "are estimated again and left as they are"
     )
-    return Continuation(file, wanted, last_written=reached)
+    return Continuation(file, requested, last_written=reached)
 
 
 def _require_same_beginning(
-    poses: Path, begun: int, wanted: Selection, opened: dict[str, Source]
+    poses: Path, begun: int, requested: Selection, opened: dict[str, Source]
 ) -> None:
     """Raise SessionError if the written poses begin at another frame than this run would."""
-    with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
+    with closing(pair(opened, requested.start, requested.stop, requested.step)) as frames:
         first = next(frames, None)
     if first is not None and first.number != begun:
         raise SessionError(
@@ -160,15 +160,15 @@ def _require_same_beginning(
         )
 
 
-def _after(wanted: Selection, last: int) -> Selection:
+def _after(selection: Selection, last: int) -> Selection:
     """Return the remaining selection after frame `last`, on the same grid of frame numbers."""
     begin = last + 1
-    if wanted.start is not None:
-        steps = max(-(-(begin - wanted.start) // wanted.step), 0)
-        begin = wanted.start + steps * wanted.step
-    elif wanted.step > 1:
-        begin = last + wanted.step
-    return replace(wanted, start=begin)
+    if selection.start is not None:
+        steps = max(-(-(begin - selection.start) // selection.step), 0)
+        begin = selection.start + steps * selection.step
+    elif selection.step > 1:
+        begin = last + selection.step
+    return replace(selection, start=begin)
 
 
 def _note(poses: Path) -> Note | None:

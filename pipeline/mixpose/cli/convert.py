@@ -205,8 +205,8 @@ def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseL
     if name == "jsonl":
         return lines
     answers = Counter((line.frame, line.label) for line in lines)
-    several = sum(count > 1 for count in answers.values())
-    if several:
-        frames = counted(several, "frame")
+    repeated = sum(count > 1 for count in answers.values())
+    if repeated:
+        frames = counted(repeated, "frame")
         warn(f"{poses.path}: several right answers in {frames}; the first is written")
     return estimates.first_answers(lines)

@@ -30,7 +30,7 @@ _LONG = 3  # frames in a row that are no accident
 _OFTEN = 0.2  # share of all frames that is no accident either, in a row or not
 _FEWEST = 10  # frames with residuals of a sensor before it is judged
 _FAR = 10.0  # times the usual residual of a sensor: its features are met far off
-_AT_LEAST = 0.2  # of sigma, for that
+_AT_LEAST = 0.2  # smallest residual for that, in sigma
 _USUAL = 100  # latest frames whose median residual is the usual one
 _KEPT = 3  # frames kept to be tried with changed sessions
 _SHOWN = 3  # stretches that are named in a message
@@ -179,13 +179,13 @@ class Findings:
         """Return lines about likely faults of the session and the bodies."""
         sizes = offsets.size_warnings(self._sizes)
         # if the size of a body is wrong, all of its markers seem displaced
-        return [*self._of_doubts(), *(sizes or self._of_markers())]
+        return [*self._doubt_lines(), *(sizes or self._marker_lines())]
 
-    def tells_of_sensors(self, causes: Iterable[str]) -> bool:
+    def explain_idle(self, causes: Iterable[str]) -> bool:
         """Test whether causes say why a sensor explains nothing."""
         return self.change is not None or any(APART in line for line in causes)
 
-    def of_sensors(self) -> list[str]:
+    def sensor_lines(self) -> list[str]:
         """Return lines about missing, repeated or odd frames and features of sensors."""
         total, lines = self._places + 1, []
         for what, by_sensor in (("no frame", self._no_frame), ("no feature", self._no_feature)):
@@ -208,7 +208,7 @@ class Findings:
             if frames.count
         ]
         far = {name: frames for name, frames in self._far.items() if frames.longest >= _LONG}
-        if far and any(line.endswith(offsets.MOVED) for line in self._of_markers()):
+        if far and any(line.endswith(offsets.MOVED) for line in self._marker_lines()):
             far = {}  # a displaced marker is the cause, and is reported
         for name, frames in far.items():
             unit = "px" if self._setups[name].sensor.unit == "px" else self._session.unit
@@ -219,10 +219,10 @@ class Findings:
             )
         return lines
 
-    def _of_doubts(self) -> list[str]:
+    def _doubt_lines(self) -> list[str]:
         if self.change is not None:
             line = f"{self.change}, frames that are not ok would be ok"
-            if self._goes_on:
+            if self._ends_in_doubt:
                 line += f"; before frame {self._doubted.kept[-1][0]} it is not, or the body rests"
             return [line]
         total, lines = self._places + 1, []
@@ -253,7 +253,7 @@ class Findings:
             APART: "was one of them bumped?",
             CHANGED: "was a sensor bumped, or is it out of focus?",
         }
-        if most not in hints or not self._goes_on:
+        if most not in hints or not self._ends_in_doubt:
             return None
         first = self._doubted.kept[-1][0]
         return first, f"{most} from frame {first} on: {hints[most]}"
@@ -264,15 +264,15 @@ class Findings:
         return sum(frames.count for frames in self._same.values())
 
     @property
-    def _late(self) -> bool:
+    def _began_ok(self) -> bool:
         """Whether frames were ok at first, as if the body rested, which hides a delay."""
         return self._agreed_before >= _LONG
 
     @property
-    def _goes_on(self) -> bool:
+    def _ends_in_doubt(self) -> bool:
         """Whether frames were ok at first and are in doubt up to the last one."""
         lasts = self._doubted.last_place == self._places
-        return self._late and lasts and self._doubted.kept[-1][2] >= _LONG
+        return self._began_ok and lasts and self._doubted.kept[-1][2] >= _LONG
 
     @cached_property
     def change(self) -> str | None:
@@ -285,10 +285,10 @@ class Findings:
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
         if not few or bad < max(_LONG, self._frozen + 1) or len(self._session.labels) > 1:
             return None
-        explain = late_sensor if self._late else explanation  # others would have shown earlier
+        explain = late_sensor if self._began_ok else explanation  # others would have shown earlier
         return explain(self._session, self._frames)
 
-    def _of_markers(self) -> list[str]:
+    def _marker_lines(self) -> list[str]:
         lines = []
         for label, markers in self._markers.items():
             if (body := self._bodies.get(label)) is not None:

@@ -59,8 +59,8 @@ def inspect_frame(request: InspectRequest) -> None:
         pictures[sheet.BODIES] = scene.draw_scene(shown, frame_set, *estimates)
     entries = zip(sheet.prefixes_of(session.labels), bodies, all_findings, estimates, strict=True)
     for prefix, body, findings, estimate in entries:
-        made = sheet.inspection_pictures(shown, body, findings, estimate) if drawn else {}
-        pictures |= {prefix + name: picture for name, picture in made.items()}
+        drawn_pictures = sheet.inspection_pictures(shown, body, findings, estimate) if drawn else {}
+        pictures |= {prefix + name: picture for name, picture in drawn_pictures.items()}
         lines += summary(session, body, estimate, findings, poses)
         lines += _of_clouds(session, frame_set, body, estimate)
     with reporting(SessionError, f"-o {folder}: cannot be made"):
@@ -89,7 +89,7 @@ def _check_folder(folder: Path, session: Session) -> None:
 
 
 def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
-    """Return the frames of one number; of the first without one."""
+    """Return the frames of a number, by default the first."""
     with closing(pair(opened, number, None if number is None else number + 1)) as frames:
         frame_set = next(frames, None)
     if frame_set is not None:

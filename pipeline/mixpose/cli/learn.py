@@ -79,16 +79,16 @@ def _tell(
     lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
-    called = [Path("body.csv") if output.is_stdout(file) else file for file in files]
-    for file, body in zip(called, bodies, strict=True):
+    shown_files = [Path("body.csv") if output.is_stdout(file) else file for file in files]
+    for file, body in zip(shown_files, bodies, strict=True):
         lines += lines_of(body, file.name, session.unit)
     if len(bodies) > 1 or bodies[0].count > 1:
         lines.append("in the session:")
-        for file, body in zip(called, bodies, strict=True):
+        for file, body in zip(shown_files, bodies, strict=True):
             lines += ["", "[[object]]", f'name = "{file.stem}"', f'file = "{file.name}"']
             lines += [f"count = {body.count}"] if body.count > 1 else []
     output.print_lines(lines, *files)
-    names = [file.name for file in called]
+    names = [file.name for file in shown_files]
     pairs = zip(bodies, names, strict=True)
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
     for doubt in (*doubts, *look_alikes(bodies, names), *_late_warnings(session, bodies, names)):

@@ -25,13 +25,13 @@ class LineFile:
     """A text stream for the writers of poses.
 
     Text written between two flushes reaches the file in one call or not at all. Old content is
-    removed (`afresh`), or stays until `rewind` says where to continue; messages name `called`, if
+    removed (`afresh`), or stays until `rewind` says where to continue; messages name `shown`, if
     given. The file is locked against other runs, as far as the system can. Raises SessionError if
     it cannot be opened, or another run writes to it.
     """
 
-    def __init__(self, path: Path, *, afresh: bool = True, called: Path | None = None) -> None:
-        self._path = called or path
+    def __init__(self, path: Path, *, afresh: bool = True, shown: Path | None = None) -> None:
+        self._path = shown or path
         self._due: list[str] = []
         self.size = self.checksum = 0
         try:
@@ -86,14 +86,14 @@ class LineFile:
 
 
 @contextmanager
-def held(folder: Path, called: Path) -> Iterator[None]:
+def locked_folder(folder: Path, shown: Path) -> Iterator[None]:
     """Lock a folder against other runs, as far as the system can; SessionError if it is locked."""
     if sys.platform == "win32":  # where folders cannot be opened
         yield
         return
     file = os.open(folder, os.O_RDONLY)
     try:
-        _lock(file, called)
+        _lock(file, shown)
         yield
     finally:
         os.close(file)

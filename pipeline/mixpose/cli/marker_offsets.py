@@ -175,9 +175,9 @@ def marker_lines(
     for text, numbers in by_text.items():  # in ascending order
         names = [labels[i] for i in numbers]
         in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
-        called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
-        several = len(names) > 1
-        lines.append(f"marker{'s' * several} {called}{of} {'are each' if several else 'is'} {text}")
+        listed = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
+        many = len(names) > 1
+        lines.append(f"marker{'s' * many} {listed}{of} {'are each' if many else 'is'} {text}")
     return lines
 
 

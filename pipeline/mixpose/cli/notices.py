@@ -63,9 +63,9 @@ def warn_of_sources(
             warn(f"sensor {name!r}: {caution}")
 
 
-def counted(count: int, what: str) -> str:
+def counted(count: int, noun: str) -> str:
     """Return a count with its noun, in the plural unless the count is 1."""
-    return f"{count} {what}{'s' * (count != 1)}"
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
@@ -158,7 +158,7 @@ class Summary:
                 if (rms := rms_by_sensor[name]) is not None:
                     residuals.append(rms)
 
-    def say(self, where: str) -> None:
+    def say(self, destination: str) -> None:
         """Print warnings, remarks on delays and the number of frames by status."""
         if not sum(self.statuses.values()):
             warn(
@@ -167,33 +167,33 @@ class Summary:
             return
         for warning in self.warnings():
             warn(warning)
-        for remark in self.late():
+        for remark in self.delay_remarks():
             say(remark)
         if self.statuses["lost"] == sum(self.statuses.values()) and not self.findings.change:
             warn(f"every frame is lost: run mixpose check {self.path}, which says what is odd")
-        say(f"{frames_text(self.statuses, self.bodies)}{where}")
+        say(f"{frames_text(self.statuses, self.bodies)}{destination}")
 
     def warnings(self) -> list[str]:
         """Return warnings about sensors, the session and the bodies."""
-        apart = [n for n, k in self.idle.items() if k >= _MOST * self.posed[n]]
+        idle = [n for n, k in self.idle.items() if k >= _MOST * self.posed[n]]
         warnings = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
             f"{self.noun}: check its T_sensor_world, calibration and source, which "
             "mixpose check tries"
-            for name in apart
+            for name in idle
         ]
         posed = sum(self.statuses.values()) - self.statuses["lost"]
-        seen, causes = self.findings.of_sensors(), self.findings.causes()
+        seen, causes = self.findings.sensor_lines(), self.findings.causes()
         if not warnings and self.split_frames and self.split_frames >= _OFTEN * self.shared:
-            apart = list(self.split)
+            idle = list(self.split)
             warnings += [] if seen else [self._split_text()]
         # a cause replaces the warnings that are its symptoms
-        warnings = [*([] if self.findings.tells_of_sensors(causes) else warnings), *seen, *causes]
+        warnings = [*([] if self.findings.explain_idle(causes) else warnings), *seen, *causes]
         warnings += [
             f"sensor {name!r} was left out of {count} of {posed} {self.noun}: {why}"
             for (name, why), count in self.left_out.items()
         ]
-        offs = {n: median(rms) for n, rms in self.residuals.items() if rms and n not in apart}
+        offs = {n: median(rms) for n, rms in self.residuals.items() if rms and n not in idle}
         far = [
             f"by {off:.2g} px in {name!r} (median; sigma is {self.sigmas[name]:g})"
             for name, off in offs.items()
@@ -207,7 +207,7 @@ class Summary:
             )
         return warnings
 
-    def late(self) -> list[str]:
+    def delay_remarks(self) -> list[str]:
         """Return remarks about delays of sensors that a moving body has shown."""
         remarks = []
         for name, delay in self.delays.items():
@@ -254,7 +254,7 @@ def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
 
 @contextmanager
 def bar(
-    what: str, total: int | None, *, shown: bool = True, spins: bool = False
+    title: str, total: int | None, *, shown: bool = True, spins: bool = False
 ) -> Iterator[Callable[..., None]]:
     """Yield a function that advances a progress bar, which only a terminal shows.
 
@@ -264,7 +264,7 @@ def bar(
         if display is None:
             yield lambda **changes: None
         else:
-            yield partial(display.update, display.add_task(what, total=total))
+            yield partial(display.update, display.add_task(title, total=total))
 
 
 @contextmanager

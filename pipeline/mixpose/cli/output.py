@@ -33,7 +33,7 @@ class Output(ExitStack):
 
     Without a path poses go to standard output. If the format holds one body only, each of several
     bodies (`labels`) gets a file, ``poses.<body>.tum`` for ``poses.tum``; this needs a path, else
-    SessionError. `goes_on` is an open file of JSON lines that has its header already and replaces
+    SessionError. `resumed` is an open file of JSON lines that has its header already and replaces
     `path`; `options` are further arguments of the format's writer; a `whole` file appears once all
     is written.
     """
@@ -45,18 +45,18 @@ class Output(ExitStack):
         header: Header,
         labels: Sequence[str] = (),
         *,
-        goes_on: LineFile | None = None,
+        resumed: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
         whole: bool = False,
     ) -> None:
         super().__init__()
-        self._called = self._path = path
+        self._named = self._path = path
         self._format, self._header = format_name, header
         self._options, self._is_whole = options or {}, whole
         self._writer: writing.PoseWriter | None = None
-        self.file = goes_on
-        if goes_on is not None:
-            self._writer = jsonl.JsonlWriter(cast(TextIO, goes_on), header, resume=True)
+        self.file = resumed
+        if resumed is not None:
+            self._writer = jsonl.JsonlWriter(cast(TextIO, resumed), header, resume=True)
         self._by_label: dict[str, Output] = {}  # if bodies have separate files
         if not _are_separate(format_name, labels):
             return
@@ -72,8 +72,8 @@ class Output(ExitStack):
         for output in self._by_label.values():
             self.enter_context(output)
         if not self._by_label:
-            if self._is_whole and self._called is not None:
-                self._path = self.enter_context(appearing_whole(self._called))
+            if self._is_whole and self._named is not None:
+                self._path = self.enter_context(appearing_whole(self._named))
             self.push(self._end)
         return super().__enter__()
 
@@ -94,7 +94,7 @@ class Output(ExitStack):
             return
         if self._writer is None and self._format == "tum" and estimate.time_s is None:
             warn(
-                f"{self._called or 'standard output'}: poses have no times, so that frame numbers "
+                f"{self._named or 'standard output'}: poses have no times, so that frame numbers "
                 "stand for seconds; fps or times in [[sensor]] gives them times"
             )
         writer = self._writer or self._open()
@@ -102,7 +102,7 @@ class Output(ExitStack):
 
     def _open(self) -> writing.PoseWriter:
         if self._path is not None:
-            self.file = LineFile(self._path, called=self._called)
+            self.file = LineFile(self._path, shown=self._named)
         # writers of poses call only write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
         self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
@@ -177,19 +177,19 @@ def is_stdout(named: Path | None) -> bool:
     return named == Path("-")
 
 
-def refuse_suffix(named: Path, allowed: Sequence[str], what: str) -> None:
-    """Raise SessionError if the suffix of a file is none of those `allowed` for `what`."""
+def refuse_suffix(named: Path, allowed: Sequence[str], reason: str) -> None:
+    """Raise SessionError, with a reason, if the suffix of a file is none of those `allowed`."""
     if named.suffix and named.suffix.casefold() not in allowed:
         raise SessionError(
-            f"-o {named}: found the suffix {named.suffix}; {what}: name it "
+            f"-o {named}: found the suffix {named.suffix}; {reason}: name it "
             f"{named.with_suffix(allowed[0]).name}"
         )
 
 
-def refuse_stdout(named: Path | None, option: str, what: str, instead: str) -> None:
-    """Raise SessionError if an option names standard output, which cannot take `what`."""
+def refuse_stdout(named: Path | None, option: str, content: str, instead: str) -> None:
+    """Raise SessionError if an option names standard output, which cannot take `content`."""
     if is_stdout(named):
-        raise SessionError(f"{option} -: {what} cannot go to standard output; name {instead}")
+        raise SessionError(f"{option} -: {content} cannot go to standard output; name {instead}")
 
 
 def refuse_one_for_two(named: Path | None, option: str, other: Path | None, before: str) -> None:

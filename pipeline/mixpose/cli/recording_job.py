@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
-from mixpose.cli.lines import held, note_path
+from mixpose.cli.lines import locked_folder, note_path
 from mixpose.cli.notices import parsed_frames
 from mixpose.errors import SessionError
 from mixpose.whole_files import appearing_whole
@@ -131,8 +131,8 @@ def finished(job: Job) -> Outcome | None:
 
 def _is_of(outcome: Outcome, job: Job) -> bool:
     """Test whether an outcome is of the same session, options and version as a job."""
-    same = (outcome.session_sha256, outcome.options, outcome.mixpose)
-    return same == (job.session_sha256, job.options, job.mixpose)
+    key = (outcome.session_sha256, outcome.options, outcome.mixpose)
+    return key == (job.session_sha256, job.options, job.mixpose)
 
 
 def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
@@ -143,7 +143,7 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
     part = Path(job.folder) / f".{job.name}.{uuid.uuid4().hex if job.shared else UNFINISHED}"
     try:
         part.mkdir(exist_ok=True)
-        with held(part, Path(job.folder) / job.name):
+        with locked_folder(part, Path(job.folder) / job.name):
             outcome = finished(job) or _run_in(part, job, running or Running(), threads)
             if outcome.state != INTERRUPTED:
                 outcome = _put_in_place(part, job, outcome)
@@ -263,6 +263,6 @@ def _not_shared(job: Job) -> Outcome | None:
 
 def outcome_of(job: Job, state: str, exit_status: int, reason: str | None = None) -> Outcome:
     """Return the outcome of a job that ended on this machine."""
-    same = {entry.name: getattr(job, entry.name) for entry in fields(Recording)}
+    values = {entry.name: getattr(job, entry.name) for entry in fields(Recording)}
     host = socket.gethostname()
-    return Outcome(**same, state=state, exit_status=exit_status, reason=reason, host=host)
+    return Outcome(**values, state=state, exit_status=exit_status, reason=reason, host=host)

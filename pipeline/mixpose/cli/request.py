@@ -28,7 +28,7 @@ SUFFIXES = {
 """Formats of poses by the endings of file names."""
 
 FARTHEST_S = 0.5
-"""Longest prediction of poses: after this time a hand may have reversed its motion."""
+"""Longest prediction of poses, s: by then a hand may have reversed its motion."""
 
 Sources = Annotated[
     list[str] | None,

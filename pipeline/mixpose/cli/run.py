@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, continuation, is_device
+from mixpose.cli.continuation import Continuation, Notes, is_device, resume
 from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
 from mixpose.cli.output import Output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
@@ -47,14 +47,14 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
             refuse_to_overwrite(path, _inputs(session))
     plan = Continuation(None, request.selection)
     if request.resume:
-        plan = continuation(request, header, opened)
+        plan = resume(request, header, opened)
     if plan.is_done:
         say(f"nothing left to do: {request.poses} has all frames asked for already")
         return
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = Output(request.poses, request.format_name, header, header.labels, goes_on=plan.file)
+    output = Output(request.poses, request.format_name, header, header.labels, resumed=plan.file)
     with output, prompt_switching(), ExitStack() as stack:
         is_new = partial(_is_new, session.labels, plan.last_written)
         watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]

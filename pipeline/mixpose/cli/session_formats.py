@@ -47,7 +47,7 @@ def write_markers(
     session = session_of(poses, request.session, allow_code=request.allow_code, unit=unit)
     output, measured = request.output, request.measured
     if format_name == "c3d":
-        _place(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
+        _require_output(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
     if output is not None:
         begins, mark = trajectories.MARKS[format_name]
         refuse_to_overwrite_but(output, [poses.path, session.path], mark, begins=begins)
@@ -123,9 +123,9 @@ def trajectories_of(
             by_sensor[row, k] = [
                 sensor in line.sensors and name in line.sensors[sensor].labels for sensor in sensors
             ]
-    several = len(bodies) > 1
+    has_several = len(bodies) > 1
     return Trajectories(
-        tuple(f"{label}:{name}" if several else name for label, name in names),
+        tuple(f"{label}:{name}" if has_several else name for label, name in names),
         places,
         residuals,
         by_sensor,
@@ -137,16 +137,16 @@ def trajectories_of(
 
 def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Mapping[str, Body]:
     """Return the bodies of lines by their labels, in the order of the session."""
-    known = {label: setup.body for setup in session.objects for label in setup.labels}
-    wanted = {line.label for line in lines}
-    for label in wanted - known.keys():
+    bodies = {label: setup.body for setup in session.objects for label in setup.labels}
+    labels = {line.label for line in lines}
+    for label in labels - bodies.keys():
         raise SessionError(
-            f"{poses.path}: has poses of {label}, and {session.path} has {', '.join(known)}; "
+            f"{poses.path}: has poses of {label}, and {session.path} has {', '.join(bodies)}; "
             "name the session of the poses with --session"
         )
-    if not wanted:
+    if not labels:
         raise SessionError(f"{poses.path}: no pose is left to write")
-    return {label: body for label, body in known.items() if label in wanted}
+    return {label: body for label, body in bodies.items() if label in labels}
 
 
 def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
@@ -164,7 +164,7 @@ def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
     return rate
 
 
-def _place(output: Path | None, name: str, suffix: str, package: str, more: str = "") -> Path:
+def _require_output(output: Path | None, name: str, suffix: str, package: str, more: str) -> Path:
     """Return the output of a binary format; SessionError if it or a package is missing."""
     if output is None:
         raise SessionError(f"--format {name}: needs -o FILE.{suffix}, it is no text")
@@ -178,7 +178,7 @@ def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequ
     Raises SessionError if the package of the viewer is missing, or the session is not found or does
     not fit the poses; RecordingError if the recording cannot be read.
     """
-    output = _place(request.output, "rerun", "rrd", "rerun-sdk")
+    output = _require_output(request.output, "rerun", "rrd", "rerun-sdk", "")
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - only where it is written
 
     session = session_of(poses, request.session, allow_code=request.allow_code)

@@ -41,15 +41,15 @@ _STATUSES = ("ok", "ambiguous", "lost")
 
 def run(request: RunRequest) -> None:
     """Run one session in this process, or several in separate ones."""
-    many, written = request.are_many, request.format_name
+    are_many, written = request.are_many, request.format_name
     if request.labels and written != "jsonl":
         raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
-    if many and (request.publish or request.predict is not None):
+    if are_many and (request.publish or request.predict is not None):
         raise SessionError(
             "--publish: found several sessions; allowed is one, whose poses receivers take for one "
             "recording"
         )
-    if many:
+    if are_many:
         raise typer.Exit(run_sessions(sessions_of(request.sessions), request))
     from mixpose.cli.run import run_session  # noqa: PLC0415 - several run in other processes
 
@@ -213,8 +213,8 @@ def _options(request: RunRequest) -> tuple[str, ...]:
     values = {"format": request.format_name, "step": request.step}
     values |= {"start": request.start, "stop": request.stop}
     flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
-    given = [f"--{name}={value}" for name, value in values.items() if value is not None]
-    return (*given, *(f"--{name}" for name, is_on in flags.items() if is_on))
+    named = [f"--{name}={value}" for name, value in values.items() if value is not None]
+    return (*named, *(f"--{name}" for name, is_on in flags.items() if is_on))
 
 
 def _sha256(session: Path) -> str:
@@ -267,13 +267,13 @@ def _line(outcome: Outcome) -> str:
     return text + warnings
 
 
-def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> None:
+def _write_summary(folder: Path, outcomes: Sequence[Outcome], total: int) -> None:
     states = Counter(outcome.state for outcome in outcomes)
     summary = {
-        "recordings": asked,
+        "recordings": total,
         "done": states[DONE],
         "failed": states[FAILED],
-        "not_done": asked - states[DONE] - states[FAILED],
+        "not_done": total - states[DONE] - states[FAILED],
         "results": [asdict(outcome) for outcome in outcomes],
     }
     recording_job.write_json(folder / SUMMARY, summary)

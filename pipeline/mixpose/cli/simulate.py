@@ -16,10 +16,10 @@ from mixpose.simulation import SimulationOptions, simulate
 from mixpose.simulation.session_copy import SESSION_NAME
 
 
-def delays_of(given: list[str]) -> dict[str, float]:
+def delays_of(texts: list[str]) -> dict[str, float]:
     """Return seconds by sensor from texts NAME=SECONDS; SessionError if a text has another form."""
     delays = {}
-    for text in given:
+    for text in texts:
         name, _, seconds = text.rpartition("=")
         delays[name] = as_number(seconds)
         if not name or not abs(delays[name]) <= LONGEST_DELAY_S:
@@ -32,8 +32,8 @@ def delays_of(given: list[str]) -> dict[str, float]:
 def simulate_session(request: SimulateRequest) -> None:
     """Render the recording of a session into a folder."""
     names = {entry.name for entry in fields(SimulationOptions)} - {"delay"}
-    given = {name: value for name, value in vars(request).items() if name in names}
-    options = SimulationOptions(**given, delay=delays_of(request.delay or []))
+    values = {name: value for name, value in vars(request).items() if name in names}
+    options = SimulationOptions(**values, delay=delays_of(request.delay or []))
     folder, overwrite = request.output, request.overwrite
     refuse_stdout(folder, "-o", "a recording", "a folder, as -o recording")
     session = load_session(request.session)

@@ -117,9 +117,9 @@ def _tell(label: str, body: SmoothedBody, unit: str) -> None:
         (body.decided, "ambiguous frame", "ok by the track"),
         (body.filled, "frame", "filled in, ambiguous and marked"),
     ]
-    for count, what, done in counts:
+    for count, noun, result in counts:
         if count:
-            say(f"{label}: {counted(count, what)} {done}")
+            say(f"{label}: {counted(count, noun)} {result}")
     if body.refused:
         numbers = ", ".join(map(str, body.refused[:8])) + (", ..." if len(body.refused) > 8 else "")
         warn(f"{label}: ok, but far off the poses around them, now ambiguous: frames {numbers}")

@@ -51,7 +51,7 @@ def option_name(entry: Field[Any]) -> str:
     return entry.metadata.get("name") or f"--{entry.name.replace('_', '-')}"
 
 
-def taking(request: type, work: str) -> Callable[..., None]:
+def command_for(request: type, work: str) -> Callable[..., None]:
     """Make a command with the fields of a record as parameters and its docstring as help.
 
     The record is passed to the ``module:function`` `work` of this package, imported when called.

@@ -79,12 +79,12 @@ class Backlog:
             self.has_ended = True
             self._changed.notify_all()
 
-    def waits_for_end(self, seconds: float) -> bool:
+    def wait_for_end(self, seconds: float) -> bool:
         """Wait at most so many seconds; return whether the end has come."""
         with self._changed:
             return self._changed.wait_for(lambda: self.has_ended, seconds)
 
-    def give_up(self) -> None:
+    def drop_all(self) -> None:
         """Drop all remaining messages."""
         with self._changed:
             self.dropped += len(self._messages)
@@ -115,7 +115,7 @@ class Channel:
         self._thread.start()
 
     def put(self, message: Message) -> None:
-        """Queue a message, unless only ok poses are to be published and it has another."""
+        """Queue a message, unless it is not ok and only ok poses are to be published."""
         if message.estimate.status == "ok" or self._address.options.get("only") != "ok":
             self._backlog.put(message)
 
@@ -130,7 +130,7 @@ class Channel:
         self._thread.join(0.0 if is_stuck else rules.farewell_s)
         self._sender.close()
         self._thread.join(rules.farewell_s)
-        self._backlog.give_up()
+        self._backlog.drop_all()
 
     def text(self) -> str:
         """Return a line: how many poses were sent and dropped, and their latency."""
@@ -168,8 +168,8 @@ class Channel:
                     )
                 is_connected = False
                 self._sender.close()
-                if self._backlog.waits_for_end(self._rules.retry_s):
-                    self._backlog.give_up()
+                if self._backlog.wait_for_end(self._rules.retry_s):
+                    self._backlog.drop_all()
                 continue
             except Exception as error:  # of this message alone: the next may succeed
                 self._began = None

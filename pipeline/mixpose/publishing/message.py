@@ -64,10 +64,10 @@ class Address:
         """Raise an error for options other than these and those of all addresses."""
         only = {self.options["only"]} if "only" in self.options else set()
         checks = ("option", set(self.options), {*names, "only"}), ("only", only, {"ok"})
-        for what, values, allowed in checks:
+        for kind, values, allowed in checks:
             for value in values - allowed:
                 listed = ", ".join(sorted(allowed))
-                raise self.error(f"{what}: found {value}; allowed: {listed}")
+                raise self.error(f"{kind}: found {value}; allowed: {listed}")
 
     def needs(self, package: str, extra: str) -> None:
         """Raise an error that names the extra if a package is not installed."""

@@ -68,7 +68,7 @@ def topics(address: Address, header: Header) -> Topics:
     return Topics(poses, words, header.unit, address.options.get("frame", "world"))
 
 
-def ros_messages(message: Message, to: Topics) -> list[tuple[str, dict[str, Any]]]:
+def ros_messages(message: Message, targets: Topics) -> list[tuple[str, dict[str, Any]]]:
     """Return pose and transform of a message, in metres, as topics and fields; none if lost.
 
     The stamp is when the frame was taken: Unix time of a live source, the time of a recording's
@@ -79,15 +79,15 @@ def ros_messages(message: Message, to: Topics) -> list[tuple[str, dict[str, Any]
         return []
     recorded = estimate.frame if estimate.time_s is None else estimate.time_s
     seconds = float(recorded if message.unix_s is None else message.unix_s)
-    fields = pose_message(estimate, to.unit, seconds, to.frame_id)
+    fields = pose_message(estimate, targets.unit, seconds, targets.frame_id)
     pose = fields["pose"]["pose"]
     transform = {
         "header": fields["header"],
-        "child_frame_id": to.frames[estimate.label],
+        "child_frame_id": targets.frames[estimate.label],
         "transform": {"translation": pose["position"], "rotation": pose["orientation"]},
     }
     return [
-        (to.poses[estimate.label], fields),
+        (targets.poses[estimate.label], fields),
         (TRANSFORMS, {"transforms": [transform]}),
     ]
 

@@ -63,8 +63,8 @@ class Datagrams(Sender):
         kind, _, _, _, self._to = socket.getaddrinfo(*self._place, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(kind, socket.SOCK_DGRAM)
 
-    def put(self, data: bytes, what: str, advice: str) -> None:
-        """Send one datagram; a `TooLargeError` names what is too large, and says what to do."""
+    def put(self, data: bytes, name: str, advice: str) -> None:
+        """Send a datagram called `name`; a `TooLargeError` says its size, and what to do."""
         assert self._socket is not None
         try:
             self._socket.sendto(data, self._to)
@@ -73,7 +73,7 @@ class Datagrams(Sender):
                 raise
             # the limit depends on systems and networks, 65,507 bytes at most
             size = f"{len(data):,} bytes, more than a datagram can be here"
-            raise TooLargeError(f"{what} has {size}; {advice}") from error
+            raise TooLargeError(f"{name} has {size}; {advice}") from error
 
     def close(self) -> None:
         """Close the socket."""
@@ -126,10 +126,10 @@ class UdpSender(Datagrams):
             self.put(self._header, "the header", _BY_TCP)
             self._header_sent_at = now
         estimate = message.estimate
-        what = f"the pose of {estimate.label} in frame {estimate.frame}"
+        name = f"the pose of {estimate.label} in frame {estimate.frame}"
         is_labelled = any(report.labels for report in estimate.sensors.values())
         advice = f"leave out --labels, or {_BY_TCP}" if is_labelled else _BY_TCP
-        self.put(message.text.encode(), what, advice)
+        self.put(message.text.encode(), name, advice)
         return True
 
 
@@ -169,8 +169,7 @@ class OscSender(Datagrams):
         if T is not None:
             for value in (*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()):
                 builder.add_arg(value, "f")
-        what = f"the message of {estimate.label}"
-        self.put(
-            builder.build().dgram, what, "shorten the name of the body, or the path of the address"
-        )
+        name = f"the message of {estimate.label}"
+        advice = "shorten the name of the body, or the path of the address"
+        self.put(builder.build().dgram, name, advice)
         return True

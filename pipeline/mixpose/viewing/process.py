@@ -41,12 +41,12 @@ def show(
 
 
 def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
-    asked, ready_at = False, 0.0
+    is_requested, ready_at = False, 0.0
     while True:
-        if not asked and wishes.viewers and time.monotonic() >= ready_at:
+        if not is_requested and wishes.viewers and time.monotonic() >= ready_at:
             wishes.wish("next")
-            asked = True
-        if not connection.poll(_LOOK_S if asked or not wishes.viewers else 1e-3):
+            is_requested = True
+        if not connection.poll(_LOOK_S if is_requested or not wishes.viewers else 1e-3):
             continue
         moment: Moment | None = connection.recv()
         if moment is None:
@@ -56,7 +56,7 @@ def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
         page.show(moment)
         took = time.monotonic() - began
         ready_at = began + max(1.0 / PACE.most_per_second, took / PACE.share)
-        asked = False
+        is_requested = False
 
 
 class Wishes:
@@ -67,10 +67,10 @@ class Wishes:
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, what: Wish) -> None:
+    def wish(self, message: Wish) -> None:
         """Send a message to the run."""
         with self._lock:
-            self._connection.send(what)
+            self._connection.send(message)
 
     def viewers_are(self, count: int) -> None:
         """Send the number of browsers that show the page."""

@@ -179,9 +179,9 @@ class Scene:
         self._server.scene.add_frame("/world", axes_length=length, axes_radius=0.02 * length)
         middle, lowest = places.mean(axis=0), float((places @ up).min())
         below = middle + (lowest - radius - middle @ up) * up
-        wanted = 0.1 * _SIZE / self._scale  # rounded down to 1, 2 or 5 times a power of ten
-        power = 10.0 ** np.floor(np.log10(wanted))
-        cell = self._scale * float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
+        largest = 0.1 * _SIZE / self._scale  # rounded down to 1, 2 or 5 times a power of ten
+        power = 10.0 ** np.floor(np.log10(largest))
+        cell = self._scale * float(power * max(k for k in (1, 2, 5) if k * power <= largest))
         turn, _ = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])
         self._server.scene.add_grid(
             "/grid",
@@ -249,7 +249,7 @@ class Outline:
     """A sensor in space."""
 
     name: str
-    # (n, 3), its place; for parallel beams points around the image on the sensor's plane
+    # (n, 3), its place; for parallel beams the corners of the image on the sensor's plane
     places: Floats
     # lines of sight around the edge of the image, in order; None for a range sensor
     border: Rays | None

@@ -55,18 +55,18 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
     socket accepts browsers from the start; they wait until viser is `ready`. Raises RuntimeError if
     viser started in another way, without the guard.
     """
-    usual = websockets.asyncio.server.serve
+    original_serve = websockets.asyncio.server.serve
     guard = Guard(place.port, place.token)
     guarded = []
 
     def serve(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
             try:
-                asked = {name: request.headers.get(name) for name in ASKED_FOR}
+                values = {name: request.headers.get(name) for name in ASKED_FOR}
             except MultipleValuesError:
-                asked = {}
-            given = {name: value for name, value in asked.items() if value is not None}
-            answer = guard.answer(request.path, given)
+                values = {}
+            present = {name: value for name, value in values.items() if value is not None}
+            answer = guard.answer(request.path, present)
             if answer is not None:
                 text = answer.text.encode()
                 headers = Headers(**answer.headers)
@@ -82,12 +82,12 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
             await handler(connection)
 
         guarded.append(True)
-        return usual(handle, sock=place.socket, process_request=process, **options)
+        return original_serve(handle, sock=place.socket, process_request=process, **options)
 
     websockets.asyncio.server.serve = serve
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = usual
+        websockets.asyncio.server.serve = original_serve
     if not guarded:
         raise RuntimeError(f"viser {viser.__version__} does not serve as expected")

@@ -62,7 +62,7 @@ class Viewer:
         self._counts: Counter[Status] = Counter()
         self._instants: deque[float] = deque(maxlen=PACE.history)
         self._estimates: list[Estimate] = []
-        self._asked = False  # for another moment
+        self._is_requested = False  # for another moment
         self._viewers = 0
         self._paused, self._steps = paused, 0
         self._waits_for_page = on_files
@@ -176,21 +176,21 @@ class Viewer:
     def _send(self) -> None:
         """Send the newest moment to the page whenever it asks for one."""
         with suppress(OSError):  # the page has ended, which `_receive` reports
-            while (taken := self._next()) is not None:
-                self._connection.send(self._moment(*taken))
+            while (update := self._next()) is not None:
+                self._connection.send(self._moment(*update))
             self._connection.send(None)  # the end, after which the page stays as it is
 
     def _next(self) -> tuple[_Frame, tuple[Row, ...]] | None:
         """Wait for a request; return the newest frame and all rows since the last."""
         with self._state:
-            while not self._gone and not (self._asked and self._newest is not None):
+            while not self._gone and not (self._is_requested and self._newest is not None):
                 if self._ended and self._newest is None:
                     return None
                 self._state.wait(_LOOK_S)
             if self._gone or self._newest is None:
                 return None
             frame, rows = self._newest, tuple(self._rows)
-            self._newest, self._asked = None, False
+            self._newest, self._is_requested = None, False
             self._rows.clear()
             return frame, rows
 
@@ -218,7 +218,7 @@ class Viewer:
                     if isinstance(message, int):
                         self._viewers = message
                     elif message == "next":
-                        self._asked = True
+                        self._is_requested = True
                     elif message == "step":
                         self._paused, self._steps = True, self._steps + 1
                     else:
