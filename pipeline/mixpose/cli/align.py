@@ -43,7 +43,7 @@ def align_session(request: AlignRequest) -> None:
     estimates = [e for text in request.floor for e in _floor_poses(text, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
-    _tell(session, floor, request.up)
+    _report_floor(session, floor, request.up)
     say(f"{session.path.name} in the frame of {floor.by} -> {shown(request.output)}")
 
 
@@ -96,7 +96,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
     return rewriting.text_of(document, session, head)
 
 
-def _tell(session: Session, floor: Floor, up: Axis) -> None:
+def _report_floor(session: Session, floor: Floor, up: Axis) -> None:
     if floor.off is not None:
         say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
     if floor.tilt_deg:

@@ -164,10 +164,10 @@ def _say_sensor(
     if caution := source.caution():
         report.warn(f"sensor {setup.name!r}: {caution}")
     numbers = {*survey.numbers, *survey.damaged}
-    of_all = numbers.union(*(other.numbers for other in surveys.values()))
-    missing = recordings.listed(sorted(of_all - numbers))
+    all_numbers = numbers.union(*(other.numbers for other in surveys.values()))
+    missing = recordings.listed(sorted(all_numbers - numbers))
     if missing and all(other.is_whole for other in surveys.values()):
-        report.say("", f"missing: {missing} of the {len(of_all)} frames of all sensors")
+        report.say("", f"missing: {missing} of the {len(all_numbers)} frames of all sensors")
     _say_features(report, session, setup, source, survey)
 
 
@@ -176,9 +176,9 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
     numbers = {name: frames for name, source in sources.items() if (frames := numbers_of(source))}
     warnings = []
     for name, frames in numbers.items():
-        of_others = set().union(*(numbers[other] for other in numbers if other != name))
-        pairs = len(frames & of_others)
-        if of_others and pairs < 0.5 * min(len(frames), len(of_others)):
+        other_numbers = set().union(*(numbers[other] for other in numbers if other != name))
+        pairs = len(frames & other_numbers)
+        if other_numbers and pairs < 0.5 * min(len(frames), len(other_numbers)):
             is_table = isinstance(sources[name], DetectionTable)
             hint = (
                 "in the column frame; count all tables alike"
@@ -248,14 +248,14 @@ def _say_accuracy(report: _Report, session: Session) -> None:
     if session.start is not None:
         _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
         return
-    has_depth = placement.depends_on_distance(session)
-    for away in _AWAY if has_depth else _AWAY[:1]:
+    depends_on_distance = placement.depends_on_distance(session)
+    for away in _AWAY if depends_on_distance else _AWAY[:1]:
         poses = placement.typical_poses(session, _TYPICAL_POSES, away=away)
         if not poses:
             report.say("start", "none, and no place is in view of the sensors: add [start]")
             return
         where = "in the middle of the sensors' common view"
-        if has_depth:
+        if depends_on_distance:
             middle = transform(np.array(poses), session.body.means.mean(axis=0)[None])[:, 0]
             distance = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
             where = f"{float(f'{distance:.3g}'):g} {session.unit} away"
@@ -272,7 +272,7 @@ def _say_accuracy(report: _Report, session: Session) -> None:
 def _say_accuracy_at(
     report: _Report, session: Session, poses: list[Floats], where: str, *, brief: bool = False
 ) -> bool:
-    """Report it for poses (4, 4); return whether other poses look like one of them."""
+    """Report accuracy at poses (4, 4); return whether other poses look like one of them."""
     free = free_mask(session.estimator)
     sensors = [setup.sensor for setup in session.sensors]
     sigmas = [setup.extract.sigma for setup in session.sensors]

@@ -85,7 +85,7 @@ class Findings:
         self._setups = {setup.name: setup for setup in session.sensors}
         self._bodies = {label: setup.body for setup in session.objects for label in setup.labels}
         stretches = [{name: Stretches() for name in self._setups} for _ in range(5)]
-        self._no_frame, self._no_feature, self._flooded, self._same, self._far = stretches
+        self._no_frame, self._no_feature, self._flooded, self._repeated, self._far = stretches
         self._most = dict.fromkeys(self._setups, 0)  # features of one frame
         self._expected = sum(map(len, self._bodies.values()))
         self._usual = {name: deque[float](maxlen=_USUAL) for name in self._setups}
@@ -121,8 +121,8 @@ class Findings:
                     self._repeating.add(name)
                 self._shown[name] = shown
         is_lost = estimate.status == "lost"
-        tells = (bool(seen) and not flooded) if is_lost else len(seen) > 1
-        if estimate.status != "ok" and len(self._frames) < _KEPT and tells:
+        is_telling = (bool(seen) and not flooded) if is_lost else len(seen) > 1
+        if estimate.status != "ok" and len(self._frames) < _KEPT and is_telling:
             planes = [plane for view in views for plane in plane_views(view)]
             self._frames.append((frame_set.number, planes))
 
@@ -157,7 +157,7 @@ class Findings:
         out_of_step = {n for n, report in estimate.sensors.items() if report.why == OUT_OF_STEP}
         contradicting = self._repeating if estimate.doubt else self._repeating & out_of_step
         for name in contradicting:
-            self._same[name].add(estimate.frame, self._places)
+            self._repeated[name].add(estimate.frame, self._places)
         self._repeating = self._repeating - contradicting
 
     def _add_residuals(self, estimate: Estimate) -> None:
@@ -204,7 +204,7 @@ class Findings:
         lines += [
             f"sensor {name!r} shows the same as the frame before in frames {frames.text()}, which "
             "contradicts the others: frozen, or frames doubled?"
-            for name, frames in self._same.items()
+            for name, frames in self._repeated.items()
             if frames.count
         ]
         far = {name: frames for name, frames in self._far.items() if frames.longest >= _LONG}
@@ -235,7 +235,7 @@ class Findings:
         first, text = self._changed_since() or (math.inf, "")
         lines += [text] if text else []
         for doubt, frames in self._doubts.items():
-            if frames.count <= self._frozen or frames.kept[0][0] >= first:
+            if frames.count <= self._repeat_count or frames.kept[0][0] >= first:
                 continue  # reported as a frozen or changed sensor
             if frames.count < _LONG and frames.count <= total / 2:
                 continue  # clutter may cause single frames
@@ -259,9 +259,9 @@ class Findings:
         return first, f"{most} from frame {first} on: {hints[most]}"
 
     @property
-    def _frozen(self) -> int:
+    def _repeat_count(self) -> int:
         """Number of repeated frames of sensors that contradict others."""
-        return sum(frames.count for frames in self._same.values())
+        return sum(frames.count for frames in self._repeated.values())
 
     @property
     def _began_ok(self) -> bool:
@@ -283,7 +283,7 @@ class Findings:
         twice = twice if 2 * twice > doubted else 0
         few = self._ok <= (self._places + 1) / 2
         bad = self._places + 1 - self._ok - twice if doubted > twice or self._lost >= _LONG else 0
-        if not few or bad < max(_LONG, self._frozen + 1) or len(self._session.labels) > 1:
+        if not few or bad < max(_LONG, self._repeat_count + 1) or len(self._session.labels) > 1:
             return None
         explain = late_sensor if self._began_ok else explanation  # others would have shown earlier
         return explain(self._session, self._frames)

@@ -15,7 +15,7 @@ from mixpose.session import Session, load_session
 
 
 def import_files(request: ImportRequest) -> None:
-    """Write a session file, which must be new, and print its content on standard error."""
+    """Write a session file, which must be new, and print a summary on standard error."""
     output, unit = request.output, request.unit
     if output.exists() and not is_stdout(output):
         raise SessionError(f"-o {output}: is there already; name a new file")

@@ -40,7 +40,7 @@ def learn_session(request: LearnRequest) -> None:
     for file, body in zip(files, bodies, strict=True):
         output.refuse_to_overwrite_but(file, inputs, MARK)
         output.write_text(file, table_text(body), "-o")
-    _tell(lesson, bodies, files, session)
+    _report(lesson, bodies, files, session)
 
 
 def _older(path: Path, session: Session) -> Markers:
@@ -75,7 +75,7 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
     return bodies
 
 
-def _tell(
+def _report(
     lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()

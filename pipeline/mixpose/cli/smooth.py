@@ -56,7 +56,7 @@ def smooth_poses(request: SmoothRequest) -> None:
             raise RecordingError(f"{path}: {error}") from error
     _write(poses, bodies, output)
     for label, body in bodies.items():
-        _tell(label, body, poses.unit)
+        _report(label, body, poses.unit)
     if output is not None:
         count = sum(body.smoothed for body in bodies.values())
         say(f"{counted(count, 'pose')} smoothed -> {output}")
@@ -91,7 +91,7 @@ def _name(body: SmoothedBody) -> str:
     return next(name for name, order in ORDERS.items() if body.model and order == body.model.order)
 
 
-def _tell(label: str, body: SmoothedBody, unit: str) -> None:
+def _report(label: str, body: SmoothedBody, unit: str) -> None:
     model = body.model
     if model is None:
         warn(f"{label}: too few poses that are ok to tell how it moves; none is smoothed")

@@ -1,4 +1,4 @@
-"""Messages between the run and the page: a `Moment`, or None at the end, and a `Wish` back."""
+"""Messages between run and page: a `Moment`, or None at the end, and a `PageMessage` back."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Moment:
     per_second: float = float("nan")  # rate of frames in the last seconds
 
 
-Wish: TypeAlias = Literal["next", "pause", "go on", "step"] | int
+PageMessage: TypeAlias = Literal["next", "pause", "go on", "step"] | int
 """A message of the page: a request for the next moment, a click, or the number of browsers."""
 
 

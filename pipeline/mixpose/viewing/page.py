@@ -19,7 +19,7 @@ from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for,
 from mixpose.records import Estimate, Status
 from mixpose.sensors import CloudSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, Shown
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
 
 _SENSORS_PX, _CONTROL_PX = 460, 380
@@ -29,13 +29,13 @@ _INK = "#bbbbbb"
 
 
 class Page:
-    """The page of a run; `wish` asks it to pause, go on or step; None if it cannot."""
+    """The page of a run; `send` asks the run to pause, go on or step; None if it cannot."""
 
     def __init__(
         self,
         server: viser.ViserServer,
         session: Session,
-        wish: Callable[[Wish], None] | None,
+        send: Callable[[PageMessage], None] | None,
         *,
         paused: bool = False,
     ) -> None:
@@ -51,8 +51,8 @@ class Page:
         main.dock_right()
         main.set_width(_CONTROL_PX)
         self._status = server.gui.add_html("<p>waiting for the first frame</p>")
-        if wish is not None:
-            self._add_buttons(wish, paused)
+        if send is not None:
+            self._add_buttons(send, paused)
         self._series = Series(server.gui, session)
         self._scene = Scene(server, session)
         self._magnified = server.gui.add_dropdown(
@@ -118,7 +118,7 @@ class Page:
         panel.set_width(_SENSORS_PX)
         return pictures
 
-    def _add_buttons(self, wish: Callable[[Wish], None], paused: bool) -> None:
+    def _add_buttons(self, send: Callable[[PageMessage], None], paused: bool) -> None:
         gui = self._server.gui
         self._buttons = pause, go_on, step = (
             gui.add_button("Pause", hint="The run waits after this frame.", visible=not paused),
@@ -126,10 +126,10 @@ class Page:
             gui.add_button("Step", hint="One frame, then wait."),
         )
 
-        def on(button: viser.GuiButtonHandle, action: Wish) -> None:
+        def on(button: viser.GuiButtonHandle, action: PageMessage) -> None:
             def clicked(_: object) -> None:
                 pause.visible, go_on.visible = action == "go on", action != "go on"
-                wish(action)
+                send(action)
 
             button.on_click(clicked)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from mixpose.session import Session
 from mixpose.viewing.address import Place
-from mixpose.viewing.moment import PACE, Moment, Wish
+from mixpose.viewing.moment import PACE, Moment, PageMessage
 
 if TYPE_CHECKING:  # an extra
     from mixpose.viewing.page import Page
@@ -33,20 +33,20 @@ def show(
     from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
     from mixpose.viewing.server import started  # noqa: PLC0415
 
-    wishes = Wishes(connection)
-    with started(place, on_viewers=wishes.viewers_are) as server:
-        page = Page(server, session, wishes.wish if on_files else None, paused=paused)
+    messages = RunMessages(connection)
+    with started(place, on_viewers=messages.send_viewers) as server:
+        page = Page(server, session, messages.send if on_files else None, paused=paused)
         with suppress(EOFError, OSError):  # the run has ended
-            _play(connection, wishes, page)
+            _play(connection, messages, page)
 
 
-def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
+def _play(connection: Connection, messages: RunMessages, page: Page) -> None:
     is_requested, ready_at = False, 0.0
     while True:
-        if not is_requested and wishes.viewers and time.monotonic() >= ready_at:
-            wishes.wish("next")
+        if not is_requested and messages.viewers and time.monotonic() >= ready_at:
+            messages.send("next")
             is_requested = True
-        if not connection.poll(_LOOK_S if is_requested or not wishes.viewers else 1e-3):
+        if not connection.poll(_LOOK_S if is_requested or not messages.viewers else 1e-3):
             continue
         moment: Moment | None = connection.recv()
         if moment is None:
@@ -59,7 +59,7 @@ def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
         is_requested = False
 
 
-class Wishes:
+class RunMessages:
     """Messages of the page to the run, from any thread."""
 
     def __init__(self, connection: Connection) -> None:
@@ -67,15 +67,15 @@ class Wishes:
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, message: Wish) -> None:
+    def send(self, message: PageMessage) -> None:
         """Send a message to the run."""
         with self._lock:
             self._connection.send(message)
 
-    def viewers_are(self, count: int) -> None:
+    def send_viewers(self, count: int) -> None:
         """Send the number of browsers that show the page."""
         self.viewers = count
-        self.wish(count)
+        self.send(count)
 
 
 def _be_quiet() -> None:

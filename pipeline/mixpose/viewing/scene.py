@@ -282,7 +282,7 @@ def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
 
 
 def up_of(session: Session) -> Floats:
-    """Return the direction (3,) of the world that is up in the images, an axis if one is near."""
+    """Return the world's up (3,) by the images, an axis if one is near; z if images disagree."""
     # ranges and clouds have no image
     cameras: list[Any] = [s.sensor for s in session.sensors if s.sensor.dimension == 2]
     ups = [-camera.T_sensor_world[1, :3] for camera in cameras]

@@ -18,7 +18,7 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish, row_of
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, Shown, row_of
 
 _LOOK_S = 0.2
 """Longest wait in seconds, after which interrupts come; some systems delay them during waits."""
@@ -213,7 +213,7 @@ class Viewer:
         """Receive messages of the page until it ends."""
         with suppress(EOFError, OSError):
             while True:
-                message: Wish = self._connection.recv()
+                message: PageMessage = self._connection.recv()
                 with self._state:
                     if isinstance(message, int):
                         self._viewers = message
