@@ -49,7 +49,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownFrame:
     """A sensor's frame on the page."""
 
     frame: RawFrame | None  # None if the sensor has none
@@ -62,7 +62,7 @@ class Moment:
     """A frame that is shown, with rows of the frames since the previous moment."""
 
     estimates: tuple[Estimate, ...]  # of all bodies
-    sensors: Mapping[str, Shown]
+    sensors: Mapping[str, ShownFrame]
     # of frames since the previous moment and of this one, the newest `Pace.history`
     rows: tuple[Row, ...]
     counts: Mapping[Status, int] = field(default_factory=dict)  # number of poses so far

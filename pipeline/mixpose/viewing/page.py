@@ -19,7 +19,7 @@ from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for,
 from mixpose.records import Estimate, Status
 from mixpose.sensors import CloudSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, Shown
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, ShownFrame
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
 
 _SENSORS_PX, _CONTROL_PX = 460, 380
@@ -69,7 +69,7 @@ class Page:
             posed = with_bodies(self._session, moment.estimates)
             with self._server.atomic():
                 for setup in self._session.sensors:
-                    shown = moment.sensors.get(setup.name, Shown(None))
+                    shown = moment.sensors.get(setup.name, ShownFrame(None))
                     drawn = self._draw(posed, setup, shown)
                     self._pictures[setup.name].image = drawn[:, :, ::-1]
                 self._status.content = status_text(moment)
@@ -88,7 +88,7 @@ class Page:
         self._server.flush()
 
     def _draw(
-        self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: Shown
+        self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: ShownFrame
     ) -> Picture:
         if isinstance(setup.sensor, CloudSensor):
             picture = np.zeros((60, 320, 3), np.uint8)

@@ -25,7 +25,7 @@ from mixpose.pictures.scene import with_bodies
 from mixpose.records import Estimate, Floats
 from mixpose.sensors import Rays, Sensor
 from mixpose.session import SensorSetup, Session
-from mixpose.viewing.moment import PACE, Moment, Row, Shown
+from mixpose.viewing.moment import PACE, Moment, Row, ShownFrame
 
 _SIZE = 4.0  # of the scene, in units of the page
 _BODY_RADII = 4.0  # smallest size of a scene, in radii of the largest body
@@ -266,7 +266,7 @@ class Outline:
         return np.concatenate([far, along] if self.border.central else [far, along, near])
 
 
-def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
+def outlines_of(session: Session, shown: Mapping[str, ShownFrame]) -> list[Outline]:
     """Return outlines of all sensors; `shown` gives sizes of images that the session does not."""
     outlines = []
     for setup in session.sensors:
@@ -296,7 +296,7 @@ def up_of(session: Session) -> Floats:
     return np.asarray(total)
 
 
-def _bounds(setup: SensorSetup, shown: Shown | None) -> tuple[Floats, Floats]:
+def _bounds(setup: SensorSetup, shown: ShownFrame | None) -> tuple[Floats, Floats]:
     """Return the lower and upper corner (2,) of a camera's image in px."""
     lower, upper = setup.sensor.lower, setup.sensor.upper
     if np.isfinite(lower).all() and np.isfinite(upper).all():

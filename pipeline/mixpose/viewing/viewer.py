@@ -18,7 +18,7 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, Shown, row_of
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, ShownFrame, row_of
 
 _LOOK_S = 0.2
 """Longest wait in seconds, after which interrupts come; some systems delay them during waits."""
@@ -198,7 +198,7 @@ class Viewer:
         frame_set, features, estimates = frame
         room = room_for(max(sum(s.sensor.dimension == 2 for s in self._session.sensors), 1))
         sensors = {
-            setup.name: _shown(frame_set.frames.get(setup.name), features.get(setup.name), room)
+            setup.name: _resized(frame_set.frames.get(setup.name), features.get(setup.name), room)
             for setup in self._session.sensors
         }
         # without `measured`, which refers to all data of the frame
@@ -231,15 +231,15 @@ class Viewer:
             self._state.notify_all()
 
 
-def _shown(frame: RawFrame | None, features: Floats | None, room: tuple[int, int]) -> Shown:
+def _resized(frame: RawFrame | None, features: Floats | None, room: tuple[int, int]) -> ShownFrame:
     """Return a frame for the page, its image no larger than the room for it."""
     if frame is None or isinstance(frame.data, PointPattern | GridPattern):
-        return Shown(frame, features=features)
+        return ShownFrame(frame, features=features)
     width, height = frame.data.shape[1], frame.data.shape[0]
     if width <= room[0] and height <= room[1]:
-        return Shown(frame, features=features)
+        return ShownFrame(frame, features=features)
     image, zoom = resized(frame.data, room)
-    return Shown(replace(frame, data=image), zoom, features)
+    return ShownFrame(replace(frame, data=image), zoom, features)
 
 
 @contextmanager
