@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import assert_one_line, command
 
-from mixpose.cli.notices import watched
+from mixpose.cli.notices import shown_progress
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.session import load_session
 
@@ -141,7 +141,7 @@ def test_what_was_searched_before_does_not_count_in_the_time_to_expect(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    with watched() as progress:
+    with shown_progress() as progress:
         for done in range(41):
             now[0] += 1e-4 if done <= 20 else 1.5
             progress("searching in left", done, 40)
@@ -155,7 +155,7 @@ def test_long_searches_are_told_in_minutes(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    with watched() as progress:
+    with shown_progress() as progress:
         for done in range(12):
             progress("searching in left", done, 14)  # too few to be worth a word
         for done in range(21):

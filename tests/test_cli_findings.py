@@ -87,7 +87,7 @@ def test_features_by_the_hundred_are_told_where_frames_are_not_ok(
         findings.watch(FrameSet(frame, None, pictures), views, estimate)
         if status == "lost":
             findings.add(estimate)
-    warnings = findings.of_sensors()
+    warnings = findings.sensor_lines()
     assert len(warnings) == warned
     for line in warnings:
         assert line.startswith("sensor 'right' found up to 700 features, where 7 are expected, in")
@@ -112,7 +112,7 @@ def test_a_table_that_repeats_itself_is_told_where_it_is_out_of_step(why: str | 
         pictures = {name: RawFrame(frame, None, data) for name, data in seen.items()}
         findings.watch(FrameSet(frame, None, pictures), views, estimate)
         findings.add(estimate)
-    told = [line for line in findings.of_sensors() if "frame before" in line]
+    told = [line for line in findings.sensor_lines() if "frame before" in line]
     # a body that rests shows the same to all
     assert len(told) == (why is not None)
     for line in told:
@@ -137,7 +137,7 @@ def test_a_flooded_image_is_told_as_such_though_nothing_of_it_is_used() -> None:
         findings.add(estimate)
     flooded = [
         line
-        for line in [*findings.of_sensors(), *findings.causes()]
+        for line in [*findings.sensor_lines(), *findings.causes()]
         if line.startswith(f"sensor {setup.name!r}")
     ]
     assert len(flooded) == 1

@@ -28,7 +28,7 @@ from page_client import open_page
 from websockets.exceptions import InvalidStatus
 
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Moment, Shown, row_of
+from mixpose.viewing.moment import PACE, Moment, ShownFrame, row_of
 from mixpose.viewing.page import Page, status_text
 from mixpose.viewing.scene import outlines_of, up_of
 from mixpose.viewing.server import started
@@ -61,7 +61,7 @@ def server() -> Iterator[Any]:
 
 def moment(frame: int, *estimates: Estimate) -> Moment:
     pattern = PointPattern(np.array([[30.0, 20.0]]), np.ones(1))
-    seen = Shown(RawFrame(frame, None, pattern), found=pattern.points)
+    seen = ShownFrame(RawFrame(frame, None, pattern), features=pattern.points)
     counts = Counter(one.status for one in estimates)
     return Moment(estimates, {"left": seen, "right": seen}, (row_of(estimates),), counts)
 

@@ -357,7 +357,7 @@ _FORMATS = (
     Mutant(
         "cli-poses-table-without-tips",
         "cli/run.py",
-        "tips=any(one.body.tip is not None for one in session.objects)",
+        "tips=any(setup.body.tip is not None for setup in session.objects)",
         "tips=False",
         "tables leave out the one point that a tool is for",
         (_RELATIVE,),

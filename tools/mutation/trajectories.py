@@ -88,7 +88,7 @@ MUTANTS = (
     Mutant(
         "cli-poses-give-way-to-a-failure",
         "cli/recording_job.py",
-        "if outcome.state == FAILED and there is not None and there.state == DONE:",
+        "if outcome.state == FAILED and existing is not None and existing.state == DONE:",
         "if False:",
         "poses are gone as a run with other options fails",
         ("test_cli_workers.py",),

@@ -19,20 +19,20 @@ WRONG_USAGE = 2
 INTERRUPTED = 130
 
 AT_ONCE = {"align", "check", "convert", "design", "evaluate", "inspect", "learn", "pivot", "smooth"}
-"""Commands that write what they found when they have all of it."""
+"""Commands that write all of their results at the end."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and leave with its exit status.
+    """Run the command line and exit with its status.
 
-    Errors that a user can mend are one line on standard error; ``--debug`` shows the traceback
-    before it, and what a command has to say beyond its results.  A request to end (SIGTERM, SIGHUP)
-    is taken like an interrupt from the keyboard.
+    Errors that a user can correct are one line on standard error; ``--debug`` shows the traceback
+    before it, and further messages of commands.  Requests to end (SIGTERM, SIGHUP) are handled like
+    an interrupt from the keyboard.
     """
     _replace_closed_streams()
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _ended_like_interrupted():
+        with _signals_as_interrupts():
             status = _status(words)
     except KeyboardInterrupt:  # while the commands were being imported
         status = _interrupted(words)
@@ -42,8 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Put something in the place of streams that whoever started this has closed."""
-    # messages then go nowhere, rather than to standard output; poses cannot be written
+    """Replace standard streams that the parent process has closed."""
+    # messages are dropped rather than written to standard output; poses cannot be written
     if sys.stderr is None:
         sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     if sys.stdout is None:
@@ -51,29 +51,29 @@ def _replace_closed_streams() -> None:
 
 
 @contextmanager
-def _ended_like_interrupted() -> Iterator[None]:
-    """Let requests to end finish what is open, as an interrupt does; ignored ones stay so."""
+def _signals_as_interrupts() -> Iterator[None]:
+    """Turn requests to end into interrupts, so that files are closed; keep ignored ones ignored."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    taken = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
-    for number in taken:
+    handled = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in handled:
         signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for number in taken:
+        for number in handled:
             signal.signal(number, signal.SIG_DFL)
 
 
 def _status(arguments: list[str]) -> int:
     ask_for_one_blas_thread()
-    # OpenCV looks at it when it is loaded
+    # OpenCV reads it when it is loaded
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
-    # imported here, so that a program that only looks at this package does not wait for them
+    # imported here, so that importing this package is fast
     import typer  # noqa: PLC0415
 
     from mixpose.cli.app import app  # noqa: PLC0415
@@ -81,7 +81,7 @@ def _status(arguments: list[str]) -> int:
     from mixpose.errors import MixposeError  # noqa: PLC0415
 
     debug = "--debug" in arguments
-    arguments = with_values([one for one in arguments if one != "--debug"] or ["--help"])
+    arguments = with_values([word for word in arguments if word != "--debug"] or ["--help"])
     try:
         outcome = typer.main.get_command(app).main(
             args=arguments, prog_name="mixpose", standalone_mode=False, obj=debug
@@ -95,35 +95,35 @@ def _status(arguments: list[str]) -> int:
     except SystemExit as error:
         if not isinstance(error.__context__, BrokenPipeError):
             raise
-        # the reader of a pipe has seen enough; keep Python from complaining when it flushes
+        # the reader has closed the pipe; keep Python from failing when it flushes
         _drop_standard_output()
         return 0
     except OSError as error:
         _drop_standard_output()
-        told = f"{error.filename or 'output'}: cannot be written or read: "
-        return _fail(told + (error.strerror or str(error)), WRONG_USAGE, debug=debug)
-    if outcome == INTERRUPTED:  # which is also what typer makes of a keyboard interrupt
+        text = f"{error.filename or 'output'}: cannot be written or read: "
+        return _fail(text + (error.strerror or str(error)), WRONG_USAGE, debug=debug)
+    if outcome == INTERRUPTED:  # typer returns the same for an interrupt from the keyboard
         return _interrupted(arguments)
     return outcome if isinstance(outcome, int) else 0
 
 
 def _interrupted(arguments: list[str]) -> int:
-    # where the interrupt fell into an `exec`, as of a dataclass that was being imported, Python
-    # would end by the signal whatever the status; the next `exec` makes it forget that
+    # if the interrupt came during an `exec`, as in the import of a dataclass, Python would end by
+    # the signal whatever the status; another `exec` clears this
     exec("")
     written = "" if AT_ONCE & {*arguments[:1]} else "; everything so far is written"
     return _fail(f"interrupted{written}", INTERRUPTED)
 
 
 def _drop_standard_output() -> None:
-    """Let what is still in the buffer go nowhere when Python flushes it."""
+    """Discard what is still in the buffer when Python flushes it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def cut_message(error: EOFError) -> str:
-    """One line: which compiled module ends too early, where it was one that was imported.
+    """Return one line that names the compiled module that is cut, if one was being imported.
 
-    No command reads what is typed, so that a file must be cut.
+    No command reads standard input, so that an EOFError is always about a cut file.
     """
     for frame, _ in traceback.walk_tb(error.__traceback__):
         path = frame.f_locals.get("bytecode_path")  # as importlib calls it

@@ -1,4 +1,4 @@
-"""``mixpose align``: a session in another frame of the world, by what lies on the floor."""
+"""``mixpose align``: move a session into a world frame that is given by objects on the floor."""
 
 from __future__ import annotations
 
@@ -29,53 +29,53 @@ MARK = "# Aligned by mixpose"
 def align_session(request: AlignRequest) -> None:
     """Write the session in the frame of the floor.
 
-    Raises SessionError if directions of the world are held in it, and RecordingError if the poses
-    tell no floor.
+    Raises SessionError if it holds directions of the world, and RecordingError if the poses
+    determine no floor.
     """
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
     rewriting.refuse_held_directions(session)
     rewriting.refuse_lost_code(session, request.output)
-    files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
+    files = [Path(text) for text in request.floor if "@" not in text or Path(text).is_file()]
     refuse_to_overwrite_but(request.output, [path, *files], MARK)
     refuse_suffix(request.output, (".toml",), "it is a session that is written")
     sources = request.source or ()
-    estimates = [one for each in request.floor for one in _told(each, session, sources)]
+    estimates = [e for text in request.floor for e in _floor_poses(text, session, sources)]
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
-    _tell(session, floor, request.up)
+    _report_floor(session, floor, request.up)
     say(f"{session.path.name} in the frame of {floor.by} -> {shown(request.output)}")
 
 
-def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate]:
-    """Poses that are ok, of a file or of a body in a frame of the recording."""
-    if Path(words).is_file():
-        poses = read_poses(words)
+def _floor_poses(text: str, session: Session, sources: Sequence[str]) -> list[Estimate]:
+    """Return poses that are ok, of a file or of a body in a frame of the recording."""
+    if Path(text).is_file():
+        poses = read_poses(text)
         poses.require_unit(session.unit, RecordingError, "--floor")
         lines = [line for line in poses.poses if line.status == "ok"]
         if not lines:
-            raise RecordingError(f"--floor {words}: found no pose that is ok")
+            raise RecordingError(f"--floor {text}: found no pose that is ok")
         return list(lines)
-    label, at, frame = words.rpartition("@")
-    if not at or label not in session.labels or not frame.isdecimal():
+    label, separator, frame = text.rpartition("@")
+    if not separator or label not in session.labels or not frame.isdecimal():
         raise SessionError(
-            f"--floor {words}: no such file; allowed: a file of poses, or OBJECT@FRAME with one of "
+            f"--floor {text}: no such file; allowed: a file of poses, or OBJECT@FRAME with one of "
             f"{', '.join(session.labels)}"
         )
-    number = int(frame)
-    replaced = named_sources(sources)
-    with closing(run(session, sources=replaced, selection=Selection(number, number + 1))) as found:
-        told = [one for one in found if one.label == label]
-    if not told:
-        raise RecordingError(f"--floor {words}: there is no frame {number}; name another one")
-    ok = [one for one in told if one.status == "ok"]
+    number, replaced = int(frame), named_sources(sources)
+    selection = Selection(number, number + 1)
+    with closing(run(session, sources=replaced, selection=selection)) as estimates:
+        of_body = [estimate for estimate in estimates if estimate.label == label]
+    if not of_body:
+        raise RecordingError(f"--floor {text}: there is no frame {number}; name another one")
+    ok = [estimate for estimate in of_body if estimate.status == "ok"]
     if not ok:
-        raise RecordingError(f"--floor {words}: {label} is not ok in this frame; name another one")
+        raise RecordingError(f"--floor {text}: {label} is not ok in this frame; name another one")
     return ok
 
 
 def _places(session: Session) -> Floats:
-    """Where sensors are; parallel beams, which come from everywhere, as their frames."""
+    """Return the places of sensors; for parallel beams the origins of their frames."""
     return np.stack([centre_of(setup.sensor) for setup in session.sensors])
 
 
@@ -96,7 +96,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
     return rewriting.text_of(document, session, head)
 
 
-def _tell(session: Session, floor: Floor, up: Axis) -> None:
+def _report_floor(session: Session, floor: Floor, up: Axis) -> None:
     if floor.off is not None:
         say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
     if floor.tilt_deg:

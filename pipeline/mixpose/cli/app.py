@@ -1,4 +1,4 @@
-"""What people type: commands and options.  Each command imports its work when it is called."""
+"""Commands and their options.  Each command imports its work when it is called."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from mixpose.cli import app_after
 from mixpose.cli.help import Command, Commands
 from mixpose.cli.request import RunRequest, Sources
-from mixpose.cli.words import AllowCode, Recordings, SessionFile, option, taking
+from mixpose.cli.words import AllowCode, Recordings, SessionFile, command_for, option
 from mixpose.units import Unit
 
 MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
@@ -251,21 +251,21 @@ class SimulateRequest:
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "run": taking(RunRequest, "several:run"),
-    "check": taking(CheckRequest, "check:check_session"),
-    "inspect": taking(InspectRequest, "inspect:inspect_frame"),
-    "import": taking(ImportRequest, "importing:import_files"),
-    "simulate": taking(SimulateRequest, "simulate:simulate_session"),
+    "run": command_for(RunRequest, "several:run"),
+    "check": command_for(CheckRequest, "check:check_session"),
+    "inspect": command_for(InspectRequest, "inspect:inspect_frame"),
+    "import": command_for(ImportRequest, "importing:import_files"),
+    "simulate": command_for(SimulateRequest, "simulate:simulate_session"),
     "evaluate": app_after.evaluate,
-    "convert": taking(app_after.ConvertRequest, "convert:convert_poses"),
+    "convert": command_for(app_after.ConvertRequest, "convert:convert_poses"),
     "schema": app_after.schema,
-    "report": taking(app_after.ReportRequest, "report:write_report"),
-    "calibrate": taking(CalibrateRequest, "calibrate:calibrate_session"),
-    "design": taking(DesignRequest, "design:design_sessions"),
-    "pivot": taking(app_after.PivotRequest, "pivot:pivot_poses"),
-    "align": taking(app_after.AlignRequest, "align:align_session"),
-    "smooth": taking(app_after.SmoothRequest, "smooth:smooth_poses"),
-    "learn": taking(LearnRequest, "learn:learn_session"),
+    "report": command_for(app_after.ReportRequest, "report:write_report"),
+    "calibrate": command_for(CalibrateRequest, "calibrate:calibrate_session"),
+    "design": command_for(DesignRequest, "design:design_sessions"),
+    "pivot": command_for(app_after.PivotRequest, "pivot:pivot_poses"),
+    "align": command_for(app_after.AlignRequest, "align:align_session"),
+    "smooth": command_for(app_after.SmoothRequest, "smooth:smooth_poses"),
+    "learn": command_for(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():
     app.command(name, cls=Command)(command)

@@ -1,4 +1,4 @@
-"""What people type when there are poses: ``mixpose evaluate``, report, convert, smooth and more."""
+"""Commands for existing poses and their options: evaluate, report, convert, smooth and more."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def evaluate(
     from json import dumps  # noqa: PLC0415
 
     from mixpose.cli.notices import warn  # noqa: PLC0415
-    from mixpose.poses.evaluate import evaluate as compared  # noqa: PLC0415
+    from mixpose.poses.evaluate import evaluate as errors_of  # noqa: PLC0415
     from mixpose.poses.jsonl import read_poses  # noqa: PLC0415
     from mixpose.poses.report import as_dict, as_table  # noqa: PLC0415
 
     files = [read_poses(path) for path in (poses, truth)]
-    found = compared(*files)
+    errors = errors_of(*files)
     for file in files:
-        if file.unit is None and found.unit is not None:
-            warn(f"{file.path}: no header says the unit of its lengths; taken for {found.unit}")
-    text = dumps(as_dict(found), indent=2) if json else as_table(found)
+        if file.unit is None and errors.unit is not None:
+            warn(f"{file.path}: no header says the unit of its lengths; taken for {errors.unit}")
+    text = dumps(as_dict(errors), indent=2) if json else as_table(errors)
     sys.stdout.write(text.rstrip("\n") + "\n")
 
 

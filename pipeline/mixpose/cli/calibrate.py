@@ -1,4 +1,4 @@
-"""``mixpose calibrate``: a session with the sensors that its recording tells of."""
+"""``mixpose calibrate``: calibrate the sensors of a session from its recording."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli import output
 from mixpose.cli.app import CalibrateRequest
-from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.notices import say, shown_progress, warn
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -32,7 +32,7 @@ from mixpose.session.rewriting import refuse_held_directions, refuse_lost_code
 
 
 def calibrate_session(request: CalibrateRequest) -> None:
-    """Calibrate a session and write what was found.
+    """Calibrate a session; write the calibrated session and the report.
 
     Raises RecordingError if the recording or the poses do not show the body.
     """
@@ -51,27 +51,27 @@ def calibrate_session(request: CalibrateRequest) -> None:
     for written, mark, option in ((target, MARK, "-o"), (request.report, REPORT_MARK, "--report")):
         if written is not None:
             output.refuse_to_overwrite_but(written, inputs, mark, option)
-    with _calibrated(session, request, inputs) as found:
+    with _calibrated(session, request, inputs) as result:
         if target is not None:
-            output.write_text(target, calibrated_text(session, found, target, __version__), "-o")
+            output.write_text(target, calibrated_text(session, result, target, __version__), "-o")
         if request.report is not None:
-            page = render_calibration(found, path.name, session.unit, __version__)
+            page = render_calibration(result, path.name, session.unit, __version__)
             output.write_text(request.report, page, "--report")
-    told = (check_lines if target is None else lines_of)(found, session.unit)
-    output.print_lines(told, target, request.report)
-    _warn(found, session.unit)
+    lines = (check_lines if target is None else lines_of)(result, session.unit)
+    output.print_lines(lines, target, request.report)
+    _warn(result, session.unit)
     if target is not None:
-        say(f"calibrated from {len(found.used)} frames -> {output.shown(target)}")
+        say(f"calibrated from {len(result.used)} frames -> {output.shown(target)}")
 
 
 @contextmanager
 def _calibrated(
     session: Session, request: CalibrateRequest, inputs: Sequence[Path | None]
 ) -> Iterator[Calibration]:
-    """Calibrate, for as long as what comes of it is written."""
+    """Yield the calibration; frames already searched stay saved until it is written."""
     rules = CalibrationRules()
-    with ExitStack() as kept:
-        with watched() as progress:
+    with ExitStack() as stack:
+        with shown_progress() as progress:
             task = task_of(session, request, rules, progress)
             say(f"free: {words.words_of(task.rig.names, task.free, task.body_free)}")
             if len(session.objects) > 1:
@@ -80,19 +80,19 @@ def _calibrated(
             if request.output is not None and not output.is_stdout(request.output):
                 partial = request.output.with_name(f"{request.output.name}.partial")
                 output.refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
-                saved = kept.enter_context(Saved(partial, _key_of(session, task)))
+                saved = stack.enter_context(Saved(partial, _key_of(session, task)))
                 if saved.resumed:
                     say(f"going on: {saved.resumed} frames of cameras were searched before")
-            found = calibrate(task, rules, progress=progress, found=saved)
+            calibration = calibrate(task, rules, progress=progress, found=saved)
         if request.length is not None:
-            found = words.in_length(found, request.length)
-        yield found if request.world is None else words.in_world(found, request.world)
+            calibration = words.in_length(calibration, request.length)
+        yield calibration if request.world is None else words.in_world(calibration, request.world)
 
 
 def task_of(
     session: Session, request: CalibrateRequest, rules: CalibrationRules, progress: Progress
 ) -> Task:
-    """Read the recording, and the poses where they are known."""
+    """Read the recording, and known poses if there are any."""
     require_points(session.body)
     setups, rig = session.sensors, rig_of(session)
     known = None if request.poses is None else known_poses(request.poses, session)
@@ -102,7 +102,7 @@ def task_of(
     pair = None if request.length is None else words.known_length(rig, request.length)[0]
     if pair is not None and known is not None:
         raise SessionError("--length: stands beside --poses, which give the scale; drop one")
-    kinds = {kind for each in free.values() for kind in each}
+    kinds = {kind for parameters in free.values() for kind in parameters}
     runs = bool(kinds & {"delay", "drift"}) or rig.is_late
     frames = read_frames(
         session, named_sources(request.source or ()), rules, progress, runs=runs, known=known
@@ -115,7 +115,7 @@ def task_of(
     return Task(
         rig=rig,
         frames=frames,
-        sigmas=np.array([one.extract.sigma for one in setups]),
+        sigmas=np.array([setup.extract.sigma for setup in setups]),
         free=free,
         body_free=body,
         pose_free=free_mask(session.estimator),
@@ -125,34 +125,34 @@ def task_of(
         known=known,
         length=pair,
         errors={
-            k: words.error_of_held(one.calibration_error, free.get(k, ()))
-            for k, one in enumerate(setups)
-            if one.calibration_error is not None
+            k: words.error_of_held(setup.calibration_error, free.get(k, ()))
+            for k, setup in enumerate(setups)
+            if setup.calibration_error is not None
         },
     )
 
 
 def known_poses(path: Path, session: Session) -> dict[int, Floats]:
-    """Poses (4, 4) of the session's body by frame number; RecordingError if there is none."""
+    """Return poses (4, 4) of the session's body by frame number; RecordingError if none is ok."""
     poses = read_poses(path)
     poses.require_unit(session.unit, RecordingError)
-    found = {
+    by_frame = {
         line.frame: line.T_world_object
         for line in poses.poses
         if line.T_world_object is not None
         and line.status == "ok"
         and line.object == session.body.name
     }
-    if not found:
+    if not by_frame:
         raise RecordingError(
             f"--poses {path}: found no pose of {session.body.name!r} that is ok; allowed: pose "
             "lines of the session's object"
         )
-    return found
+    return by_frame
 
 
 def _key_of(session: Session, task: Task) -> str:
-    """What the hypotheses of single cameras depend on."""
+    """Return a digest of all that the pose hypotheses of single cameras depend on."""
     digest = hashlib.sha256(f"{__version__} {session.sha256}".encode())
     for frame in task.frames:
         digest.update(str(frame.number).encode())
@@ -161,17 +161,17 @@ def _key_of(session: Session, task: Task) -> str:
     return digest.hexdigest()
 
 
-def _warn(found: Calibration, unit: str) -> None:
-    names = found.after.names
-    for sensor in found.unlinked:
+def _warn(result: Calibration, unit: str) -> None:
+    names = result.after.names
+    for sensor in result.unlinked:
         warn(
             f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
             "was: record the body where both see it"
         )
-    for doubt in doubts_of(found, unit):
+    for doubt in doubts_of(result, unit):
         warn(doubt)
-    for direction in found.refused:
+    for direction in result.refused:
         warn(f"not determined: {direction}: what is written of it tells nothing")
-    if found.bad:
-        numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
-        warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")
+    if result.bad:
+        numbers = ", ".join(map(str, result.bad[:8])) + (", ..." if len(result.bad) > 8 else "")
+        warn(f"{len(result.bad)} frames left out, most of their features are not met: {numbers}")

@@ -1,4 +1,4 @@
-"""``mixpose check``: what a session says and its recording holds, before poses are estimated."""
+"""``mixpose check``: report on a session and its recording before poses are estimated."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ from mixpose.session import ObjectSetup, SensorSetup, Session, load_session
 
 _TYPICAL_POSES = 3
 _AWAY = (1.0, 2.0, 4.0)  # times the distance at which the body fills half of one camera's image
-_ALL_WAYS = np.pi / 2  # a turn that is less certain than this, in radians, is not known at all
+_ALL_WAYS = np.pi / 2  # standard deviation of a turn, in radians, above which it is not known
 
 
 @dataclass
 class _Report:
-    """Lines for people, warnings last, so that they are on the screen in the end."""
+    """Lines to be printed, warnings last, so that they stay on the screen."""
 
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    of_counts: list[str] = field(default_factory=list)  # of features
-    of: str = ""  # of several bodies, which one is spoken of
+    count_warnings: list[str] = field(default_factory=list)  # warnings about numbers of features
+    prefix: str = ""  # the name of one of several bodies
 
     def say(self, title: str, text: str) -> None:
-        self.lines.append(f"{title:<10}{self.of}{text}")
+        self.lines.append(f"{title:<10}{self.prefix}{text}")
 
     def warn(self, text: str) -> None:
-        self.warnings.append(f"{self.of}{text}")
+        self.warnings.append(f"{self.prefix}{text}")
 
-    def write(self, tried: str, beside: str = "") -> None:
-        """Print all; `tried` is what is known where nothing is warned of, `beside` what follows."""
+    def write(self, tried: str, qualifier: str = "") -> None:
+        """Print all lines; without warnings, `tried` says what was tested, after a `qualifier`."""
         for warning in self.warnings:
             self.say("warning", warning)
         if not self.warnings:
-            self.say("warnings", f"none{beside}; {tried}")
+            self.say("warnings", f"none{qualifier}; {tried}")
         print_lines(self.lines)
 
 
@@ -68,33 +68,33 @@ def check_session(request: CheckRequest) -> None:
         source.check_times(ALL_NUMBERS)
     report = _Report()
     report.say("session", f"{session.path}, lengths in {session.unit}")
-    for one in session.objects:
-        _say_object(report, session, one)
+    for table in session.objects:
+        _say_object(report, session, table)
     surveys: dict[str, recordings.Survey] = {}
-    some = None if quick else recordings.some_of(opened)
+    sample = None if quick else recordings.some_of(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
-    with bar("reading frames", total, shown=not quick) as moved:
+    with bar("reading frames", total, shown=not quick) as tick:
         for setup in session.sensors:
             source = opened[setup.name]
             surveys[setup.name] = recordings.survey(
-                session, setup, source, quick=quick, looked_at=some, done=partial(moved, advance=1)
+                session, setup, source, quick=quick, looked_at=sample, done=partial(tick, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     shared = keys.shared_source_warnings(session, replaced)
-    sizes = {name: each.size for name, each in surveys.items()}
+    sizes = {name: survey.size for name, survey in surveys.items()}
     doubts = geometry.geometry_doubts(session, opened, surveys)
-    given = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
-    report.lines += given.lines
+    placed = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
+    report.lines += placed.lines
     if doubts.mended is None:
-        counts = keys.told_apart(report.of_counts, len(session.sensors))
-        report.warnings = [*counts, *report.warnings, *given.warnings, *doubts.warnings]
-        if doubts.unexplained and not (report.of_counts or doubts.warnings):
+        counts = keys.told_apart(report.count_warnings, len(session.sensors))
+        report.warnings = [*counts, *report.warnings, *placed.warnings, *doubts.warnings]
+        if doubts.unexplained and not (report.count_warnings or doubts.warnings):
             report.warnings.append(doubts.unexplained)
-    else:  # the cause first, then what is odd all the same
-        report.warnings = [*doubts.warnings, *report.warnings, *given.warnings]
-    # files and numbers are sure, and what is given twice or out of step may look moved
+    else:  # the cause first, then what remains odd
+        report.warnings = [*doubts.warnings, *report.warnings, *placed.warnings]
+    # faults of files and numbers are certain, and may make sensors look displaced
     report.warnings = [
         *shared,
         *_pairing_warnings(opened),
@@ -104,42 +104,42 @@ def check_session(request: CheckRequest) -> None:
         *recordings.frozen_warnings(surveys),
         *report.warnings,
     ]
-    first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
+    first = min((min(survey.numbers) for survey in surveys.values() if survey.numbers), default=0)
     not_tried = f"no frame was estimated, which mixpose run --stop {first + 3} does"
-    damage = [text for each in surveys.values() for text in each.damage]
-    beside = " but for the error that follows" if damage else ""
-    report.write(doubts.tried or not_tried, beside)
+    damage = [text for survey in surveys.values() for text in survey.damage]
+    qualifier = " but for the error that follows" if damage else ""
+    report.write(doubts.tried or not_tried, qualifier)
     if damage:
-        more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
-        raise RecordingError(f"{damage[0]}{more}")
+        suffix = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
+        raise RecordingError(f"{damage[0]}{suffix}")
 
 
 def _of_geometry(session: Session) -> _Report:
-    """What is said of where sensors stand and what they see of the bodies there."""
+    """Report on the placement of sensors, their views of the bodies and the expected accuracy."""
     report = _Report()
     report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
-    for one in session.objects:
-        report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
-        _say_accuracy(report, session.with_only(one.body.name))
-    report.of = ""
+    for setup in session.objects:
+        report.prefix = f"{setup.body.name}: " if len(session.objects) > 1 else ""
+        _say_accuracy(report, session.alone(setup.body.name))
+    report.prefix = ""
     report.warnings += keys.shared_part_warnings(session)
     return report
 
 
-def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
-    body = one.body
+def _say_object(report: _Report, session: Session, setup: ObjectSetup) -> None:
+    body = setup.body
     spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
     extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
-    many = f", {one.count} that are identical" if one.count > 1 else ""
-    report.say("object", f"{body.name}: {extent}{spread}{many}")
-    alike, of = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
+    identical = f", {setup.count} that are identical" if setup.count > 1 else ""
+    report.say("object", f"{body.name}: {extent}{spread}{identical}")
+    count, prefix = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
     within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
-    same = f"{alike} orientations look the same{within}" if alike > 1 else "none"
+    symmetry = f"{count} orientations look the same{within}" if count > 1 else "none"
     points = body.nodes.points
     if free_mask(session.estimator)[3:].all() and is_on_a_line(points, default_tolerance(points)):
-        same = "all turns about the line of its features look the same: no frame has its pose"
-    written = "; the pose nearest to the previous one is written" if alike > 1 else ""
-    report.say("symmetry", f"{of}{same}{written}")
+        symmetry = "all turns about the line of its features look the same: no frame has its pose"
+    written = "; the pose nearest to the previous one is written" if count > 1 else ""
+    report.say("symmetry", f"{prefix}{symmetry}{written}")
 
 
 def _say_sensor(
@@ -149,87 +149,89 @@ def _say_sensor(
     source: Source,
     surveys: Mapping[str, recordings.Survey],
 ) -> None:
-    found = surveys[setup.name]
+    survey = surveys[setup.name]
     size = "" if setup.resolution is None else f" {setup.resolution[0]}x{setup.resolution[1]}"
     report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, session.unit)}")
     for line in placement.placement_lines(setup, session.unit):
         report.say("", line)
-    total = len(found.numbers) + len(found.damage)
-    read = "all read" if found.is_whole else f"looked at {total}"
-    if found.damage:
-        read = f"{len(found.damage)} of the {total} looked at cannot be read"
-    report.say("", f"{source.describe()}; {read}" if not found.damage or found.numbers else read)
-    for text in found.damage[: recordings.LISTED]:
+    total = len(survey.numbers) + len(survey.damage)
+    read = "all read" if survey.is_whole else f"looked at {total}"
+    if survey.damage:
+        read = f"{len(survey.damage)} of the {total} looked at cannot be read"
+    report.say("", read if survey.damage and not survey.numbers else f"{source.describe()}; {read}")
+    for text in survey.damage[: recordings.LISTED]:
         report.say("", f"damaged: {text}")
     if caution := source.caution():
         report.warn(f"sensor {setup.name!r}: {caution}")
-    own = {*found.numbers, *found.damaged}
-    known = own.union(*(each.numbers for each in surveys.values()))
-    missing = recordings.listed(sorted(known - own))
-    if missing and all(each.is_whole for each in surveys.values()):
-        report.say("", f"missing: {missing} of the {len(known)} frames of all sensors")
-    _say_features(report, session, setup, source, found)
+    numbers = {*survey.numbers, *survey.damaged}
+    all_numbers = numbers.union(*(other.numbers for other in surveys.values()))
+    missing = recordings.listed(sorted(all_numbers - numbers))
+    if missing and all(other.is_whole for other in surveys.values()):
+        report.say("", f"missing: {missing} of the {len(all_numbers)} frames of all sensors")
+    _say_features(report, session, setup, source, survey)
 
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
-    """Sensors whose frames hardly pair with those of others, told by numbers alone."""
-    numbers = {name: found for name, each in sources.items() if (found := numbers_of(each))}
+    """Return warnings of sensors whose frame numbers hardly pair with those of others."""
+    numbers = {name: frames for name, source in sources.items() if (frames := numbers_of(source))}
     warnings = []
-    for name, own in numbers.items():
-        known = set().union(*(each for other, each in numbers.items() if other != name))
-        pairs = len(own & known)
-        if known and pairs < 0.5 * min(len(own), len(known)):
+    for name, frames in numbers.items():
+        other_numbers = set().union(*(numbers[other] for other in numbers if other != name))
+        pairs = len(frames & other_numbers)
+        if other_numbers and pairs < 0.5 * min(len(frames), len(other_numbers)):
             is_table = isinstance(sources[name], DetectionTable)
-            by = (
+            hint = (
                 "in the column frame; count all tables alike"
                 if is_table
                 else "that their names end in; rename the files"
             )
             warnings.append(
-                f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other "
-                f"sensors: frames are paired by the number {by}"
+                f"sensor {name!r}: {pairs} of its {len(frames)} frames pair with those of other "
+                f"sensors: frames are paired by the number {hint}"
             )
-    for (one, own), (other, others) in combinations(numbers.items(), 2):
-        if own & others and own != others and {k - min(own) + min(others) for k in own} == others:
+    for (name, frames), (other, others) in combinations(numbers.items(), 2):
+        shift = min(others) - min(frames)
+        if frames & others and frames != others and {k + shift for k in frames} == others:
             warnings.append(
-                f"sensors {one!r} and {other!r} have {len(own)} frames each, numbered from "
-                f"{min(own)} and from {min(others)}: if both began at once, number those of one "
+                f"sensors {name!r} and {other!r} have {len(frames)} frames each, numbered from "
+                f"{min(frames)} and from {min(others)}: if both began at once, number those of one "
                 "anew, as frames of one number are taken together"
             )
     return warnings
 
 
 def _say_features(
-    report: _Report, session: Session, setup: SensorSetup, source: Source, found: recordings.Survey
+    report: _Report, session: Session, setup: SensorSetup, source: Source, survey: recordings.Survey
 ) -> None:
-    where = f"sensor {setup.name!r}"
-    alone = [(session.with_only(one.body.name), one.count) for one in session.objects]
-    expected = sum(count * placement.expected_count(setup, each) for each, count in alone)
-    if not (found.numbers or found.damage):
-        report.warn(f"{where}: its recording has no frame")
-    if found.counts is None:
-        if found.numbers and found.empty:
-            frames = recordings.listed(found.empty)
-            report.warn(f"{where}: nothing but one value in frame {frames}")
+    sensor = f"sensor {setup.name!r}"
+    singles = [(session.alone(table.body.name), table.count) for table in session.objects]
+    expected = sum(count * placement.expected_count(setup, single) for single, count in singles)
+    if not (survey.numbers or survey.damage):
+        report.warn(f"{sensor}: its recording has no frame")
+    if survey.counts is None:
+        if survey.numbers and survey.empty:
+            frames = recordings.listed(survey.empty)
+            report.warn(f"{sensor}: nothing but one value in frame {frames}")
         return
-    low, high = min(found.counts), max(found.counts)
-    middle = float(np.median(found.counts))
-    of = "" if len(found.counted) == len(found.numbers) else f" of {len(found.counted)} frames"
-    counts = f"{low} / {middle:g} / {high} (least / median / most{of})"
+    low, high = min(survey.counts), max(survey.counts)
+    middle = float(np.median(survey.counts))
+    counted = len(survey.counted)
+    basis = "" if counted == len(survey.numbers) else f" of {counted} frames"
+    counts = f"{low} / {middle:g} / {high} (least / median / most{basis})"
     report.say("", f"features per frame: {counts}, expected: {expected}")
-    fewest = min(placement.fewest_count(setup, each) for each, _ in alone)
+    fewest = min(placement.fewest_count(setup, single) for single, _ in singles)
     judgement = keys.judge(middle, expected, fewest if len(session.labels) == 1 else None)
     if judgement is not None:
-        number = found.typical_frame
-        assert number is not None, "there are counts"
-        image = recordings.image_of(source, number)
-        count = found.counts[found.counted.index(number)]
-        report.of_counts.append(
-            f"{where}: {judgement} features, {count} in frame {number} where "
-            f"{expected} are expected: {keys.advice(session, setup, number, image, expected)}"
+        typical = survey.typical_frame
+        assert typical is not None, "there are counts"
+        image = recordings.image_of(source, typical)
+        count = survey.counts[survey.counted.index(typical)]
+        report.count_warnings.append(
+            f"{sensor}: {judgement} features, {count} in frame {typical} where "
+            f"{expected} are expected: {keys.advice(session, setup, typical, image, expected)}"
         )
-    elif found.empty:
-        report.warn(f"{where}: no feature in frame {recordings.listed(found.empty)}")
+    elif survey.empty:
+        report.warn(f"{sensor}: no feature in frame {recordings.listed(survey.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:
@@ -242,21 +244,21 @@ def _extraction(setup: SensorSetup, length_unit: str) -> str:
 
 
 def _say_accuracy(report: _Report, session: Session) -> None:
-    """What is in view, how accurate poses will be, and which poses look alike."""
+    """Report features in view, expected accuracy, and poses that look alike."""
     if session.start is not None:
         _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
         return
-    several = placement.depends_on_distance(session)
-    for away in _AWAY if several else _AWAY[:1]:
+    depends_on_distance = placement.depends_on_distance(session)
+    for away in _AWAY if depends_on_distance else _AWAY[:1]:
         poses = placement.typical_poses(session, _TYPICAL_POSES, away=away)
         if not poses:
             report.say("start", "none, and no place is in view of the sensors: add [start]")
             return
         where = "in the middle of the sensors' common view"
-        if several:
+        if depends_on_distance:
             middle = transform(np.array(poses), session.body.means.mean(axis=0)[None])[:, 0]
-            away_by = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
-            where = f"{float(f'{away_by:.3g}'):g} {session.unit} away"
+            distance = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
+            where = f"{float(f'{distance:.3g}'):g} {session.unit} away"
         if away == _AWAY[0]:
             report.say(
                 "start",
@@ -270,7 +272,7 @@ def _say_accuracy(report: _Report, session: Session) -> None:
 def _say_accuracy_at(
     report: _Report, session: Session, poses: list[Floats], where: str, *, brief: bool = False
 ) -> bool:
-    """Say it for some poses; returns whether other poses look like one of them."""
+    """Report accuracy at poses (4, 4); return whether other poses look like one of them."""
     free = free_mask(session.estimator)
     sensors = [setup.sensor for setup in session.sensors]
     sigmas = [setup.extract.sigma for setup in session.sensors]
@@ -295,23 +297,23 @@ def _say_accuracy_at(
                 f"{where}, the sensors do not determine {', '.join(unknown)}: hold what is known "
                 "at the pose of [start] with free in [estimator], or add a sensor"
             )
-    others = [
+    looking_alike = [
         lookalikes.look_alikes(session.sensors, session.body, T, free)
         for T, (covariance, _) in zip(poses, expected, strict=True)
         if np.isfinite(np.diag(covariance)).all()
     ]
-    found = [alike for alike in others if alike]
-    if found:
-        report.warn(_look_alike_text(session, found, len(poses), where))
-    return bool(found)
+    ambiguous = [alike for alike in looking_alike if alike]
+    if ambiguous:
+        report.warn(_look_alike_text(session, ambiguous, len(poses), where))
+    return bool(ambiguous)
 
 
 def _look_alike_text(
-    session: Session, found: list[list[lookalikes.LookAlike]], tried: int, where: str
+    session: Session, ambiguous: list[list[lookalikes.LookAlike]], tried: int, where: str
 ) -> str:
-    best = min((alike[0] for alike in found), key=lambda other: other.difference)
-    orientations = f" in {len(found)} of {tried} orientations" if tried > 1 else ""
-    count = max(map(len, found))
+    best = min((alike[0] for alike in ambiguous), key=lambda alike: alike.difference)
+    orientations = f" in {len(ambiguous)} of {tried} orientations" if tried > 1 else ""
+    count = max(map(len, ambiguous))
     poses = "another pose looks" if count == 1 else f"{count} other poses look"
     largest = max(session.sensors, key=lookalikes.noise_of)
     unit = "px" if largest.sensor.unit == "px" else session.unit
@@ -327,8 +329,8 @@ def _deviations(deviations: Floats, unit: str, free: NDArray[np.bool_]) -> str:
     scale = np.array([1.0] * 3 + [180 / np.pi] * 3)
     units = [unit] * 3 + ["deg"] * 3
     return ", ".join(
-        f"{name} {value:.3g} {each}" if np.isfinite(value) else f"{name} not determined"
-        for name, value, each, is_free in zip(
+        f"{name} {value:.3g} {unit_name}" if np.isfinite(value) else f"{name} not determined"
+        for name, value, unit_name, is_free in zip(
             TWIST_NAMES, deviations * scale, units, free, strict=True
         )
         if is_free

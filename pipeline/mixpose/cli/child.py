@@ -1,7 +1,7 @@
-"""The command line of a process that ends when the one which started it does.
+"""Run the command line in a process that ends together with its parent.
 
-Its standard input is a pipe that nobody writes to: when it ends, whoever held the other end is
-gone, killed perhaps, and what this process would go on to write could meet its successor's.
+Its standard input is a pipe without data, which ends with the parent.  A child that went on, after
+its parent was killed, could write to the same files as a later run.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import sys
 import threading
 import time
 
-_GRACE_S = 5.0  # to finish what is open, as after an interrupt
+_GRACE_S = 5.0  # to finish open files, as after an interrupt
 
 
 def _end_with_parent() -> None:
-    """Wait for the end of standard input, and ask this process to end then."""
+    """Wait for the end of standard input, then end this process."""
     while os.read(sys.stdin.fileno(), 1):
         pass
-    # taken like an interrupt, which is ignored by what a script starts in the background
+    # handled like an interrupt, which processes that a script starts in the background ignore
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_GRACE_S)
     os._exit(130)

@@ -1,4 +1,4 @@
-"""``mixpose convert``: pose lines in the formats of others."""
+"""``mixpose convert``: write pose lines in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 def convert_poses(request: ConvertRequest) -> None:
     """Write the poses of a file in another format.
 
-    Raises RecordingError if it holds what the format cannot say.
+    Raises RecordingError if it holds what the format cannot express.
     """
     request = replace(request, output=output_of(request.output))
     path, name = request.poses, _format(request)
@@ -38,7 +38,7 @@ def convert_poses(request: ConvertRequest) -> None:
     T_sensor_world = np.eye(4)
     if request.relative_to in {line.label for line in poses.poses}:
         _refuse_of_other_references(name, request)
-        poses = _beside(poses, request.relative_to)
+        poses = _relative_to_body(poses, request.relative_to)
     elif request.relative_to is not None:
         T_sensor_world = _T_sensor_world(poses, request.relative_to, request)
     lines = _selected(poses, name, request)
@@ -59,8 +59,8 @@ def convert_poses(request: ConvertRequest) -> None:
     if request.output is not None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
-        many = len(lines) if name in ("jsonl", "csv", "rerun") else posed
-        say(f"{counted(many, 'pose')} -> {', '.join(map(str, outputs))}")
+        count = len(lines) if name in ("jsonl", "csv", "rerun") else posed
+        say(f"{counted(count, 'pose')} -> {', '.join(map(str, outputs))}")
 
 
 def _write(
@@ -71,8 +71,8 @@ def _write(
     request: ConvertRequest,
 ) -> None:
     frame_id = request.relative_to if name == "ros" else None
-    given = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
-    options = {key: value for key, value in given.items() if value is not None}
+    values = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
+    options = {key: value for key, value in values.items() if value is not None}
     header = estimates.header_of(poses, _unit(poses, request), __version__)
     if name != "bop" or (request.object is not None and request.obj_id is not None):
         header = replace(header, objects=estimates.objects_of(lines))
@@ -83,7 +83,7 @@ def _write(
 
 
 def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
-    """Refuse what goes with poses relative to a camera, and not to a body."""
+    """Raise SessionError for options that need poses relative to a camera, not to a body."""
     if name == "bop":
         raise SessionError(
             f"--relative-to {request.relative_to}: is a body, and --format bop holds poses "
@@ -95,29 +95,29 @@ def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
         raise SessionError("--session: found beside a body at --relative-to, which needs none")
 
 
-def _beside(poses: PoseFile, reference: str) -> PoseFile:
-    """Poses of the other bodies of a file in the axes of one of them."""
-    own = [line for line in poses.poses if line.label == reference]
-    known = {line.frame: line for line in estimates.first_answers(own)}
-    if len(known) < len(own):
+def _relative_to_body(poses: PoseFile, reference: str) -> PoseFile:
+    """Return the poses of the other bodies of a file in the axes of a reference body."""
+    lines = [line for line in poses.poses if line.label == reference]
+    by_frame = {line.frame: line for line in estimates.first_answers(lines)}
+    if len(by_frame) < len(lines):
         warn(f"{poses.path}: several right answers for {reference!r}; the first is taken")
     others = [line for line in poses.poses if line.label != reference]
     if not others:
         raise SessionError(f"--relative-to {reference}: {poses.path} has poses of no other body")
-    beside = tuple(estimates.relative_to_body(line, known.get(line.frame)) for line in others)
+    relative = tuple(estimates.relative_to_body(line, by_frame.get(line.frame)) for line in others)
     lost = sum(
-        one.status != "lost" and then.status == "lost"
-        for one, then in zip(others, beside, strict=True)
+        before.status != "lost" and after.status == "lost"
+        for before, after in zip(others, relative, strict=True)
     )
     if lost:
         warn(
             f"{poses.path}: {lost} of {len(others)} poses are lost, as {reference!r} has none then"
         )
-    return replace(poses, poses=beside)
+    return replace(poses, poses=relative)
 
 
 def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floats:
-    """The pose (4, 4) of a camera of the session, that poses are moved by."""
+    """Return T_sensor_world (4, 4) of a camera of the poses' session."""
     bodies = ", ".join(dict.fromkeys(line.label for line in poses.poses))
     try:
         session = session_of(poses, request.session, unit=request.unit)
@@ -134,22 +134,22 @@ def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floa
 
 
 def _format(request: ConvertRequest) -> str:
-    found, suffixes = request.format or by_suffix(request.output, _BY_SUFFIX), ", ".join(_BY_SUFFIX)
-    if found is None and request.output is None:
+    name, suffixes = request.format or by_suffix(request.output, _BY_SUFFIX), ", ".join(_BY_SUFFIX)
+    if name is None and request.output is None:
         raise SessionError(
             "--format: missing, where there is no -o whose suffix tells the format; add "
             f"--format csv, or -o with a name that ends in {suffixes}"
         )
-    if found is None:
+    if name is None:
         raise SessionError(
             f"-o {request.output}: no format has this suffix; add --format, or choose a name that "
             f"ends in {suffixes}"
         )
-    return found
+    return name
 
 
 def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None:
-    given = {
+    options = {
         "--scene-id": (request.scene_id, ("bop",)),
         "--obj-id": (request.obj_id, ("bop",)),
         "--relative-to": (request.relative_to, ("bop", "csv", "ros", "tum")),
@@ -157,7 +157,7 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
         "--measured": (request.measured or None, MARKER_FORMATS),
         "--fps": (request.fps, MARKER_FORMATS),
     }
-    for option, (value, owners) in given.items():
+    for option, (value, owners) in options.items():
         if value is not None and name not in owners:
             raise SessionError(
                 f"{option}: belongs to --format {' or '.join(owners)}, found --format {name}"
@@ -170,7 +170,7 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
 
 
 def _unit(poses: PoseFile, request: ConvertRequest) -> str:
-    """Unit of the lengths in the poses file."""
+    """Return the unit of lengths in the poses file."""
     allowed = ", ".join(UNITS_PER_METRE)
     if request.unit is not None and request.unit not in UNITS_PER_METRE:
         raise SessionError(f"--unit {request.unit}: allowed are {allowed}")
@@ -185,7 +185,7 @@ def _unit(poses: PoseFile, request: ConvertRequest) -> str:
 
 
 def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseLine]:
-    """The lines to write, in the order of the file."""
+    """Return the lines to write, in the order of the file."""
     bodies = list(dict.fromkeys(line.label for line in poses.poses))
     objects = {*bodies, *(line.object for line in poses.poses)}
     if request.object is not None and request.object not in objects:
@@ -205,8 +205,8 @@ def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseL
     if name == "jsonl":
         return lines
     answers = Counter((line.frame, line.label) for line in lines)
-    several = sum(count > 1 for count in answers.values())
-    if several:
-        frames = counted(several, "frame")
+    repeated = sum(count > 1 for count in answers.values())
+    if repeated:
+        frames = counted(repeated, "frame")
         warn(f"{poses.path}: several right answers in {frames}; the first is written")
     return estimates.first_answers(lines)

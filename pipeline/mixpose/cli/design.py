@@ -1,4 +1,4 @@
-"""``mixpose design``: what planned systems will achieve."""
+"""``mixpose design``: predict the accuracy of planned systems."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from mixpose.whole_files import appearing_whole
 _MOST_POSES = 2000
 
 
-def design_sessions(asked: DesignRequest) -> None:
+def design_sessions(request: DesignRequest) -> None:
     """Print a study of the systems of several session files. Raises SessionError."""
-    paths = asked.sessions
+    paths = request.sessions
     sessions = [with_image_sizes(load_session(path), {}) for path in paths]
     for path, session in zip(paths, sessions, strict=True):
         if session.unit != sessions[0].unit:
@@ -38,82 +38,83 @@ def design_sessions(asked: DesignRequest) -> None:
                 f"{path}: unit: found {session.unit!r}; allowed: {sessions[0].unit!r}, as of "
                 f"{paths[0]}, to compare them"
             )
-    _require_room(asked, paths)
+    _require_room(request, paths)
     for path, session in zip(paths, sessions, strict=True):
         if len(session.objects) > 1:
-            bodies = ", ".join(one.body.name for one in session.objects)
+            bodies = ", ".join(setup.body.name for setup in session.objects)
             warn(f"{path}: {session.body.name!r} alone is judged, the first of {bodies}")
-    # of each its own, or that of its folder
+    # named by the file or, if that is session.toml, by its folder
     stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
     names = [s if stems.count(s) == 1 else f"{s} ({k + 1})" for k, s in enumerate(stems)]
-    request = Request(
-        poses=_poses(sessions[0], asked),
-        tip=sessions[0].body.tip if asked.tip is None else _three("--tip", asked.tip),
-        noises=_noises(asked.noise or (), sessions, names),
-        runs=asked.monte_carlo,
-        seed=asked.seed,
-        tolerance=asked.tolerance,
+    task = Request(
+        poses=_poses(sessions[0], request),
+        tip=sessions[0].body.tip if request.tip is None else _three("--tip", request.tip),
+        noises=_noises(request.noise or (), sessions, names),
+        runs=request.monte_carlo,
+        seed=request.seed,
+        tolerance=request.tolerance,
     )
-    told = say if sys.stderr.isatty() else lambda text: None
-    # what does the simulated frames: this process, others, or a cluster
-    alone = not asked.monte_carlo or (asked.workers == 1 and asked.scheduler is None)
-    several = asked.workers if asked.workers > 1 else None
-    with nullcontext() if alone else executor(asked.scheduler, several) as workers:
-        found = study(list(zip(names, sessions, strict=True)), request, told, workers)
-    output.print_lines([study_text(found).removesuffix("\n")], asked.json)
-    if asked.json is not None:
-        output.write_text(asked.json, json.dumps(study_json(found), indent=1) + "\n", "--json")
-    if asked.plot is not None:
+    progress = say if sys.stderr.isatty() else lambda text: None
+    # frames are simulated in this process, in others, or on a cluster
+    is_serial = not request.monte_carlo or (request.workers == 1 and request.scheduler is None)
+    worker_count = request.workers if request.workers > 1 else None
+    with nullcontext() if is_serial else executor(request.scheduler, worker_count) as workers:
+        results = study(list(zip(names, sessions, strict=True)), task, progress, workers)
+    output.print_lines([study_text(results).removesuffix("\n")], request.json)
+    if request.json is not None:
+        output.write_text(request.json, json.dumps(study_json(results), indent=1) + "\n", "--json")
+    if request.plot is not None:
         from mixpose.design.plot import draw_study  # noqa: PLC0415
 
-        with appearing_whole(asked.plot) as draft:
-            draw_study(found, draft)
+        with appearing_whole(request.plot) as draft:
+            draw_study(results, draft)
             sign_figure(draft)
-    if written := [output.shown(path) for path in (asked.json, asked.plot) if path is not None]:
+    if written := [output.shown(path) for path in (request.json, request.plot) if path is not None]:
         say(f"{counted(len(names), 'system')} -> {', '.join(written)}")
 
 
-def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
-    """See that what will be written is in nothing's way, before anything is computed."""
-    if asked.json is not None:
-        output.refuse_to_overwrite_but(asked.json, (*sessions, asked.poses), JSON_MARK, "--json")
-    output.refuse_stdout(asked.plot, "--plot", "a picture", "a file, as --plot study.png")
-    output.refuse_one_for_two(asked.plot, "--plot", asked.json, "--json")
-    if asked.plot is not None:
+def _require_room(request: DesignRequest, sessions: Sequence[Path]) -> None:
+    """Raise SessionError if an output cannot be written, before anything is computed."""
+    inputs = *sessions, request.poses
+    if request.json is not None:
+        output.refuse_to_overwrite_but(request.json, inputs, JSON_MARK, "--json")
+    output.refuse_stdout(request.plot, "--plot", "a picture", "a file, as --plot study.png")
+    output.refuse_one_for_two(request.plot, "--plot", request.json, "--json")
+    if request.plot is not None:
         from mixpose.design.plot import require_plots  # noqa: PLC0415
 
-        require_plots(asked.plot)
-        if not asked.plot.parent.is_dir():
-            raise SessionError(f"--plot {asked.plot}: there is no folder {asked.plot.parent}")
-        refuse_foreign(asked.plot, "--plot")
+        require_plots(request.plot)
+        if not request.plot.parent.is_dir():
+            raise SessionError(f"--plot {request.plot}: there is no folder {request.plot.parent}")
+        refuse_foreign(request.plot, "--plot")
 
 
-def _poses(session: Session, asked: DesignRequest) -> Floats:
-    if asked.poses is None:
-        volume = None if asked.volume is None else _three("--volume", asked.volume)
+def _poses(session: Session, request: DesignRequest) -> Floats:
+    if request.poses is None:
+        volume = None if request.volume is None else _three("--volume", request.volume)
         if volume is not None and (volume < 0).any():
-            raise SessionError(f"--volume: found {asked.volume}; allowed: three lengths from 0")
+            raise SessionError(f"--volume: found {request.volume}; allowed: three lengths from 0")
         return spread_poses(
-            session, asked.count, volume=volume, turn_deg=asked.turn, seed=asked.seed
+            session, request.count, volume=volume, turn_deg=request.turn, seed=request.seed
         )
-    poses = _read(asked.poses, session)
+    poses = _read(request.poses, session)
     if len(poses) > _MOST_POSES:
         poses = [poses[int(k)] for k in np.linspace(0, len(poses) - 1, _MOST_POSES)]
     return np.array(poses)
 
 
 def _read(path: Path, session: Session) -> list[Floats]:
-    """Poses of the session's body from a file; a SessionError if it has none of its unit."""
-    read = read_poses(path)
-    read.require_unit(session.unit, SessionError)
+    """Return poses of the session's body from a file; SessionError if none, or another unit."""
+    file = read_poses(path)
+    file.require_unit(session.unit, SessionError)
     name = session.body.name
     poses = [
         pose.T_world_object
-        for pose in read.poses
+        for pose in file.poses
         if pose.T_world_object is not None and pose.object == name
     ]
     if not poses:
-        others = ", ".join(dict.fromkeys(pose.object for pose in read.poses)) or "none"
+        others = ", ".join(dict.fromkeys(pose.object for pose in file.poses)) or "none"
         raise SessionError(
             f"--poses {path}: holds no pose of {name!r}, the body of {session.path}; found lines "
             f"of {others}"
@@ -129,12 +130,12 @@ def _three(option: str, text: str) -> Floats:
 
 
 def _noises(
-    given: Sequence[str], sessions: Sequence[Session], names: Sequence[str]
+    texts: Sequence[str], sessions: Sequence[Session], names: Sequence[str]
 ) -> dict[tuple[int | None, str], float]:
-    """``SENSOR=NUMBER`` for all systems, ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
+    """Parse noise: ``SENSOR=NUMBER``, or ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
     noises: dict[tuple[int | None, str], float] = {}
-    # what is said of fewer systems and sensors counts more, wherever it stands
-    for text in sorted(given, key=lambda text: ("*" not in text, ":" in text)):
+    # texts for fewer systems or sensors override more general ones, in any order
+    for text in sorted(texts, key=lambda text: ("*" not in text, ":" in text)):
         place, _, number = text.rpartition("=")
         system, _, sensor = place.rpartition(":")
         value = as_number(number)
@@ -145,14 +146,14 @@ def _noises(
             )
         if system and system not in names:
             raise SessionError(f"--noise: found no system {system!r}; systems: {', '.join(names)}")
-        meant = [
+        selected = [
             (k, setup.name)
             for k, (name, session) in enumerate(zip(names, sessions, strict=True))
             for setup in session.sensors
             if system in ("", name) and sensor in ("*", setup.name)
         ]
-        noises |= dict.fromkeys(meant, value)
-        if not meant:
+        noises |= dict.fromkeys(selected, value)
+        if not selected:
             known = sorted({setup.name for session in sessions for setup in session.sensors})
             raise SessionError(f"--noise: found no sensor {sensor!r}; sensors: {', '.join(known)}")
     return noises

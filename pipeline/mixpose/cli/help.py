@@ -1,6 +1,6 @@
-"""What typer says, as mixpose does: `--help`, and what is wrong with what was typed, in one line.
+"""Change the messages of typer: the text of `--help`, and wrong usage in one line.
 
-Help has commands in groups, values by what they are, and examples.
+Help shows commands in groups, names of values by their meaning, and examples.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ EXAMPLES = {name: [*calls] for name, calls in groupby(_CALLS, lambda call: call.
 """Two calls of each command."""
 
 DEBUG = "Show the traceback of an error; of run, also where each pose came from that was searched."
-"""What `--debug` does, which is no parameter of a single command."""
+"""Help of `--debug`, which is no parameter of a single command."""
 
 VALUES = {"path": "FILE", "int": "NUMBER", "float": "NUMBER", "str": "TEXT"}
-"""What a value is called, by the word that begins its type's name."""
+"""Names of values in help by the first word of their types' names."""
 
-# what typer says, and how mixpose says it; the rest of a message stays as it is
+# messages of typer and their replacements; other messages stay as they are
 _WORDINGS = (
     (r"Input should be a valid (\w+).*", r"allowed: \1"),
     (r"Input should be (.*)", r"allowed: \1"),
@@ -83,30 +83,30 @@ _WORDINGS = (
 
 _ADDRESS = re.compile(r"(.*:)?\d+")
 OPTIONAL = {"--view": _ADDRESS}
-"""What a value of each looks like; anything else after it is the next argument."""
+"""Options whose value may be missing: a word that does not match is the next argument."""
 
 
 class Command(TyperCommand):
-    """A command whose help ends on examples, and does not speak of Python's types."""
+    """A command whose help ends with examples and does not mention Python's types."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Parameters, each value with a name for what it is."""
-        found: list[Any] = super().get_params(ctx)
-        for one in found:
-            kind = one.display_type(ctx).strip("<>").split(" ")[0]
-            if one.param_type_name == "argument":  # whose name says what it is
-                one.display_type_rich = lambda ctx: None
-            elif one.metavar is None and not one.is_flag and kind in VALUES:
-                one.metavar = VALUES[kind]
-        return found
+        """Return the parameters; values have names by their meaning."""
+        parameters: list[Any] = super().get_params(ctx)
+        for parameter in parameters:
+            kind = parameter.display_type(ctx).strip("<>").split(" ")[0]
+            if parameter.param_type_name == "argument":  # whose name says enough
+                parameter.display_type_rich = lambda ctx: None
+            elif parameter.metavar is None and not parameter.is_flag and kind in VALUES:
+                parameter.metavar = VALUES[kind]
+        return parameters
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments, options, by groups where they are many, and examples."""
+        """Write arguments, options in their groups, and examples."""
         sections = dict[str, list[Any]]()
-        for one in self.get_params(ctx):
-            kind = "Arguments" if one.param_type_name == "argument" else "Options"
-            if (record := one.get_help_record(ctx)) is not None:
-                title = getattr(one, "rich_help_panel", None) or kind
+        for parameter in self.get_params(ctx):
+            kind = "Arguments" if parameter.param_type_name == "argument" else "Options"
+            if (record := parameter.get_help_record(ctx)) is not None:
+                title = getattr(parameter, "rich_help_panel", None) or kind
                 sections.setdefault(title, []).append(record)
         sections.setdefault("Options", []).append(("--debug", DEBUG))
         for title, records in sections.items():
@@ -118,10 +118,10 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """All commands, in groups, each with its whole sentence."""
+    """All commands, in groups, with their whole first sentences."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; an EOFError is no interrupt, which typer takes it for."""
+        """Run a command; turn an EOFError, which typer takes for an interrupt, into an error."""
         try:
             return super().invoke(ctx)
         except EOFError as error:
@@ -136,7 +136,7 @@ class Commands(TyperGroup):
 
 
 def usage_message(error: typer.TyperException, arguments: Sequence[str]) -> str:
-    """One line: which option, what was found of what was typed, what is allowed, what to read."""
+    """Return one line: which option, what was found, what is allowed, and which help to read."""
     typed = " ".join(["mixpose", *arguments[:1]]) if arguments[0][:1] != "-" else "mixpose"
     command = getattr(getattr(error, "ctx", None), "command_path", typed)
     text = _text(error, arguments).rstrip(". ")
@@ -161,12 +161,12 @@ def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
     name = max(names, key=len) if is_option else (parameter.metavar or names[0]).removesuffix("...")
     if not message:
         return f"{name}: missing"
-    found = _typed(names, arguments) if is_option else None
-    return f"{name}: " + (f"found {found}; " if found is not None else "") + message
+    typed = _typed(names, arguments) if is_option else None
+    return f"{name}: " + (f"found {typed}; " if typed is not None else "") + message
 
 
 def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
-    """The value of an option as it was typed, the last if there are several."""
+    """Return the value of an option as it was typed, the last if there are several."""
     for i in reversed(range(len(arguments))):
         option, equals, value = arguments[i].partition("=")
         if option in names:
@@ -175,11 +175,11 @@ def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
 
 
 def with_values(arguments: Sequence[str]) -> list[str]:
-    """Arguments in which each of these options has a value, an empty one where none was given."""
-    given: list[str] = []
+    """Return arguments with an empty value after each of the `OPTIONAL` options without one."""
+    completed: list[str] = []
     for k, argument in enumerate(arguments):
         pattern = OPTIONAL.get(argument)
         following = arguments[k + 1] if k + 1 < len(arguments) else ""
         has_value = pattern is None or pattern.fullmatch(following) is not None
-        given.append(argument if has_value else f"{argument}=")
-    return given
+        completed.append(argument if has_value else f"{argument}=")
+    return completed

@@ -1,4 +1,4 @@
-"""``mixpose import``: a session file from those of other programs."""
+"""``mixpose import``: make a session file from files of other programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mixpose.session import Session, load_session
 
 
 def import_files(request: ImportRequest) -> None:
-    """Write a session file, which must be new, and say on standard error what is in it."""
+    """Write a session file, which must be new, and print a summary on standard error."""
     output, unit = request.output, request.unit
     if output.exists() and not is_stdout(output):
         raise SessionError(f"-o {output}: is there already; name a new file")
@@ -36,7 +36,7 @@ def import_files(request: ImportRequest) -> None:
 
 
 def _written(imported: Imported, output: Path) -> Session:
-    """Write the session and read it again: what was written can be read, or this is a defect."""
+    """Write the session and load it; a file that cannot be loaded is removed."""
     if is_stdout(output):
         with TemporaryDirectory() as folder:
             copy = Path(folder) / "session.toml"
@@ -49,5 +49,5 @@ def _written(imported: Imported, output: Path) -> Session:
     try:
         return load_session(output)
     except SessionError:
-        output.unlink()  # so that the next try is not refused for it
+        output.unlink()  # or the next attempt would be refused
         raise

@@ -1,4 +1,4 @@
-"""``mixpose inspect``: pictures and words about one frame."""
+"""``mixpose inspect``: draw and describe one frame."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from mixpose.tracking import with_clouds
 def inspect_frame(request: InspectRequest) -> None:
     """Write pictures of one frame into a folder and print what was found in it.
 
-    Poses of a run may stand in place of estimating this frame on its own.
+    The poses are estimated from this frame alone, or taken from a run.
     """
     folder, poses = request.output, request.poses
     refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
     plots.require_matplotlib()
     _check_folder(folder, session)
-    file, named = None if poses is None else read_poses(poses), request.source or ()
-    if file is None:
+    pose_file, named = None if poses is None else read_poses(poses), request.source or ()
+    if pose_file is None:
         opened = open_sources(session, named_sources(named))
     else:
-        file.require_unit(session.unit, SessionError)
-        opened = recording_of(file, session, named)
+        pose_file.require_unit(session.unit, SessionError)
+        opened = recording_of(pose_file, session, named)
     frame_set = _frame(opened, request.frame)
     number = frame_set.number
     views = observe(session, frame_set)
     tracked = scene_of(session)
-    if file is None:
+    if pose_file is None:
         _, estimates = tracked.advance(tracked.begin(), number, frame_set.time_s, views)
     else:
-        estimates = _from_file(file, session, number)
-    bodies = [one.body for one in session.objects for _ in one.instances]
+        estimates = _from_file(pose_file, session, number)
+    bodies = [setup.body for setup in session.objects for _ in setup.instances]
     clouds = clouds_of(session)
-    estimates = [with_clouds(one, clouds) for one in estimates]
+    estimates = [with_clouds(estimate, clouds) for estimate in estimates]
     drawn = tuple(setup for setup in session.sensors if setup.name not in clouds)
-    found = finding.find_several(drawn, frame_set.frames, views, bodies, estimates)
+    all_findings = finding.find_several(drawn, frame_set.frames, views, bodies, estimates)
     shown = replace(session, sensors=drawn)
     pictures: dict[str, Picture] = {}
     lines = []
     if len(bodies) > 1 and drawn:
         pictures[sheet.BODIES] = scene.draw_scene(shown, frame_set, *estimates)
-    each = zip(sheet.prefixes_of(session.labels), bodies, found, estimates, strict=True)
-    for prefix, body, findings, estimate in each:
-        made = sheet.inspection_pictures(shown, body, findings, estimate) if drawn else {}
-        pictures |= {prefix + name: picture for name, picture in made.items()}
+    entries = zip(sheet.prefixes_of(session.labels), bodies, all_findings, estimates, strict=True)
+    for prefix, body, findings, estimate in entries:
+        drawn_pictures = sheet.inspection_pictures(shown, body, findings, estimate) if drawn else {}
+        pictures |= {prefix + name: picture for name, picture in drawn_pictures.items()}
         lines += summary(session, body, estimate, findings, poses)
         lines += _of_clouds(session, frame_set, body, estimate)
     with reporting(SessionError, f"-o {folder}: cannot be made"):
@@ -89,11 +89,11 @@ def _check_folder(folder: Path, session: Session) -> None:
 
 
 def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
-    """The frames of one number, or of the first."""
+    """Return the frames of a number, by default the first."""
     with closing(pair(opened, number, None if number is None else number + 1)) as frames:
-        found = next(frames, None)
-    if found is not None:
-        return found
+        frame_set = next(frames, None)
+    if frame_set is not None:
+        return frame_set
     recordings = "; ".join(f"{name}: {source.describe()}" for name, source in opened.items())
     if number is None:
         raise RecordingError(f"the recording has no frame; it has {recordings}")
@@ -101,32 +101,32 @@ def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
 
 
 def _from_file(file: PoseFile, session: Session, number: int) -> list[Estimate]:
-    """The poses of a frame as a run wrote them, one per body."""
+    """Return the poses of a frame as a run wrote them, one per body."""
     path = file.path
-    found: list[Estimate] = []
+    estimates: list[Estimate] = []
     for label in session.labels:
-        own = [pose for pose in file.poses if pose.label == label]
-        if not own:
+        of_body = [pose for pose in file.poses if pose.label == label]
+        if not of_body:
             others = ", ".join(sorted({pose.label for pose in file.poses}))
             raise SessionError(
                 f"--poses {path}: found poses of {others or 'nothing'}, the session's object is "
                 f"{label}"
             )
-        of_frame = [pose for pose in own if pose.frame == number]
+        of_frame = [pose for pose in of_body if pose.frame == number]
         if not of_frame:
-            numbers = [pose.frame for pose in own]
+            numbers = [pose.frame for pose in of_body]
             raise SessionError(
                 f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to "
                 f"{max(numbers)}"
             )
-        found.append(of_frame[0])
-    return found
+        estimates.append(of_frame[0])
+    return estimates
 
 
 def _of_clouds(
     session: Session, frame_set: FrameSet, body: Body, estimate: Estimate
 ) -> Iterator[str]:
-    """What a pose meets of each cloud, of which there are no pictures."""
+    """Yield what a pose meets in each cloud; clouds are not drawn."""
     for name in clouds_of(session):
         frame, report = frame_set.frames.get(name), estimate.sensors.get(name)
         data = None if frame is None else frame.data
@@ -149,12 +149,12 @@ def summary(
     findings: Sequence[finding.Finding],
     poses: Path | None,
 ) -> list[str]:
-    """What is said of a frame beside its pictures: where its pose is from, and what to change."""
+    """Return lines about a body in a frame: the origin of its pose, and what to change."""
     origin = "estimated on its own" if poses is None else f"pose of {poses}"
     whose = f"{estimate.label} " if len(session.labels) > 1 else ""
     head = f"{session.path}, frame {estimate.frame}: {whose}{estimate.status} ({origin})"
     if len(estimate.hypotheses) > 1:
-        weights = ", ".join(f"{one.weight:.2g}" for one in estimate.hypotheses)
+        weights = ", ".join(f"{hypothesis.weight:.2g}" for hypothesis in estimate.hypotheses)
         head += f"; {len(estimate.hypotheses)} poses with weights {weights}, the first is shown"
     lines, why = [head], estimate.doubt
     if estimate.status == "ambiguous" and len(estimate.hypotheses) < 2:
@@ -163,8 +163,8 @@ def summary(
         lines.append(f"why: {why}; confidence {estimate.confidence:.3g}")
     if estimate.proposer:
         lines.append(f"the pose came from: {estimate.proposer}")
-    for found in findings:
-        lines += advice.describe(found, body, session.unit)
+    for result in findings:
+        lines += advice.describe(result, body, session.unit)
     if estimate.status == "lost":
         lines.append(
             f"lost: once the counts are right, mixpose check {session.path} tries what else may be "

@@ -1,4 +1,4 @@
-"""``mixpose learn``: tables of markers from a recording in which bodies move."""
+"""``mixpose learn``: learn tables of markers from a recording in which bodies move."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mixpose.cli import output
 from mixpose.cli.app import LearnRequest
-from mixpose.cli.notices import say, warn, watched
+from mixpose.cli.notices import say, shown_progress, warn
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.learning import LearningResult, LearntBody, in_axes_of, in_marker_axes, learn
@@ -18,16 +18,16 @@ from mixpose.session.messages import BadKeyError
 
 
 def learn_session(request: LearnRequest) -> None:
-    """Learn the bodies of a recording, or a RecordingError if none moves; write a table of each."""
+    """Learn the bodies of a recording and write their tables; RecordingError if none moves."""
     path = request.session
     session = load_scene(path, allow_code=request.allow_code)
     inputs = path, request.like
     output.refuse_to_overwrite_but(request.output, inputs, MARK)
     output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
     older = None if request.like is None else _older(request.like, session)
-    if others := [one.name for one in session.sensors if one.sensor.dimension < 2]:
+    if others := [setup.name for setup in session.sensors if setup.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
-    with watched() as progress:
+    with shown_progress() as progress:
         lesson = learn(session, named_sources(request.source or ()), progress)
     bodies = _in_frames(lesson, request, older)
     if len(bodies) > 1 and output.is_stdout(request.output):
@@ -40,7 +40,7 @@ def learn_session(request: LearnRequest) -> None:
     for file, body in zip(files, bodies, strict=True):
         output.refuse_to_overwrite_but(file, inputs, MARK)
         output.write_text(file, table_text(body), "-o")
-    _tell(lesson, bodies, files, session)
+    _report(lesson, bodies, files, session)
 
 
 def _older(path: Path, session: Session) -> Markers:
@@ -50,58 +50,56 @@ def _older(path: Path, session: Session) -> Markers:
         raise SessionError(f"--like {path}: {problem.text}") from problem
 
 
-def _in_frames(
-    lesson: LearningResult, request: LearnRequest, older: Markers | None
-) -> list[LearntBody]:
-    """Bodies in the frame that was asked for; the one that is like an older one first."""
+def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> list[Learnt]:
+    """Return the bodies in the requested axes, first the one that is like the older table."""
     bodies = list(lesson.bodies)
     if older is not None:
-        found = [(in_axes_of(each, older.points, older.names), k) for k, each in enumerate(bodies)]
-        alike = [(-one.shared, one.max_distance, k, one) for one, k in found if one is not None]
+        fits = [(like(body, older.points, older.names), k) for k, body in enumerate(bodies)]
+        alike = [(-fit.shared, fit.off, k, fit) for fit, k in fits if fit is not None]
         if not alike:
             raise RecordingError(
                 f"--like {request.like}: found bodies of "
-                f"{', '.join(str(len(each.points)) for each in bodies)} markers that move, none "
+                f"{', '.join(str(len(body.points)) for body in bodies)} markers that move, none "
                 "of which has those of the table; see without --like what they are"
             )
-        _, off, k, best = min(alike, key=lambda each: each[:3])
+        _, off, k, best = min(alike, key=lambda entry: entry[:3])
         say(f"like {request.like}: {best.shared} markers in both, {off:.3g} off at most")
         if best.other_ways:
             warn(
                 f"--like {request.like}: the markers can be laid on it in {best.other_ways} other "
                 f"way{'s' * (best.other_ways > 1)} with as many of them; the closest is taken"
             )
-        bodies = [best.body, *(each for n, each in enumerate(bodies) if n != k)]
+        bodies = [best.learnt, *(body for n, body in enumerate(bodies) if n != k)]
     if request.axes is not None:
         bodies[0] = in_marker_axes(bodies[0], request.axes)
     return bodies
 
 
-def _tell(
-    lesson: LearningResult, bodies: Sequence[LearntBody], files: Sequence[Path], session: Session
+def _report(
+    lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
-    called = [Path("body.csv") if output.is_stdout(file) else file for file in files]
-    for file, body in zip(called, bodies, strict=True):
+    shown_files = [Path("body.csv") if output.is_stdout(file) else file for file in files]
+    for file, body in zip(shown_files, bodies, strict=True):
         lines += lines_of(body, file.name, session.unit)
     if len(bodies) > 1 or bodies[0].count > 1:
         lines.append("in the session:")
-        for file, body in zip(called, bodies, strict=True):
+        for file, body in zip(shown_files, bodies, strict=True):
             lines += ["", "[[object]]", f'name = "{file.stem}"', f'file = "{file.name}"']
             lines += [f"count = {body.count}"] if body.count > 1 else []
     output.print_lines(lines, *files)
-    names = [file.name for file in called]
+    names = [file.name for file in shown_files]
     pairs = zip(bodies, names, strict=True)
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
-    for doubt in (*doubts, *look_alikes(bodies, names), *_late_ones(session, bodies, names)):
+    for doubt in (*doubts, *look_alikes(bodies, names), *_late_warnings(session, bodies, names)):
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
 
 
-def _late_ones(session: Session, bodies: Sequence[LearntBody], names: Sequence[str]) -> list[str]:
-    """Bodies whose motion is not known, where late sensors ask for it."""
-    late = [one.name for one in session.sensors if one.delay or one.readout]
+def _late_warnings(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+    """Return warnings of identical bodies, whose motion is unknown although sensors are late."""
+    late = [setup.name for setup in session.sensors if setup.delay or setup.readout]
     return [
         f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, of "
         "which none is followed: move slowly, or learn from a recording of one alone"

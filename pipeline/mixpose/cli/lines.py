@@ -1,4 +1,4 @@
-"""A file that grows line by line and always ends at a whole one, whatever happens to the disk."""
+"""A file of lines that always ends with a complete line, even if the disk is full."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from pathlib import Path
 from mixpose.errors import SessionError
 
 PATIENCE_S = 10.0
-"""How long another run, which may be about to end, is waited for."""
+"""How long to wait for another run, which may be about to end."""
 
 
 def note_path(poses: Path) -> Path:
-    """Where the note about a poses file lies."""
+    """Return the path of the note about a poses file, from which a run resumes."""
     return poses.with_name(f".{poses.name}.state")
 
 
 class LineFile:
-    """What the writers of poses take for a text stream.
+    """A text stream for the writers of poses.
 
-    What is written between two flushes reaches the file in one call or not at all. What was there
-    goes (`afresh`), or stays until `rewind` says where to go on; messages call the file `called`.
-    No two runs write to one file: it is locked, as far as the system can. Raises SessionError if it
-    cannot be opened, or another run writes to it.
+    Text written between two flushes reaches the file in one call or not at all. Old content is
+    removed (`afresh`), or stays until `rewind` says where to continue; messages name `shown`, if
+    given. The file is locked against other runs, as far as the system can. Raises SessionError if
+    it cannot be opened, or another run writes to it.
     """
 
-    def __init__(self, path: Path, *, afresh: bool = True, called: Path | None = None) -> None:
-        self._path = called or path
+    def __init__(self, path: Path, *, afresh: bool = True, shown: Path | None = None) -> None:
+        self._path = shown or path
         self._due: list[str] = []
         self.size = self.checksum = 0
         try:
@@ -47,28 +47,28 @@ class LineFile:
             raise
 
     def rewind(self, size: int, checksum: int) -> None:
-        """Cut the file down to its first bytes, of this CRC-32, and go on there."""
+        """Cut the file down to its first `size` bytes, of this CRC-32, and continue there."""
         os.ftruncate(self._file, size)
         os.lseek(self._file, size, os.SEEK_SET)
         self.size, self.checksum = size, checksum
 
     def write(self, text: str) -> int:
-        """Take text, to be written by the next `flush`."""
+        """Keep text to be written by the next `flush`."""
         self._due.append(text)
         return len(text)
 
     def flush(self) -> None:
-        """Write what is due.
+        """Write the text since the last flush.
 
-        Raises SessionError if it cannot be written; the file is then as it was before. Raises
-        BrokenPipeError if nobody reads a pipe any more.
+        Raises SessionError if it cannot be written, after which the file is as before, and
+        BrokenPipeError if a pipe has no reader any more.
         """
         data = "".join(self._due).encode("utf-8")
         self._due = []
-        left = memoryview(data)
+        remaining = memoryview(data)
         try:
-            while left:
-                left = left[os.write(self._file, left) :]
+            while remaining:
+                remaining = remaining[os.write(self._file, remaining) :]
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -81,26 +81,26 @@ class LineFile:
         self.checksum = zlib.crc32(data, self.checksum)
 
     def close(self) -> None:
-        """Let go of the file; what is due is not written."""
+        """Close the file without a flush."""
         os.close(self._file)
 
 
 @contextmanager
-def held(folder: Path, called: Path) -> Iterator[None]:
-    """Keep other runs from a folder, as far as the system can; SessionError if one holds it."""
-    if sys.platform == "win32":  # which opens no folder
+def locked_folder(folder: Path, shown: Path) -> Iterator[None]:
+    """Lock a folder against other runs, as far as the system can; SessionError if it is locked."""
+    if sys.platform == "win32":  # where folders cannot be opened
         yield
         return
     file = os.open(folder, os.O_RDONLY)
     try:
-        _lock(file, called)
+        _lock(file, shown)
         yield
     finally:
         os.close(file)
 
 
 def _lock(file: int, path: Path) -> None:
-    """Keep other runs from a file until it is closed; the lock ends with the process."""
+    """Lock a file against other runs until it is closed or this process ends."""
     try:
         import fcntl  # noqa: PLC0415 - POSIX only
     except ImportError:

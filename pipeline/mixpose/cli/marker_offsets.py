@@ -1,4 +1,4 @@
-"""Markers that a run met elsewhere than the body has them; all of them, where its size is wrong."""
+"""Detect markers that are displaced on the body, or all of them because its size is wrong."""
 
 from __future__ import annotations
 
@@ -16,68 +16,68 @@ from mixpose.session import Session
 
 MOVED = "moved?"
 
-_GONE = 0.25  # of the frames in which a marker should be seen, at their end: it fell off
-_FEWEST = 10  # frames in which a marker should have been seen before anything is said of it
-_MEASURED = 4.0  # times what the other markers are off: a marker that is not where it should be
-_SURE = 100.0  # squared offset in its own noise from which that is no chance
-_KEPT = 32  # stretches of frames by whose sums it is told when a marker moved
+_GONE = 0.25  # share of the frames where a marker is expected, missed up to the end: it fell off
+_FEWEST = 10  # frames where a marker is expected before it is judged
+_MEASURED = 4.0  # times the offset of other markers from which a marker is displaced
+_SURE = 100.0  # squares that a displacement explains, over the variance, which are no chance
+_KEPT = 32  # stretches of frames whose sums show when a marker moved
 
-_SIZED = 5  # frames before the size of a body is spoken of
-_FEATURES = 4  # of a body: three in any other size are three in another place
+_SIZED = 5  # frames before the size of a body is judged
+_FEATURES = 4  # fewest of a body: another size of three looks like another pose of them
 _SHARE = 0.8  # of all squared offsets that the other size explains; one wrong marker stays below
-_LEAST = 1e-3  # a body measured to less than that is measured well
-_SEEN = 1e-3  # of what a change of size does to the features, what no other pose does as well
+_LEAST = 1e-3  # smallest change of size that is reported: such a body is measured well
+_SEEN = 1e-3  # share of the effect of a change of size that no change of pose imitates
 
 
 @dataclass
 class _Sums:
-    """Of a stretch of frames: by what displacement in the body's axes a marker is met off."""
+    """Sums over a stretch of frames that fit a displacement of a marker in the body's axes."""
 
     first: int  # frame
-    met: int = 0  # frames
-    squares: float = 0.0  # of the offsets of whole spots, each by what it tells
-    views: float = 0.0
-    normal: Floats = field(default_factory=lambda: np.zeros((3, 3)))
-    pull: Floats = field(default_factory=lambda: np.zeros(3))
+    met: int = 0  # frames in which the marker was met
+    squares: float = 0.0  # weighted squares of offsets
+    views: float = 0.0  # sum of weights
+    normal: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # matrix of normal equations
+    pull: Floats = field(default_factory=lambda: np.zeros(3))  # their right-hand side
 
-    def __add__(self, after: _Sums) -> _Sums:
+    def __add__(self, later: _Sums) -> _Sums:
         return _Sums(
             self.first,
-            self.met + after.met,
-            self.squares + after.squares,
-            self.views + after.views,
-            self.normal + after.normal,
-            self.pull + after.pull,
+            self.met + later.met,
+            self.squares + later.squares,
+            self.views + later.views,
+            self.normal + later.normal,
+            self.pull + later.pull,
         )
 
     def shift(self) -> Floats:
-        """Displacement in the body's axes that explains its offsets best (3,)."""
+        """Return the displacement (3,) in the body's axes that explains the offsets best."""
         scale = max(float(np.trace(self.normal)), 1e-300)
-        inner = self.normal + 1e-9 * scale * np.eye(3)
-        return np.asarray(np.linalg.solve(inner, self.pull))
+        regular = self.normal + 1e-9 * scale * np.eye(3)
+        return np.asarray(np.linalg.solve(regular, self.pull))
 
     def explained(self) -> float:
-        """How much of the squares this displacement takes away."""
+        """Return the part of the squares that this displacement explains."""
         return float(self.pull @ self.shift())
 
 
-def _left(whole: _Sums, since: _Sums) -> float:
-    """Variance of all views where those of a stretch are displaced."""
+def _remaining_variance(whole: _Sums, since: _Sums) -> float:
+    """Return the variance of all offsets once those of a stretch are displaced."""
     return max((whole.squares - since.explained()) / max(whole.views, 1e-12), 1e-12)
 
 
 class Marker:
-    """How one marker was met."""
+    """Statistics of how one marker was met."""
 
     def __init__(self) -> None:
         self.expected = 0
-        self.since: int | None = None  # first frame since which it was not met
+        self.since: int | None = None  # first of the latest frames in which it was missed
         self.missed_since = 0
         self.stretches: list[_Sums] = []
         self._longest = 1  # frames that a stretch may have
 
     def add(self, frame: int, seen: Sequence[tuple[float, Floats, Floats]] | None) -> None:
-        """Count a frame: weights, offsets and Jacobians in the body's axes, None where not met."""
+        """Count a frame: weights, offsets and Jacobians in the body's axes; None if not met."""
         self.expected += 1
         if seen is None:
             self.since = frame if self.since is None else self.since
@@ -95,29 +95,29 @@ class Marker:
             return
         if len(self.stretches) == _KEPT:
             pairs = zip(self.stretches[::2], self.stretches[1::2], strict=True)
-            self.stretches = [one + other for one, other in pairs]
+            self.stretches = [earlier + later for earlier, later in pairs]
             self._longest *= 2
         self.stretches.append(sums)
 
     @property
     def whole(self) -> _Sums:
-        """Sums over all frames."""
+        """The sums over all frames."""
         return reduce(_Sums.__add__, self.stretches, _Sums(0))
 
     def displaced(self) -> tuple[_Sums, float]:
-        """The stretch up to the end in which it is elsewhere, and the variance that this leaves.
+        """Return the final stretch in which it is displaced, and the variance that remains then.
 
-        All frames, unless what shows since one of them explains surely more.
+        These are all frames, unless a displacement since one of them surely explains more.
         """
-        *others, whole = accumulate(reversed(self.stretches), lambda after, one: one + after)
-        since = [one for one in others if one.met >= _FEWEST <= whole.met - one.met]
+        *ends, whole = accumulate(reversed(self.stretches), lambda later, sums: sums + later)
+        since = [end for end in ends if end.met >= _FEWEST <= whole.met - end.met]
         latest = max(since, key=_Sums.explained, default=whole)
-        is_surely = latest.explained() - whole.explained() > _SURE * _left(whole, latest)
-        one = latest if is_surely else whole
-        return one, _left(whole, one)
+        gain = latest.explained() - whole.explained()
+        displaced = latest if gain > _SURE * _remaining_variance(whole, latest) else whole
+        return displaced, _remaining_variance(whole, displaced)
 
     def oddness(self, typical: float, unit: str) -> str | None:
-        """What is odd about it in words, by how far off others are (squares a view)."""
+        """Return what is odd about it in words; `typical` is the mean square of other markers."""
         if self.expected < _FEWEST:
             return None
         whole = self.whole
@@ -126,16 +126,16 @@ class Marker:
                 f"met in none of {self.expected} frames where it should be seen: gone, or "
                 "measured wrong?"
             )
-        since, own = self.displaced()
+        since, variance = self.displaced()
         explained = since.explained()
-        # of a few frames a displacement takes up all
-        sure = explained / own > _SURE and since.met >= _FEWEST
+        # in few frames a displacement explains any offsets
+        sure = explained / variance > _SURE and since.met >= _FEWEST
         if sure and explained > _MEASURED**2 * typical * since.views:
             off = f"met {float(np.linalg.norm(since.shift())):.2g} {unit} off"
             if since.met < whole.met:
                 return f"{off} from frame {since.first} on, in {since.met} frames: {MOVED}"
             return f"{off} in {whole.met} of {self.expected} frames: measured wrong?"
-        # one that is measured wrong is missed, too, wherever it is too far off
+        # tested last, as a displaced marker is also missed where it is too far off
         gone = self.missed_since
         if self.since is not None and gone >= max(_FEWEST, _GONE * self.expected):
             return f"not met from frame {self.since} on, in {gone} frames: gone?"
@@ -147,14 +147,14 @@ def add_markers(markers: dict[int, Marker], estimate: Estimate) -> None:
     T = estimate.T_world_object
     assert T is not None
     seen: dict[int, list[tuple[float, Floats, Floats]]] = {}
-    for name, one in estimate.offsets.items():
-        if (estimate.sensors[name].explained or 0.0) < 0.1:  # what it sees is not the body
+    for name, offsets in estimate.offsets.items():
+        if (estimate.sensors[name].explained or 0.0) < 0.1:  # the sensor hardly sees the body
             continue
-        for k, i in enumerate(one.features.tolist()):
+        for k, i in enumerate(offsets.features.tolist()):
             of_marker = seen.setdefault(i, [])
-            if one.met[k]:
-                J = one.by_shift[k] @ T[:3, :3]
-                of_marker.append((float(one.weights[k]), one.offsets[k], J))
+            if offsets.met[k]:
+                J = offsets.by_shift[k] @ T[:3, :3]
+                of_marker.append((float(offsets.weights[k]), offsets.offsets[k], J))
     for i, of_marker in seen.items():
         markers.setdefault(i, Marker()).add(estimate.frame, of_marker or None)
 
@@ -162,30 +162,30 @@ def add_markers(markers: dict[int, Marker], estimate: Estimate) -> None:
 def marker_lines(
     markers: Mapping[int, Marker], labels: Sequence[str], of: str, unit: str
 ) -> list[str]:
-    """What is odd about markers of a body (its name in words, `of`), a line each."""
-    wholes = {i: one.whole for i, one in markers.items()}
-    means = {i: one.squares / one.views for i, one in wholes.items() if one.views}
-    told = dict[str, list[int]]()
+    """Return a line for each oddity of the markers of a body, with its name (`of`)."""
+    wholes = {i: marker.whole for i, marker in markers.items()}
+    means = {i: sums.squares / sums.views for i, sums in wholes.items() if sums.views}
+    by_text = dict[str, list[int]]()
     for i, marker in sorted(markers.items()):
         others = [mean for j, mean in means.items() if j != i]
         typical = float(np.median(others)) if i in means and len(others) > 1 else np.inf
         if text := marker.oddness(typical, unit):
-            told.setdefault(text, []).append(i)
+            by_text.setdefault(text, []).append(i)
     lines = []
-    for text, numbers in told.items():  # which rise
+    for text, numbers in by_text.items():  # in ascending order
         names = [labels[i] for i in numbers]
         in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
-        called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
-        several = len(names) > 1
-        lines.append(f"marker{'s' * several} {called}{of} {'are each' if several else 'is'} {text}")
+        listed = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
+        many = len(names) > 1
+        lines.append(f"marker{'s' * many} {listed}{of} {'are each' if many else 'is'} {text}")
     return lines
 
 
 class BodySize:
-    """Sums over frames of what another size of a body would explain of its offsets.
+    """Sums over frames that fit another size of a body to its offsets.
 
-    To first order a feature at p from the body's middle goes by c R p where the body is 1 + c
-    times as large, beside what the six directions of the pose do.
+    If the body is 1 + c times as large, a feature at p from its middle moves by c R p to first
+    order, in addition to the effects of the six directions of the pose.
     """
 
     def __init__(self, session: Session, means: Floats) -> None:
@@ -200,14 +200,14 @@ class BodySize:
             return
         arms = self._arms @ estimate.T_world_object[:3, :3].T
         normal, pull, squares = np.zeros((7, 7)), np.zeros(7), 0.0
-        for name, one in estimate.offsets.items():
-            met = np.flatnonzero(one.met)
+        for name, offsets in estimate.offsets.items():
+            met = np.flatnonzero(offsets.met)
             if not len(met):
                 continue
-            own, J = arms[one.features[met]], one.by_shift[met] / self._sigmas[name]
-            columns = [pose_jacobian(J, own), J @ own[..., None]]
+            arms_met, J = arms[offsets.features[met]], offsets.by_shift[met] / self._sigmas[name]
+            columns = [pose_jacobian(J, arms_met), J @ arms_met[..., None]]
             A = np.concatenate(columns, axis=2).reshape(-1, 7)
-            y = one.offsets[met].ravel() / self._sigmas[name]
+            y = offsets.offsets[met].ravel() / self._sigmas[name]
             normal, pull, squares = normal + A.T @ A, pull + A.T @ y, squares + float(y @ y)
         if not normal.any():
             return
@@ -221,7 +221,7 @@ class BodySize:
             self._squares += max(squares - float(pull[:6] @ pose @ pull[:6]), 0.0)
 
     def factor(self) -> float | None:
-        """How many times as large the body fits best; None where its size is no matter."""
+        """Return the factor of size that fits best; None if the size explains little."""
         if self._frames < _SIZED or not self._curvature or not self._squares:
             return None
         change = self._pull / self._curvature
@@ -230,7 +230,7 @@ class BodySize:
 
 
 def size_warnings(sizes: Mapping[str, BodySize]) -> list[str]:
-    """A line for each body, by its label, that fits better in another size."""
+    """Return a line for each body, by its label, that fits better in another size."""
     factors = {label: size.factor() for label, size in sizes.items()}
     return [
         f"the features of {label!r} are met as if it were {times_as_large(factor)}: were its "

@@ -1,4 +1,4 @@
-"""Remarks to people on standard error, a line each, and the progress of long work."""
+"""Messages on standard error, a line each, and the progress of long work."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # whoever only has to say something need not load them
+if TYPE_CHECKING:  # not needed to print a message
     from mixpose.calibration.task import Progress
     from mixpose.frames import Source
     from mixpose.records import DelayEstimate, Estimate
     from mixpose.session import Session
 
-_NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
-_WELL = 0.1  # above it a sensor is explained, even beside 60 false features
-_MOST = 0.8  # of the frames: a sensor that takes no part in so many never does
-_OFTEN = 0.2  # of the frames: sensors that take turns do so by no accident
-# of sigma: 0.2 is the most in recordings whose geometry is right, 0.8 with a chessboard whose
-# squares are given as 25 in place of 24 mm
+_NOTHING = 0.01  # share of a sensor's density that is explained: below it the sensor is idle
+_WELL = 0.1  # share above which a sensor is explained, even with 60 false features
+_MOST = 0.8  # share of the frames in which a sensor is idle that never takes part
+_OFTEN = 0.2  # share of the frames above which sensors are idle by turns for a reason
+# of sigma: at most 0.2 in recordings whose geometry is right, 0.8 with a chessboard whose squares
+# are given as 25 in place of 24 mm
 _FAR_OFF = 0.5
-_EARLY = 10  # frames without one that is ok, after which that is said: they may take seconds each
+_EARLY = 10  # first frames: a warning if none of them is ok, as frames may take seconds each
 _SURELY_LATE = 6.0  # standard deviations
-_LATE_S = 5e-4  # less is rarely worth a key
-_REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
+_LATE_S = 5e-4  # smaller delays are rarely worth a key in the session
+_REMEMBERED = 10_000  # residuals kept of a camera: a live source may run for days
 
-_TIMED = 4  # frames by which it is told how long the search takes
-_FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
+_TIMED = 4  # frames whose times predict the duration of a search
+_FOUND_BEFORE_S = 2e-3  # frames that take less time were searched before an interruption
 
-# what `frames_text` says, and where poses were written
+# the line of `frames_text`, and the files of poses after it
 _FRAMES = re.compile(
     r"mixpose: \d+ frames?(?: of (\d+) bodies)?: (\d+ \w+(?:, \d+ \w+)*)(?: -> |$)"
 )
 
 
 def say(message: str) -> None:
-    """Say something on standard error; that nobody can be told stops no work."""
+    """Print a message on standard error; a closed stream stops no work."""
     with suppress(OSError):
         print(f"mixpose: {message}", file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
-    """Say something that does not stop the work but should be looked at."""
+    """Print a warning on one line."""
     say(f"warning: {' '.join(message.split())}")
 
 
 def warn_of_sources(
     session: Session, sources: Mapping[str, Source], replaced: Mapping[str, str]
 ) -> None:
-    """Say what is odd about the recordings; `replaced` are those in place of the session's."""
+    """Warn of oddities of the recordings; those in `replaced` replace the session's."""
     from mixpose.checking import shared_source_warnings  # noqa: PLC0415 - only a run needs it
 
     for warning in shared_source_warnings(session, replaced):
@@ -63,13 +63,13 @@ def warn_of_sources(
             warn(f"sensor {name!r}: {caution}")
 
 
-def counted(count: int, what: str) -> str:
-    """So many of something, in words."""
-    return f"{count} {what}{'s' * (count != 1)}"
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, in the plural unless the count is 1."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
-    """How many frames there were, and how many poses of theirs came to which status."""
+    """Return the number of frames and of poses of each status, in words."""
     count = sum(statuses.values()) // bodies
     of = f" of {bodies} bodies" if bodies > 1 else ""
     words = ("ok", "ambiguous", "lost")
@@ -77,18 +77,18 @@ def frames_text(statuses: Mapping[str, int], bodies: int) -> str:
     return f"{counted(count, 'frame')}{of}: {', '.join(parts) or 'none'}"
 
 
-def told_frames(line: str) -> tuple[dict[str, int], int] | None:
-    """The statuses and the number of bodies in a line that a run said in the end; else None."""
-    found = _FRAMES.match(line)
-    if found is None:
+def parsed_frames(line: str) -> tuple[dict[str, int], int] | None:
+    """Parse the last line of a run: counts by status, number of bodies; None for other lines."""
+    match = _FRAMES.match(line)
+    if match is None:
         return None
-    bodies, told = found.groups()
-    pairs = (part.split(" ", 1) for part in told.split(", "))
+    bodies, counts = match.groups()
+    pairs = (part.split(" ", 1) for part in counts.split(", "))
     return {status: int(count) for count, status in pairs}, int(bodies or 1)
 
 
 def origin_of(estimate: Estimate) -> str:
-    """A frame's status, which proposer its pose came from, and what a search cost."""
+    """Return a frame's status, the proposer of its pose, and the guesses of its search."""
     origin = f", the pose came from: {estimate.proposer}" if estimate.proposer else ""
     if estimate.guesses:
         made, tested, refined = estimate.guesses
@@ -97,14 +97,15 @@ def origin_of(estimate: Estimate) -> str:
 
 
 class Summary:
-    """Counts frames as they pass, and says in the end what became of them."""
+    """Count the frames of a run by what became of them; print a summary at the end."""
 
     def __init__(self, session: Session) -> None:
+        is_soft = any(setup.body.spread for setup in session.objects)
         self.sigmas = {
             setup.name: setup.extract.sigma
             for setup in session.sensors
-            # ranges err as the place has it, and features of a soft body are off theirs
-            if setup.sensor.unit == "px" and not any(one.body.spread for one in session.objects)
+            # errors of ranges depend on the place, and features of a soft body are displaced
+            if setup.sensor.unit == "px" and not is_soft
         }
         from mixpose.cli.findings import Findings  # noqa: PLC0415 - only a run needs it
         from mixpose.judgement import MEETS_NOTHING  # noqa: PLC0415
@@ -112,17 +113,17 @@ class Summary:
         self.idle_for = MEETS_NOTHING
         self.findings, self.path = Findings(session), session.path
         self.bodies = len(session.labels)
-        self.counted = "frames with a pose" if self.bodies == 1 else "poses"
+        self.noun = "frames with a pose" if self.bodies == 1 else "poses"
         self.statuses: Counter[str] = Counter()
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
         self.shared = 0  # frames with a pose in which two sensors or more had features
-        self.split: Counter[str] = Counter()  # sensors not explained where another one is
+        self.split: Counter[str] = Counter()  # sensors not explained in frames where another is
         self.split_frames = 0
-        self.left_out: Counter[tuple[str, str]] = Counter()  # sensors, and why
+        self.left_out: Counter[tuple[str, str]] = Counter()  # sensors with reasons
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
-        self.told = {setup.name: setup.delay for setup in session.sensors}
-        self.delays: Mapping[str, DelayEstimate] = {}
+        self.stated_delays = {setup.name: setup.delay for setup in session.sensors}
+        self.delays: Mapping[str, DelaySeen] = {}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
@@ -137,12 +138,12 @@ class Summary:
             )
         if estimate.status == "lost":
             return
-        reasons = {n: one.why for n, one in estimate.sensors.items() if one.why}
+        reasons = {n: report.why for n, report in estimate.sensors.items() if report.why}
         self.left_out.update((n, why) for n, why in reasons.items() if why != self.idle_for)
         shares = {
-            n: one.explained or 0.0
-            for n, one in estimate.sensors.items()
-            if one.used or one.why == self.idle_for
+            n: report.explained or 0.0
+            for n, report in estimate.sensors.items()
+            if report.used or report.why == self.idle_for
         }
         idle = [name for name, share in shares.items() if share < _NOTHING]
         self.posed.update(shares.keys())
@@ -152,13 +153,13 @@ class Summary:
             self.split_frames += 1
             self.split.update(idle)
         if estimate.status == "ok":
-            found = estimate.weighted_rms
+            rms_by_sensor = estimate.whole_rms
             for name, residuals in self.residuals.items():
-                if (rms := found[name]) is not None:
+                if (rms := rms_by_sensor[name]) is not None:
                     residuals.append(rms)
 
-    def say(self, where: str) -> None:
-        """Print the line, and warn of sensors that took no part or fit badly."""
+    def say(self, destination: str) -> None:
+        """Print warnings, remarks on delays and the number of frames by status."""
         if not sum(self.statuses.values()):
             warn(
                 "no frame was estimated: the recording has none, or none with the numbers asked for"
@@ -166,79 +167,79 @@ class Summary:
             return
         for warning in self.warnings():
             warn(warning)
-        for remark in self.late():
+        for remark in self.delay_remarks():
             say(remark)
         if self.statuses["lost"] == sum(self.statuses.values()) and not self.findings.change:
             warn(f"every frame is lost: run mixpose check {self.path}, which says what is odd")
-        say(f"{frames_text(self.statuses, self.bodies)}{where}")
+        say(f"{frames_text(self.statuses, self.bodies)}{destination}")
 
     def warnings(self) -> list[str]:
-        """What is most likely wrong with the geometry, once for each sensor at most."""
-        apart = [n for n, k in self.idle.items() if k >= _MOST * self.posed[n]]
-        found = [
+        """Return warnings about sensors, the session and the bodies."""
+        idle = [n for n, k in self.idle.items() if k >= _MOST * self.posed[n]]
+        warnings = [
             f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
-            f"{self.counted}: check its T_sensor_world, calibration and source, which "
+            f"{self.noun}: check its T_sensor_world, calibration and source, which "
             "mixpose check tries"
-            for name in apart
+            for name in idle
         ]
         posed = sum(self.statuses.values()) - self.statuses["lost"]
-        seen, causes = self.findings.of_sensors(), self.findings.causes()
-        if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
-            apart = list(self.split)
-            found += [] if seen else [self._split_text()]
-        # what names the cause stands for what only shows it
-        found = [*([] if self.findings.tells_of_sensors(causes) else found), *seen, *causes]
-        found += [
-            f"sensor {name!r} was left out of {count} of {posed} {self.counted}: {why}"
+        seen, causes = self.findings.sensor_lines(), self.findings.causes()
+        if not warnings and self.split_frames and self.split_frames >= _OFTEN * self.shared:
+            idle = list(self.split)
+            warnings += [] if seen else [self._split_text()]
+        # a cause replaces the warnings that are its symptoms
+        warnings = [*([] if self.findings.explain_idle(causes) else warnings), *seen, *causes]
+        warnings += [
+            f"sensor {name!r} was left out of {count} of {posed} {self.noun}: {why}"
             for (name, why), count in self.left_out.items()
         ]
-        offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
+        offs = {n: median(rms) for n, rms in self.residuals.items() if rms and n not in idle}
         far = [
             f"by {off:.2g} px in {name!r} (median; sigma is {self.sigmas[name]:g})"
             for name, off in offs.items()
             if off > _FAR_OFF * self.sigmas[name]
         ]
         if far:
-            found.append(
+            warnings.append(
                 f"features are met far off, {' and '.join(far)}: is the size of [object], its "
                 "unit, the calibration or T_sensor_world wrong, are frames out of step, or are "
                 "features found no better?"
             )
-        return found
+        return warnings
 
-    def late(self) -> list[str]:
-        """Which sensors are late by how much, as far as a moving body shows it."""
+    def delay_remarks(self) -> list[str]:
+        """Return remarks about delays of sensors that a moving body has shown."""
         remarks = []
-        for name, seen in self.delays.items():
-            spread = f"(give or take {2 * seen.deviation:.4f})"
-            told = self.told.get(name, 0.0)
-            if told == "estimate":
-                late = f"{seen.seconds:.4f} s {spread}"
+        for name, delay in self.delays.items():
+            spread = f"(give or take {2 * delay.deviation:.4f})"
+            stated = self.stated_delays.get(name, 0.0)
+            if stated == "estimate":
+                late = f"{delay.seconds:.4f} s {spread}"
                 remarks.append(f"sensor {name!r}: delay estimated as {late}")
-            elif abs(seen.seconds) > max(_SURELY_LATE * seen.deviation, _LATE_S):
-                kind = "late" if seen.seconds > 0 else "early"
-                whole = round(told + seen.seconds, 4) + 0.0  # no minus zero
+            elif abs(delay.seconds) > max(_SURELY_LATE * delay.deviation, _LATE_S):
+                kind = "late" if delay.seconds > 0 else "early"
+                whole = round(stated + delay.seconds, 4) + 0.0  # no minus zero
                 remarks.append(
-                    f"sensor {name!r} is {kind} by {abs(seen.seconds):.4f} s {spread}: "
+                    f"sensor {name!r} is {kind} by {abs(delay.seconds):.4f} s {spread}: "
                     f"delay = {whole:.4f} in its [[sensor]] takes it off"
                 )
         return remarks
 
     def _split_text(self) -> str:
-        frames = f"in {self.split_frames} of {self.shared} {self.counted}"
+        frames = f"in {self.split_frames} of {self.shared} {self.noun}"
         check = (
             "check the size of [object], its unit, T_sensor_world and calibration, if the body was "
             "in view of all"
         )
         if len(self.posed) == 2:
             return f"{frames} only one of 2 sensors is explained: {check}"
-        each = ", ".join(f"{name!r} in {count}" for name, count in self.split.items())
-        return f"{frames} not all of {len(self.posed)} sensors are explained ({each} not): {check}"
+        idle = ", ".join(f"{name!r} in {count}" for name, count in self.split.items())
+        return f"{frames} not all of {len(self.posed)} sensors are explained ({idle} not): {check}"
 
 
 @contextmanager
 def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
-    """A display of rich on standard error, while a person is watching; else None."""
+    """Yield a display of rich on standard error if that is a terminal; else None."""
     if not shown or not sys.stderr.isatty():
         yield None
         return
@@ -253,22 +254,22 @@ def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
 
 @contextmanager
 def bar(
-    what: str, total: int | None, *, shown: bool = True, spins: bool = False
+    title: str, total: int | None, *, shown: bool = True, spins: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """What moves a bar on standard error on, while a person is watching; else nothing is seen.
+    """Yield a function that advances a progress bar, which only a terminal shows.
 
-    Of a bar that `spins` nobody is to see how much is left.
+    A bar that `spins` does not show how much remains.
     """
     with _display(shown=shown, spins=spins) as display:
         if display is None:
-            yield lambda **moved: None
+            yield lambda **changes: None
         else:
-            yield partial(display.update, display.add_task(what, total=total))
+            yield partial(display.update, display.add_task(title, total=total))
 
 
 @contextmanager
-def watched() -> Iterator[Progress]:
-    """Progress: a bar on a terminal; and how long the search will take, before it does."""
+def shown_progress() -> Iterator[Progress]:
+    """Yield a function that shows progress on a terminal and predicts the duration of a search."""
     last: dict[str, float] = {}
     took: dict[str, list[float]] = {}
 
@@ -282,10 +283,10 @@ def watched() -> Iterator[Progress]:
             return
         steps.append(step)
         if len(steps) == _TIMED:
-            left, each = total - done, sum(steps) / _TIMED
-            seconds = each * left
+            remaining, mean_s = total - done, sum(steps) / _TIMED
+            seconds = mean_s * remaining
             about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-            say(f"{left} frames of cameras left to search, about {about}")
+            say(f"{remaining} frames of cameras left to search, about {about}")
 
     with _display() as display:
         tasks: dict[str, object] = {}

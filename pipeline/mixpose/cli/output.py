@@ -1,4 +1,4 @@
-"""Where poses and texts are written: to a stream, or to a file that is never something else."""
+"""Write poses and texts to a stream or a file; never replace files that mixpose did not write."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _FIRST_LINES = re.compile(
     rf"{re.escape(_HEADER)}.*|{','.join(csvtable.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
     r"|# frame -?\d+, (ok|ambiguous)"
 )
-"""Of files of poses, whole as they are written."""
+"""First lines of files of poses that mixpose wrote."""
 
 
 class Output(ExitStack):
-    """Writes poses; a file is opened with the first of them, so that no failure empties it.
+    """Write poses; the first pose opens the file, so that an earlier failure does not empty it.
 
-    Without a path poses go to standard output. Of several bodies (their `labels`) each gets a file
-    of its own where the format needs that, ``poses.<body>.tum`` for ``poses.tum``; a SessionError
-    if there is no path then. `goes_on` is a file of JSON lines that has its header already, in
-    place of opening `path`; `options` are what the writer of the format takes besides; a `whole`
-    file appears when all is written.
+    Without a path poses go to standard output. If the format holds one body only, each of several
+    bodies (`labels`) gets a file, ``poses.<body>.tum`` for ``poses.tum``; this needs a path, else
+    SessionError. `resumed` is an open file of JSON lines that has its header already and replaces
+    `path`; `options` are further arguments of the format's writer; a `whole` file appears once all
+    is written.
     """
 
     def __init__(
@@ -45,42 +45,42 @@ class Output(ExitStack):
         header: Header,
         labels: Sequence[str] = (),
         *,
-        goes_on: LineFile | None = None,
+        resumed: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
         whole: bool = False,
     ) -> None:
         super().__init__()
-        self._called = self._path = path
+        self._named = self._path = path
         self._format, self._header = format_name, header
         self._options, self._is_whole = options or {}, whole
         self._writer: writing.PoseWriter | None = None
-        self.file = goes_on
-        if goes_on is not None:
-            self._writer = jsonl.JsonlWriter(cast(TextIO, goes_on), header, resume=True)
-        self._apart: dict[str, Output] = {}  # by label
-        if not _are_apart(format_name, labels):
+        self.file = resumed
+        if resumed is not None:
+            self._writer = jsonl.JsonlWriter(cast(TextIO, resumed), header, resume=True)
+        self._by_label: dict[str, Output] = {}  # if bodies have separate files
+        if not _are_separate(format_name, labels):
             return
         if path is None:
             raise SessionError(
                 f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
                 "with -o: each body gets one with its own name in it"
             )
-        for label, own in zip(labels, _body_paths(path, labels), strict=True):
-            self._apart[label] = Output(own, format_name, header, options=options, whole=whole)
+        for label, file in zip(labels, _body_paths(path, labels), strict=True):
+            self._by_label[label] = Output(file, format_name, header, options=options, whole=whole)
 
     def __enter__(self) -> Self:
-        for each in self._apart.values():
-            self.enter_context(each)
-        if not self._apart:
-            if self._is_whole and self._called is not None:
-                self._path = self.enter_context(appearing_whole(self._called))
+        for output in self._by_label.values():
+            self.enter_context(output)
+        if not self._by_label:
+            if self._is_whole and self._named is not None:
+                self._path = self.enter_context(appearing_whole(self._named))
             self.push(self._end)
         return super().__enter__()
 
     def _end(self, kind: object, error: object, trace: object) -> None:
         try:
             if error is None and self._writer is None:
-                self._open()  # a run without frames says at least what it was
+                self._open()  # a run without frames still writes a header
             if self._writer is not None and not isinstance(error, OSError | SessionError):
                 self._writer.close()
         finally:
@@ -88,13 +88,13 @@ class Output(ExitStack):
                 self.file.close()
 
     def write(self, estimate: Estimate) -> None:
-        """Write one frame of one body, at once."""
-        if self._apart:
-            self._apart[estimate.label].write(estimate)
+        """Write the pose of one body in one frame without delay."""
+        if self._by_label:
+            self._by_label[estimate.label].write(estimate)
             return
         if self._writer is None and self._format == "tum" and estimate.time_s is None:
             warn(
-                f"{self._called or 'standard output'}: poses have no times, so that frame numbers "
+                f"{self._named or 'standard output'}: poses have no times, so that frame numbers "
                 "stand for seconds; fps or times in [[sensor]] gives them times"
             )
         writer = self._writer or self._open()
@@ -102,29 +102,29 @@ class Output(ExitStack):
 
     def _open(self) -> writing.PoseWriter:
         if self._path is not None:
-            self.file = LineFile(self._path, called=self._called)
-        # the writers only ever write and flush
+            self.file = LineFile(self._path, shown=self._named)
+        # writers of poses call only write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
         self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
 def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
-    """Where the poses of several bodies go: ``poses.tum`` → ``poses.tool.tum``; no two alike."""
+    """Return distinct files for the poses of bodies: ``poses.tum`` → ``poses.tool.tum``."""
     words = distinct(labels, partial(re.sub, r"[^\w\- ]", "_"), str.casefold)
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
 
 
-def _are_apart(format_name: str, labels: Sequence[str]) -> bool:
-    """Whether a format needs a file for each of some bodies."""
+def _are_separate(format_name: str, labels: Sequence[str]) -> bool:
+    """Test whether a format needs a file for each of several bodies."""
     return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
 
 
 def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
-    """The files that poses go to; none where that is standard output."""
+    """Return the files that poses go to; none for standard output."""
     if path is None:
         return []
-    return _body_paths(path, labels) if _are_apart(format_name, labels) else [path]
+    return _body_paths(path, labels) if _are_separate(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
@@ -141,9 +141,9 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
-    """Raise SessionError unless a file to be written is new, empty, or has a mark near its begin.
+    """Raise SessionError unless a file to be written is new, empty, or has `mark` in its beginning.
 
-    `begins` is what the very first characters have to be, `option` what named the file.
+    It has to start with `begins`; `option` is the option that named the file.
     """
     if is_stdout(path):
         return
@@ -153,14 +153,14 @@ def refuse_to_overwrite_but(
 
 
 def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") -> str:
-    """The first characters of a file that may be in the way; none where no file is."""
+    """Return the first characters of an existing file at a path to be written, else none."""
     if not path.parent.is_dir():
         raise SessionError(f"{option} {path}: there is no folder {path.parent}")
     if path.is_dir():
         raise SessionError(f"{option} {path}: is a folder; name a file")
     if not path.is_file():
         return ""
-    if any(each is not None and each.exists() and path.samefile(each) for each in inputs):
+    if any(source is not None and source.exists() and path.samefile(source) for source in inputs):
         raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")
@@ -173,49 +173,49 @@ def _foreign(path: Path, option: str = "-o") -> SessionError:
 
 
 def is_stdout(named: Path | None) -> bool:
-    """Whether what an option names is standard output."""
+    """Test whether an option names standard output."""
     return named == Path("-")
 
 
-def refuse_suffix(named: Path, allowed: Sequence[str], what: str) -> None:
-    """Raise a SessionError where a name ends as files do that are something else than `what`."""
+def refuse_suffix(named: Path, allowed: Sequence[str], reason: str) -> None:
+    """Raise SessionError, with a reason, if the suffix of a file is none of those `allowed`."""
     if named.suffix and named.suffix.casefold() not in allowed:
         raise SessionError(
-            f"-o {named}: found the suffix {named.suffix}; {what}: name it "
+            f"-o {named}: found the suffix {named.suffix}; {reason}: name it "
             f"{named.with_suffix(allowed[0]).name}"
         )
 
 
-def refuse_stdout(named: Path | None, option: str, what: str, instead: str) -> None:
-    """Raise a SessionError where an option names standard output, which cannot take `what`."""
+def refuse_stdout(named: Path | None, option: str, content: str, instead: str) -> None:
+    """Raise SessionError if an option names standard output, which cannot take `content`."""
     if is_stdout(named):
-        raise SessionError(f"{option} -: {what} cannot go to standard output; name {instead}")
+        raise SessionError(f"{option} -: {content} cannot go to standard output; name {instead}")
 
 
 def refuse_one_for_two(named: Path | None, option: str, other: Path | None, before: str) -> None:
-    """Raise a SessionError where two options name one place, as only the last would be there."""
+    """Raise SessionError if two options name one file, which only the later output would keep."""
     if named is not None and other is not None and named.resolve() == other.resolve():
         raise SessionError(f"{option} {named}: {before} goes there, too; name another file")
 
 
 def shown(named: Path) -> str:
-    """What messages call a place that is written to."""
+    """Return the name of an output in messages."""
     return "standard output" if is_stdout(named) else str(named)
 
 
 def print_lines(lines: Iterable[str], *written: Path | None) -> None:
-    """Print what people read; to standard error where standard output has what is written."""
+    """Print lines for people; to standard error if one of the outputs `written` is `-`."""
     stream = sys.stderr if any(map(is_stdout, written)) else sys.stdout
     stream.write("\n".join(lines) + "\n")
 
 
 def write_text(path: Path, text: str, option: str) -> None:
-    """Write a text to the file that an option names, or to standard output, or SessionError."""
+    """Write a text to the file that an option names or to standard output; else SessionError."""
     if is_stdout(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(text.encode("utf-8"))  # the same bytes on every system
         sys.stdout.buffer.flush()
         return
-    told = reporting(SessionError, f"{option} {path}: cannot be written")
-    with told, appearing_whole(path) as part:
+    errors = reporting(SessionError, f"{option} {path}: cannot be written")
+    with errors, appearing_whole(path) as part:
         part.write_text(text, encoding="utf-8", newline="\n")

@@ -1,4 +1,4 @@
-"""``mixpose pivot``: the tip of a tool, told and written into a session."""
+"""``mixpose pivot``: find the tip of a tool, and write it into a session."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few pe
 
 
 def pivot_poses(request: PivotRequest) -> None:
-    """Find the tip of a tool, tell it, and write it into a session.
+    """Find the tip of a tool, print it, and write it into a session.
 
-    Raises RecordingError if the poses do not tell the tip.
+    Raises RecordingError if the poses do not determine the tip.
     """
     path = request.poses
     poses = read_poses(path)
@@ -63,10 +63,10 @@ def _tool(poses: PoseFile, request: PivotRequest) -> str:
 
 
 def _pivoting(poses: PoseFile, tool: str, reference: str | None) -> Pivoting:
-    """Poses of the tool that are ok, with those of the reference in the same frames."""
-    own = _known(poses, tool)
-    other = own if reference is None else _known(poses, reference)
-    frames = [frame for frame in own if frame in other]
+    """Return poses of the tool that are ok, with those of the reference in the same frames."""
+    of_tool = _ok_lines(poses, tool)
+    of_reference = of_tool if reference is None else _ok_lines(poses, reference)
+    frames = [frame for frame in of_tool if frame in of_reference]
 
     def stacked(lines: Mapping[int, PoseLine]) -> list[np.ndarray]:
         return [
@@ -74,22 +74,22 @@ def _pivoting(poses: PoseFile, tool: str, reference: str | None) -> Pivoting:
             for name, n in (("T_world_object", 4), ("covariance", 6))
         ]
 
-    pivoting = fixed_in_world(*stacked(own))
-    return pivoting if reference is None else fixed_in(pivoting, *stacked(other))
+    pivoting = fixed_in_world(*stacked(of_tool))
+    return pivoting if reference is None else fixed_in(pivoting, *stacked(of_reference))
 
 
-def _known(poses: PoseFile, label: str) -> dict[int, PoseLine]:
-    own = [line for line in poses.poses if line.label == label]
-    require_frames_once(sorted(own, key=lambda line: line.frame))
-    lines = [line for line in own if line.status == "ok"]
-    require_covariances(lines)
-    return {line.frame: line for line in lines}
+def _ok_lines(poses: PoseFile, label: str) -> dict[int, PoseLine]:
+    lines = [line for line in poses.poses if line.label == label]
+    require_frames_once(sorted(lines, key=lambda line: line.frame))
+    ok_lines = [line for line in lines if line.status == "ok"]
+    require_covariances(ok_lines)
+    return {line.frame: line for line in ok_lines}
 
 
 def _lines(tool: str, reference: str | None, tip: Tip, unit: str, unsure: int) -> list[str]:
-    """What is printed of a tip; `unsure` frames have no pose that is ok, of both bodies."""
+    """Return the lines about a tip; in `unsure` frames not all poses of both bodies are ok."""
     deviations = np.sqrt(tip.covariance.diagonal())
-    turns = ", ".join(f"{value:.3g}" for value in tip.turns_deg[::-1])
+    swings = ", ".join(f"{value:.3g}" for value in tip.turns_deg[::-1])
     where = "the world" if reference is None else reference
     not_ok = f", {unsure} not ok" if unsure else ""
     return [
@@ -99,12 +99,12 @@ def _lines(tool: str, reference: str | None, tip: Tip, unit: str, unsure: int) -
         f"from it: {tip.residual:.3g} {unit} RMS, {tip.held_out:.3g} in frames held out; "
         f"{tip.expected:.3g} by the covariances of the poses",
         f"{tip.frames} frames, {tip.left_out} left out{not_ok}; directions of the body swing by "
-        f"{turns} deg RMS",
+        f"{swings} deg RMS",
     ]
 
 
 def _numbers(values: np.ndarray, deviations: np.ndarray) -> str:
-    """With two digits of what they err by."""
+    """Return values in words, to two digits of their smallest deviation."""
     places = max(0, 1 - int(np.floor(np.log10(max(float(deviations.min()), 1e-9)))))
     return ", ".join(f"{value:.{places}f}" for value in values)
 
@@ -137,7 +137,7 @@ def _put_into(path: Path, tool: str, poses: PoseFile, tip: Tip) -> None:
             f"--into {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"
         )
     document = document_of(session, path)
-    names = [one.body.name for one in session.objects]
+    names = [setup.body.name for setup in session.objects]
     name = next(line.object for line in poses.poses if line.label == tool)
     if name not in names:
         raise SessionError(f"--into {path}: has {', '.join(names)}, and the poses are of {name}")

@@ -1,8 +1,8 @@
-"""One recording of many: run in a process of its own, in a folder that appears when it is whole.
+"""Run one recording of many in a separate process, in a folder that appears when it is complete.
 
-The folder holds the poses, what was said (`LOG`) and how it ended (`STATUS`).  While it is made
-its name begins with a dot.  A recording that two workers come to do gives one folder: the first to
-be whole stays.
+The folder holds the poses, the messages (`LOG`) and the outcome (`STATUS`).  Until it is complete
+its name begins with a dot.  If two workers run the same recording, the first folder that is
+complete stays.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
-from mixpose.cli.lines import held, note_path
-from mixpose.cli.notices import told_frames
+from mixpose.cli.lines import locked_folder, note_path
+from mixpose.cli.notices import parsed_frames
 from mixpose.errors import SessionError
 from mixpose.whole_files import appearing_whole
 
@@ -38,7 +38,7 @@ _INTERRUPTED_STATUS = 130
 
 @dataclass(frozen=True)
 class Recording:
-    """One of many; text only, as it may travel to another machine."""
+    """One recording of many; plain values only, as it may be sent to another machine."""
 
     name: str  # of its folder
     session: str  # absolute path
@@ -49,21 +49,21 @@ class Recording:
 
 @dataclass(frozen=True)
 class Job(Recording):
-    """What is to be done."""
+    """A recording that is to be run."""
 
-    folder: str  # absolute path of that of all recordings
+    folder: str  # absolute path of the folder of all recordings
     poses: str  # name of the file with the poses
-    shared: bool = False  # whether another worker may come to do the same
+    shared: bool = False  # whether another worker may run the same job
 
 
 @dataclass(frozen=True)
 class Outcome(Recording):
-    """How a recording ended: what its status file holds."""
+    """How a recording ended; the content of its status file."""
 
     state: str
     exit_status: int  # of ``mixpose run``
-    frames: Mapping[str, int] = field(default_factory=dict)  # poses by their status
-    bodies: int = 1  # poses of a frame
+    frames: Mapping[str, int] = field(default_factory=dict)  # number of poses by status
+    bodies: int = 1  # poses per frame
     warnings: int = 0  # in the log
     reason: str | None = None  # why it failed: the last line of the log
     seconds: float = 0.0
@@ -71,7 +71,7 @@ class Outcome(Recording):
 
 
 class Running:
-    """The processes that run, so that an interrupt reaches all of them."""
+    """The running processes, so that an interrupt reaches all of them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -79,7 +79,7 @@ class Running:
         self.stopped = False
 
     def run(self, command: list[str], folder: Path, log: Path, threads: int) -> int:
-        """Run a command to its end; an interrupted one's status if none may start any more."""
+        """Run a command and return its status; after an interrupt, start none and return that."""
         with self._lock, log.open("ab") as stream:
             if self.stopped:
                 return _INTERRUPTED_STATUS
@@ -90,7 +90,7 @@ class Running:
                 stdin=subprocess.PIPE,  # ends with this process, see `mixpose.cli.child`
                 stdout=subprocess.DEVNULL,
                 stderr=stream,
-                # an interrupt from the keyboard comes once, through this process
+                # an interrupt from the keyboard reaches it through this process only
                 start_new_session=True,
             )
             self._running.add(process)
@@ -105,45 +105,45 @@ class Running:
             process.stdin.close()
 
     def interrupt(self) -> None:
-        """Let every process end after its frame, and no further one start."""
+        """Let every process end after its frame, and let no other start."""
         with self._lock:
             self.stopped = True
             for process in self._running:
-                if sys.platform != "win32":  # there the keyboard reaches all by itself
-                    # an interrupt is ignored by what a script starts in the background
+                if sys.platform != "win32":  # where the keyboard interrupts all processes
+                    # SIGTERM, as processes that a script starts in the background ignore SIGINT
                     process.send_signal(signal.SIGTERM)
 
 
-def told(folder: Path) -> Outcome | None:
-    """What the status file in a folder says, if there is one."""
+def outcome_in(folder: Path) -> Outcome | None:
+    """Read the status file in a folder; None without a valid one."""
     try:
-        said = json.loads((folder / STATUS).read_bytes())
-        return Outcome(**{**said, "options": tuple(said["options"])})
+        content = json.loads((folder / STATUS).read_bytes())
+        return Outcome(**{**content, "options": tuple(content["options"])})
     except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
 def finished(job: Job) -> Outcome | None:
-    """How a job ended before, if it is done and nothing about it has changed."""
-    outcome = told(Path(job.folder) / job.name)
+    """Return the earlier outcome of a job if it is done and the job has not changed."""
+    outcome = outcome_in(Path(job.folder) / job.name)
     return outcome if outcome and outcome.state == DONE and _is_of(outcome, job) else None
 
 
 def _is_of(outcome: Outcome, job: Job) -> bool:
-    """Whether an outcome is of the same session, options and version as a job."""
-    same = (outcome.session_sha256, outcome.options, outcome.mixpose)
-    return same == (job.session_sha256, job.options, job.mixpose)
+    """Test whether an outcome is of the same session, options and version as a job."""
+    key = (outcome.session_sha256, outcome.options, outcome.mixpose)
+    return key == (job.session_sha256, job.options, job.mixpose)
 
 
 def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
-    """Do a job, if it is not done yet; an interrupt reaches its process through `running`."""
+    """Run a job unless it is done; an interrupt reaches its process through `running`."""
     missing = _not_shared(job)
     if missing is not None:
         return missing
     part = Path(job.folder) / f".{job.name}.{uuid.uuid4().hex if job.shared else UNFINISHED}"
     try:
         part.mkdir(exist_ok=True)
-        with held(part, Path(job.folder) / job.name):
+        with locked_folder(part, Path(job.folder) / job.name):
             outcome = finished(job) or _run_in(part, job, running or Running(), threads)
             if outcome.state != INTERRUPTED:
                 outcome = _put_in_place(part, job, outcome)
@@ -160,11 +160,11 @@ def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outco
 
 def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     part.mkdir(exist_ok=True)
-    goes_on = _goes_on(part, job)
+    resumes = _can_resume(part, job)
     log, poses = part / LOG, part / job.poses
     command = [sys.executable, "-m", "mixpose.cli.child", "run", *job.options]
-    command += [f"--output={job.poses}", *(["--resume"] if goes_on else [])]
-    # what is begun says of what it is, should nothing come to say how it ended
+    command += [f"--output={job.poses}", *(["--resume"] if resumes else [])]
+    # if this process is killed, the status file still says which job was begun
     write_json(part / STATUS, asdict(outcome_of(job, INTERRUPTED, _INTERRUPTED_STATUS)))
     log.touch()
     began = time.monotonic()
@@ -174,63 +174,63 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
         lines.append(f"mixpose: ended by signal {-status}")
     interrupted = status == _INTERRUPTED_STATUS or running.stopped
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
-    told = [found for line in lines if (found := told_frames(line))]
-    frames, bodies = told[-1] if told else ({}, 1)  # as the run said in the end
-    if goes_on and state != FAILED:
+    parsed = [counts for line in lines if (counts := parsed_frames(line))]
+    frames, bodies = parsed[-1] if parsed else ({}, 1)
+    if resumes and state != FAILED:
         with suppress(OSError, ValueError, KeyError):
             frames = _statuses_in(poses)
-    said = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
-    reason = None if status == 0 else said
+    last_line = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
+    reason = None if status == 0 else last_line
     outcome = replace(
         outcome_of(job, state, 128 - status if status < 0 else status, reason),
         frames=frames,
         bodies=bodies,
-        # a run that goes on may say again what the one before it said
+        # a run that resumes may repeat warnings of the earlier one
         warnings=sum(line.startswith("mixpose: warning: ") for line in set(lines)),
         seconds=round(time.monotonic() - began, 3),
     )
-    if state == DONE:  # nothing is left to go on with
+    if state == DONE:  # nothing remains to be resumed
         note_path(poses).unlink(missing_ok=True)
     write_json(part / STATUS, asdict(outcome))
     return outcome
 
 
-def _goes_on(part: Path, job: Job) -> bool:
-    """Whether poses of the same job are begun in a folder, which is emptied of all else."""
-    begun, poses = told(part), part / job.poses
+def _can_resume(part: Path, job: Job) -> bool:
+    """Test whether a folder has poses of the same job to resume; else empty it."""
+    begun, poses = outcome_in(part), part / job.poses
     is_begun = begun is not None and begun.state == INTERRUPTED and _is_of(begun, job)
     if is_begun and poses.suffix == ".jsonl" and poses.exists():
         return True
-    for left in part.iterdir():
-        shutil.rmtree(left) if left.is_dir() else left.unlink()
+    for path in part.iterdir():
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
     return False
 
 
 def _statuses_in(poses: Path) -> dict[str, int]:
-    """How many poses of each status a file holds, with those of runs that were interrupted."""
+    """Count the poses of each status in a file, which interrupted runs contributed to."""
     with poses.open(encoding="ascii") as lines:
         whole = [json.loads(line) for line in lines if line.endswith("\n")]
     return dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
 
 
-def write_json(path: Path, said: Mapping[str, object]) -> None:
-    """Write a file that people may read, too."""
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write an indented JSON file as a whole."""
     with appearing_whole(path) as part:
-        part.write_text(json.dumps(said, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
-    """Give a whole folder its name, unless another worker was faster.
+    """Rename a complete folder to its final name, unless another worker was faster.
 
-    Poses that are there are not given up for a run that failed.
+    Existing poses are not replaced by a run that failed.
     """
     place = Path(job.folder) / job.name
     while True:
-        before, there = finished(job), told(place)
-        if before is not None:
+        earlier, existing = finished(job), outcome_in(place)
+        if earlier is not None:
             shutil.rmtree(part, ignore_errors=True)
-            return before
-        if outcome.state == FAILED and there is not None and there.state == DONE:
+            return earlier
+        if outcome.state == FAILED and existing is not None and existing.state == DONE:
             shutil.rmtree(part, ignore_errors=True)
             return replace(outcome, reason=f"{outcome.reason}; {job.name} is as it was before")
         old = place.with_name(f".{job.name}.{uuid.uuid4().hex}")
@@ -248,7 +248,7 @@ def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
 
 
 def _not_shared(job: Job) -> Outcome | None:
-    """What to say where this machine does not see the folders of the one that asked."""
+    """Return a failure if this machine does not see the folders of the one that made the job."""
     missing = [path for path in (job.session, job.folder) if not Path(path).exists()]
     if not missing:
         return None
@@ -262,7 +262,7 @@ def _not_shared(job: Job) -> Outcome | None:
 
 
 def outcome_of(job: Job, state: str, exit_status: int, reason: str | None = None) -> Outcome:
-    """How a job ended on this machine."""
-    same = {one.name: getattr(job, one.name) for one in fields(Recording)}
+    """Return the outcome of a job that ended on this machine."""
+    values = {entry.name: getattr(job, entry.name) for entry in fields(Recording)}
     host = socket.gethostname()
-    return Outcome(**same, state=state, exit_status=exit_status, reason=reason, host=host)
+    return Outcome(**values, state=state, exit_status=exit_status, reason=reason, host=host)

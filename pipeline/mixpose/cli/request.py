@@ -1,6 +1,6 @@
-"""What is asked of ``mixpose run``.
+"""Arguments and options of ``mixpose run``.
 
-Apart from the run itself, so that a command which only starts others need not load what they do.
+This module imports little, so that a command which only starts other processes loads fast.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ SUFFIXES = {
     ".yaml": "ros",
     ".yml": "ros",
 }
-"""Formats of poses by how the name of a file ends."""
+"""Formats of poses by the endings of file names."""
 
 FARTHEST_S = 0.5
-"""What poses are foretold at most: a hand has turned round by then."""
+"""Longest prediction of poses, s: by then a hand may have reversed its motion."""
 
 Sources = Annotated[
     list[str] | None,
@@ -99,17 +99,17 @@ class RunRequest:
 
     @property
     def poses(self) -> Path | None:
-        """Where poses go; None: to standard output."""
+        """The file for poses; None for standard output."""
         return output_of(self.output)
 
     @property
     def format_name(self) -> str:
-        """The format of poses: the one named, else that of the file's suffix, else JSON lines.
+        """The format of poses: of --format, else of the file's suffix, else JSON lines.
 
-        Raises SessionError if the suffix is that of no format, or of one that is not written while
-        poses are estimated.
+        Raises SessionError if the suffix belongs to no format, or to one that cannot be written
+        while poses are estimated.
         """
-        return self.format or ("jsonl" if self.are_many else _by_its_suffix(self.poses))
+        return self.format or ("jsonl" if self.are_many else _format_by_suffix(self.poses))
 
     @property
     def are_many(self) -> bool:
@@ -121,18 +121,18 @@ class RunRequest:
 
     @property
     def selection(self) -> Selection:
-        """Which frames are estimated."""
+        """The numbers of the frames to estimate."""
         return Selection(self.start, self.stop, self.step)
 
     @property
     def options(self) -> dict[str, int | bool]:
-        """What is not the default of the options that all lines of a file have to share."""
+        """Options that differ from their defaults and must be the same for all lines of a file."""
         step = {"step": self.step} if self.step != 1 else {}
         return step | ({"labels": True} if self.labels else {})
 
     @property
     def ahead_s(self) -> float:
-        """How far poses that are published are foretold; a SessionError where they cannot be."""
+        """How far ahead published poses are predicted; raises SessionError if they cannot be."""
         seconds = self.predict
         if seconds is None:
             return 0.0
@@ -149,17 +149,17 @@ class RunRequest:
 
 
 def output_of(named: Path | None) -> Path | None:
-    """Where an option says that something goes; None, standard output, also where it says ``-``."""
+    """Return the path that an option names; None, standard output, for ``-`` too."""
     return None if named == Path("-") else named
 
 
 def by_suffix(output: Path | None, suffixes: Mapping[str, str]) -> str | None:
-    """The format that the name of a file tells by its end; None where it tells none."""
+    """Return the format that belongs to the suffix of a file name; None if none does."""
     name = "" if output is None else output.name.casefold()
-    return next((each for end, each in suffixes.items() if name.endswith(end)), None)
+    return next((word for end, word in suffixes.items() if name.endswith(end)), None)
 
 
-def _by_its_suffix(output: Path | None) -> str:
+def _format_by_suffix(output: Path | None) -> str:
     if output is None or not output.suffix or (output.exists() and not output.is_file()):
         return "jsonl"
     if output.name.casefold().endswith(".rrd"):
@@ -167,10 +167,10 @@ def _by_its_suffix(output: Path | None) -> str:
             f"-o {output}: poses are not written in this format while they are estimated; write "
             f".jsonl, and then: mixpose convert POSES.jsonl -o {output}"
         )
-    told = by_suffix(output, SUFFIXES)
-    if told is None:
+    format_name = by_suffix(output, SUFFIXES)
+    if format_name is None:
         raise SessionError(
             f"-o {output}: found the suffix {output.suffix}, which is no format of poses; allowed: "
             f"{', '.join(SUFFIXES)}; or name one with --format"
         )
-    return told
+    return format_name

@@ -1,4 +1,4 @@
-"""``mixpose run``: poses to a file or to standard output, as soon as each frame is done."""
+"""``mixpose run``: write poses to a file or to standard output as soon as each frame is done."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, continuation, is_device
+from mixpose.cli.continuation import Continuation, Notes, is_device, resume
 from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
 from mixpose.cli.output import Output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
@@ -32,7 +32,7 @@ def run_session(request: RunRequest) -> None:
 
     Whatever is raised, frames already estimated stay written.
     """
-    with ExitStack() as pages:  # what outlives the poses
+    with ExitStack() as pages:  # closed after the poses
         _run_session(request, pages)
 
 
@@ -42,29 +42,29 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     header = header_of(session, replaced, request.options)
     opened = open_sources(session, replaced)
     outputs = written_paths(request.poses, request.format_name, header.labels)
-    for each in outputs:
-        if not is_device(each):
-            refuse_to_overwrite(each, _inputs(session))
-    go_on = Continuation(None, request.selection)
+    for path in outputs:
+        if not is_device(path):
+            refuse_to_overwrite(path, _inputs(session))
+    plan = Continuation(None, request.selection)
     if request.resume:
-        go_on = continuation(request, header, opened)
-    if go_on.is_done:
+        plan = resume(request, header, opened)
+    if plan.is_done:
         say(f"nothing left to do: {request.poses} has all frames asked for already")
         return
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
-    output = Output(request.poses, request.format_name, header, header.labels, goes_on=go_on.file)
+    output = Output(request.poses, request.format_name, header, header.labels, resumed=plan.file)
     with output, prompt_switching(), ExitStack() as stack:
-        is_new = partial(_is_new, session.labels, go_on.there)
+        is_new = partial(_is_new, session.labels, plan.last_written)
         watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
             opened=opened,
-            selection=go_on.selection,
-            watch=partial(_each, is_new, watches),
-            memory=go_on.memory,
+            selection=plan.selection,
+            watch=partial(_call_watches, is_new, watches),
+            memory=plan.memory,
             remember=memories.append,
             labels=request.labels,
         )
@@ -73,7 +73,7 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
         shown = _with_progress(estimates, session, quiet=request.poses is None)
         for estimate in filter(is_new, shown):
             output.write(estimate)
-            is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
+            is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are written
             if output.file is not None and is_whole:
                 notes.remember(estimate.frame, output.file, memories[-1])
             summary.add(estimate)
@@ -83,22 +83,22 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     summary.say(f" -> {', '.join(names)}" if names else "")
 
 
-def _is_new(labels: Sequence[str], there: ResumePoint | None, estimate: Estimate) -> bool:
-    """Whether an estimate comes after the last line that is there already."""
-    place = labels.index(estimate.label) + 1  # of its line among those of the frame
-    return there is None or (estimate.frame, place) > (there.frame, there.lines)
+def _is_new(labels: Sequence[str], last: ResumePoint | None, estimate: Estimate) -> bool:
+    """Test whether an estimate comes after the last line that an earlier run wrote."""
+    line_number = labels.index(estimate.label) + 1  # among the lines of the frame
+    return last is None or (estimate.frame, line_number) > (last.frame, last.lines)
 
 
 def _watches(
     stack: ExitStack, session: Session, request: RunRequest, header: Header
 ) -> Iterator[Watch]:
-    """What sends each pose on and draws its frame, where asked for; finished with the stack."""
+    """Yield the watches that publish poses and draw overlays, if requested; the stack ends them."""
     ahead_s = request.ahead_s
     if request.publish:
         from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
-        each = [(label, one.body) for one in session.objects for label in one.labels]
-        foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in each}
+        bodies = [(label, setup.body) for setup in session.objects for label in setup.labels]
+        foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in bodies}
         publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
         yield stack.enter_context(publishing).watch
     if request.overlay is not None:
@@ -110,13 +110,13 @@ def _watches(
         yield stack.enter_context(overlay).watch
 
 
-def _foresee(known: PosePredictor, seconds: float) -> Callable[[Estimate], Estimate]:
-    """Foretells the poses of a body so many seconds ahead, by the estimates it is called with."""
+def _foresee(predictor: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
+    """Return a function that predicts a body's pose `seconds` ahead from successive estimates."""
 
     def foresee(estimate: Estimate) -> Estimate:
-        nonlocal known
-        known = known.after(estimate)
-        return known.ahead(estimate, seconds)
+        nonlocal predictor
+        predictor = predictor.after(estimate)
+        return predictor.ahead(estimate, seconds)
 
     return foresee
 
@@ -124,7 +124,7 @@ def _foresee(known: PosePredictor, seconds: float) -> Callable[[Estimate], Estim
 def _view(
     stack: ExitStack, session: Session, request: RunRequest, opened: Mapping[str, Source]
 ) -> list[Watch]:
-    """What shows each frame on a page, gone with the stack; nothing where none is to be shown."""
+    """Return the watch that shows frames on a page, if requested; the stack closes the page."""
     if request.view is None:
         if request.pause:
             raise SessionError("--pause: nothing to go on with; add --view")
@@ -137,28 +137,28 @@ def _view(
     return [viewer.watch]
 
 
-def _each(
+def _call_watches(
     is_new: Callable[[Estimate], bool],
     watches: Sequence[Watch],
     frame_set: FrameSet,
     views: Sequence[View],
     estimate: Estimate,
 ) -> None:
-    """Let several look at each new frame, one after the other."""
+    """Pass a new estimate and its frame to all watches."""
     for watch in watches if is_new(estimate) else ():
         watch(frame_set, views, estimate)
 
 
 def _inputs(session: Session) -> Iterator[Path]:
-    """Files that a run reads."""
+    """Yield the files that a run reads, which no output may replace."""
     yield session.path
     for setup in session.sensors:
-        for name in setup.sources:
-            yield session.folder / name
-            if isinstance(setup.source, str) and "://" not in name:
-                # as its frames are found: Path.glob takes other patterns
-                found = glob.glob(name, root_dir=session.folder, recursive=True)  # noqa: PTH207
-                yield from (session.folder / each for each in found)
+        for pattern in setup.sources:
+            yield session.folder / pattern
+            if isinstance(setup.source, str) and "://" not in pattern:
+                # frames are found by glob.glob, too: Path.glob takes other patterns
+                names = glob.glob(pattern, root_dir=session.folder, recursive=True)  # noqa: PTH207
+                yield from (session.folder / name for name in names)
         if setup.times is not None:
             yield setup.times
 
@@ -168,8 +168,8 @@ def header_of(
     sources: Mapping[str, str] | None = None,
     options: Mapping[str, int | bool] | None = None,
 ) -> Header:
-    """The first line of the poses of a session, with the recordings given in place of its own, and
-    what else was asked for that the lines hang on.
+    """Return the header of a session's poses, with `sources` that replace the session's and those
+    `options` that change pose lines.
     """
     return Header(
         unit=session.unit,
@@ -177,17 +177,17 @@ def header_of(
         session_sha256=session.sha256,
         mixpose=__version__,
         seed=session.estimator.seed,
-        symmetries={one.body.name: one.body.symmetries for one in session.objects},
+        symmetries={setup.body.name: setup.body.symmetries for setup in session.objects},
         sources=sources or {},
         options=options or {},
         sensors=tuple(setup.name for setup in session.sensors),
-        objects={one.body.name: one.count for one in session.objects},
-        tips=any(one.body.tip is not None for one in session.objects),
+        objects={setup.body.name: setup.count for setup in session.objects},
+        tips=any(setup.body.tip is not None for setup in session.objects),
     )
 
 
 def named_sources(named: Iterable[str]) -> dict[str, str]:
-    """Recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
+    """Return recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
 
     Raises SessionError if a text is not of this form.
     """
@@ -196,7 +196,7 @@ def named_sources(named: Iterable[str]) -> dict[str, str]:
         name, separator, path = text.partition("=")
         if not separator or not name or not path:
             raise SessionError(f"--source {text}: found no NAME=PATH, as in --source left=frames/")
-        # as in a session file, where it is no text; of two meanings a file that is there is meant
+        # a session file has a number without quotes here; an existing file of this name comes first
         is_camera = path.isdecimal() and not Path(path).exists()
         sources[name] = f"camera:{path}" if is_camera else path
     return sources
@@ -205,11 +205,11 @@ def named_sources(named: Iterable[str]) -> dict[str, str]:
 def _with_progress(
     estimates: Generator[Estimate, None, None], session: Session, *, quiet: bool
 ) -> Iterable[Estimate]:
-    """Show a bar on standard error while poses go to a file and a person is watching."""
-    with bar(str(session.path), None, shown=not quiet, spins=True) as moved:
+    """Pass estimates on; show progress on standard error, on a terminal and unless `quiet`."""
+    with bar(str(session.path), None, shown=not quiet, spins=True) as advance:
         lost = 0
         for count, estimate in enumerate(estimates, 1):
             lost += estimate.status == "lost"
             text = f"frame {estimate.frame}, {count} done, {lost} lost"
-            moved(advance=1, description=text)
+            advance(advance=1, description=text)
             yield estimate

@@ -1,6 +1,6 @@
 """``mixpose convert`` to formats that need the session of the poses.
 
-Trajectories of the labelled markers (.c3d, .trc), and poses with their recording (.rrd).
+These are trajectories of labelled markers (.c3d, .trc), and poses with their recording (.rrd).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mixpose.whole_files import appearing_whole
 MARKER_FORMATS = ("c3d", "trc")
 
 MOST_PLACES = 50_000_000
-"""Of all markers in all frames: they are held in memory, with 50 bytes each."""
+"""Limit of places of markers in all frames, which are held in memory with 50 bytes each."""
 
 
 def write_markers(
@@ -38,16 +38,16 @@ def write_markers(
     format_name: str,
     request: ConvertRequest,
 ) -> None:
-    """Write where the markers of all bodies were: measured where they were, else by the pose.
+    """Write the places of all markers: measured ones, else by the pose.
 
-    `lines` are those of the poses to write, in a unit of lengths. Raises SessionError if a package
-    is missing, or poses and options do not go together, and RecordingError if the poses hold what
-    such a file cannot.
+    `lines` are the poses to write, with lengths in `unit`. Raises SessionError if a package is
+    missing or options do not fit the poses, and RecordingError if such a file cannot hold the
+    poses.
     """
     session = session_of(poses, request.session, allow_code=request.allow_code, unit=unit)
     output, measured = request.output, request.measured
     if format_name == "c3d":
-        _place(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
+        _require_output(output, "c3d", "c3d", "ezc3d", "; .trc needs none")
     if output is not None:
         begins, mark = trajectories.MARKS[format_name]
         refuse_to_overwrite_but(output, [poses.path, session.path], mark, begins=begins)
@@ -57,22 +57,22 @@ def write_markers(
         if measured:
             raise SessionError(f"--measured: {without}; {hint}")
         warn(f"{without}; all places are by the pose; {hint}")
-    told = trajectories_of(poses, lines, session, measured=measured, fps=request.fps)
+    collected = trajectories_of(poses, lines, session, measured=measured, fps=request.fps)
     if output is None:
-        trajectories.write_trc(sys.stdout, told, "markers.trc")
+        trajectories.write_trc(sys.stdout, collected, "markers.trc")
         return
     with appearing_whole(output) as part:
         if format_name == "trc":
             with part.open("w", encoding="utf-8", newline="\n") as stream:
-                trajectories.write_trc(stream, told, output.name)
-        elif not trajectories.write_c3d(part, told):
-            warn(f"{output}: frames are numbered from 1, not from {told.first}")
-    frames, markers = told.is_known.shape
-    known, found = told.is_known.sum(), told.is_measured.sum()
+                trajectories.write_trc(stream, collected, output.name)
+        elif not trajectories.write_c3d(part, collected):
+            warn(f"{output}: frames are numbered from 1, not from {collected.first}")
+    frames, markers = collected.is_known.shape
+    known, direct = collected.is_known.sum(), collected.is_measured.sum()
     say(
         f"{counted(markers, 'marker')} in {counted(frames, 'frame')}: "
-        f"{found} places measured, {known - found} by the pose, "
-        f"{told.is_known.size - known} gaps -> {output}"
+        f"{direct} places measured, {known - direct} by the pose, "
+        f"{collected.is_known.size - known} gaps -> {output}"
     )
 
 
@@ -86,14 +86,14 @@ def trajectories_of(
 ) -> Trajectories:
     """Collect the places of all markers from pose lines.
 
-    `measured` leaves a gap where no sensors measured; `fps` stands in place of the times.
+    `measured` leaves gaps where no marker was measured; `fps` replaces the rate of the times.
     """
     bodies = _bodies(poses, lines, session)
     names = [(label, name) for label, body in bodies.items() for name in body.labels]
     columns = {pair: k for k, pair in enumerate(names)}
     numbers = trajectories.numbers_of(poses.poses)
     first, last = min(numbers.values()), max(numbers.values())
-    if any(number != own for own, number in numbers.items()):
+    if any(number != frame for frame, number in numbers.items()):
         warn(f"{poses.path}: frames are numbered by stamps; in the file they count from {first}")
     count = last - first + 1
     if count * len(names) > MOST_PLACES:
@@ -109,9 +109,9 @@ def trajectories_of(
         if line.T_world_object is None:
             continue
         row, body = numbers[line.frame] - first, bodies[line.label]
-        own = [columns[line.label, name] for name in body.labels]
+        body_columns = [columns[line.label, name] for name in body.labels]
         if not measured:
-            places[row, own] = transform(line.T_world_object, body.means)
+            places[row, body_columns] = transform(line.T_world_object, body.means)
         for name, point in line.points.items():
             k = columns.get((line.label, name))
             if k is None:
@@ -121,11 +121,11 @@ def trajectories_of(
                 )
             places[row, k], residuals[row, k] = point.at, point.residual
             by_sensor[row, k] = [
-                one in line.sensors and name in line.sensors[one].labels for one in sensors
+                sensor in line.sensors and name in line.sensors[sensor].labels for sensor in sensors
             ]
-    several = len(bodies) > 1
+    has_several = len(bodies) > 1
     return Trajectories(
-        tuple(f"{label}:{name}" if several else name for label, name in names),
+        tuple(f"{label}:{name}" if has_several else name for label, name in names),
         places,
         residuals,
         by_sensor,
@@ -136,26 +136,26 @@ def trajectories_of(
 
 
 def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Mapping[str, Body]:
-    """The bodies that lines are of, by their labels, in the order of the session."""
-    known = {label: one.body for one in session.objects for label in one.labels}
-    wanted = {line.label for line in lines}
-    for label in wanted - known.keys():
+    """Return the bodies of lines by their labels, in the order of the session."""
+    bodies = {label: setup.body for setup in session.objects for label in setup.labels}
+    labels = {line.label for line in lines}
+    for label in labels - bodies.keys():
         raise SessionError(
-            f"{poses.path}: has poses of {label}, and {session.path} has {', '.join(known)}; "
+            f"{poses.path}: has poses of {label}, and {session.path} has {', '.join(bodies)}; "
             "name the session of the poses with --session"
         )
-    if not wanted:
+    if not labels:
         raise SessionError(f"{poses.path}: no pose is left to write")
-    return {label: body for label, body in known.items() if label in wanted}
+    return {label: body for label, body in bodies.items() if label in labels}
 
 
 def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
-    """Frames per second by the times of the poses; 1 where they have none."""
-    found = trajectories.rate_of(poses.poses, numbers)
-    if found is None:
+    """Return the frames per second by the times of poses; 1 if they have none."""
+    rate_and_error = trajectories.rate_of(poses.poses, numbers)
+    if rate_and_error is None:
         warn(f"{poses.path}: has no times; the rate is told as 1 frame a second; --fps says more")
         return 1.0
-    rate, off = found
+    rate, off = rate_and_error
     if off > 0.5:
         warn(
             f"{poses.path}: frames are up to {off:.2g} of a frame's time off an even rate of "
@@ -164,8 +164,8 @@ def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
     return rate
 
 
-def _place(output: Path | None, name: str, suffix: str, package: str, more: str = "") -> Path:
-    """Where a format goes that is no text, and takes a package."""
+def _require_output(output: Path | None, name: str, suffix: str, package: str, more: str) -> Path:
+    """Return the output of a binary format; SessionError if it or a package is missing."""
     if output is None:
         raise SessionError(f"--format {name}: needs -o FILE.{suffix}, it is no text")
     require_package(f"--format {name}", package, name, more)
@@ -175,10 +175,10 @@ def _place(output: Path | None, name: str, suffix: str, package: str, more: str 
 def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequest) -> None:
     """Write poses and the recording of their session as an ``.rrd`` file.
 
-    Raises SessionError if the viewer's package is missing, or the session is not found or not that
-    of the poses. Raises RecordingError if the recording cannot be read.
+    Raises SessionError if the package of the viewer is missing, or the session is not found or does
+    not fit the poses; RecordingError if the recording cannot be read.
     """
-    output = _place(request.output, "rerun", "rrd", "rerun-sdk")
+    output = _require_output(request.output, "rerun", "rrd", "rerun-sdk", "")
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - only where it is written
 
     session = session_of(poses, request.session, allow_code=request.allow_code)
@@ -188,17 +188,17 @@ def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequ
 
 
 def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dict[str, Source]:
-    """The recording that poses were estimated from: that of their header, else of the session.
+    """Open the recording of poses: that of their header, else of the session.
 
-    Recordings that are `named` stand in place of it. Raises SessionError if there is no frame any
-    more, and RecordingError if it cannot be opened.
+    Recordings that are `named` replace it. Raises SessionError for a live sensor, whose frames are
+    gone, and RecordingError if a recording cannot be opened.
     """
     from mixpose.cli.run import named_sources  # noqa: PLC0415 - only where it is read again
     from mixpose.runner import open_sources  # noqa: PLC0415
 
     sensors = [setup.name for setup in session.sensors]
-    told = {name: source for name, source in poses.sources.items() if name in sensors}
-    opened = open_sources(session, {**told, **named_sources(named)})
+    recorded = {name: source for name, source in poses.sources.items() if name in sensors}
+    opened = open_sources(session, {**recorded, **named_sources(named)})
     for name, source in opened.items():
         if source.kind == "live":
             raise SessionError(
@@ -211,21 +211,21 @@ def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dic
 def session_of(
     poses: PoseFile, named: Path | None, *, allow_code: bool = False, unit: str | None = None
 ) -> Session:
-    """The session that poses were estimated with: the one `named`, or the one of their header.
+    """Load the session of poses: the one `named`, or that of their header.
 
-    `unit` is that of poses which say none. Raises SessionError if it is not there or has another.
+    `unit` is for poses that state none. Raises SessionError for a missing session or another unit.
     """
     path = named
     if path is None:
-        found = poses.header.get("session")
-        if not isinstance(found, str):
+        stated = poses.header.get("session")
+        if not isinstance(stated, str):
             raise SessionError(f"{poses.path}: names no session; add --session SESSION.toml")
-        # beside their session are truth files
-        places = (Path(found), poses.path.parent / found)
+        # truth files are in the folder of their session
+        places = (Path(stated), poses.path.parent / stated)
         path = next((place for place in places if place.is_file()), None)
         if path is None:
             raise SessionError(
-                f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
+                f"{poses.path}: its session {stated} is not there; add --session SESSION.toml"
             )
     session = load_session(path, allow_code=allow_code)
     unit = poses.unit or unit

@@ -1,7 +1,7 @@
-"""``mixpose run``, on many recordings here or on a cluster: each in its own process and folder.
+"""``mixpose run`` on many recordings, here or on a cluster, each in a separate process and folder.
 
-A process is the same command with one session, so that a recording gives the same poses alone and
-among others, and none can disturb another.
+A process runs the same command with one session, so that a recording gives the same poses alone
+and among others, and none can disturb another.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ _STATUSES = ("ok", "ambiguous", "lost")
 
 
 def run(request: RunRequest) -> None:
-    """Run one session here, or many in processes of their own, as was asked for."""
-    many, written = request.are_many, request.format_name
+    """Run one session in this process, or several in separate ones."""
+    are_many, written = request.are_many, request.format_name
     if request.labels and written != "jsonl":
         raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
-    if many and (request.publish or request.predict is not None):
+    if are_many and (request.publish or request.predict is not None):
         raise SessionError(
             "--publish: found several sessions; allowed is one, whose poses receivers take for one "
             "recording"
         )
-    if many:
+    if are_many:
         raise typer.Exit(run_sessions(sessions_of(request.sessions), request))
-    from mixpose.cli.run import run_session  # noqa: PLC0415 - many are run elsewhere
+    from mixpose.cli.run import run_session  # noqa: PLC0415 - several run in other processes
 
     if request.workers > 1:
         warn(f"--workers {request.workers}: one session is one process, frames follow each other")
@@ -59,7 +59,7 @@ def run(request: RunRequest) -> None:
 
 
 def sessions_of(named: Sequence[str]) -> list[Path]:
-    """The sessions that arguments name: files, patterns, or text files with one to a line.
+    """Return the sessions that arguments name: files, patterns, or text files with one per line.
 
     Raises SessionError if a pattern matches nothing, or a list cannot be read or is empty.
     """
@@ -67,19 +67,19 @@ def sessions_of(named: Sequence[str]) -> list[Path]:
     for text in named:
         path = Path(text)
         if path.suffix == ".txt":
-            found = _listed(path)
+            paths = _listed(path)
         elif glob.has_magic(text) and not path.exists():
-            found = [Path(each) for each in sorted(glob.glob(text, recursive=True))]  # noqa: PTH207
-            if not found:
+            paths = [Path(name) for name in sorted(glob.glob(text, recursive=True))]  # noqa: PTH207
+            if not paths:
                 raise SessionError(f"{text}: matches no session file")
         else:
-            found = [path]
-        sessions.update(dict.fromkeys(each.absolute() for each in found))
+            paths = [path]
+        sessions.update(dict.fromkeys(name.absolute() for name in paths))
     return list(sessions)
 
 
 def _listed(path: Path) -> list[Path]:
-    """The lines of a list; what is not there from the working folder is sought beside the list."""
+    """Return the paths that a list names, from the working folder or else from that of the list."""
     try:
         content = _beginning(path)
         lines = content.decode("utf-8-sig").splitlines()
@@ -91,7 +91,7 @@ def _listed(path: Path) -> list[Path]:
     names = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not names:
         raise SessionError(f"{path}: names no session; allowed: a session file per line")
-    return [each if (each := Path(name)).exists() else path.parent / name for name in names]
+    return [named if (named := Path(name)).exists() else path.parent / name for name in names]
 
 
 def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
@@ -100,24 +100,24 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
     alone["--pause"] = "" if request.pause else None
     for option, value in alone.items():
         if not value and value != "":
-            continue  # not asked for; empty are the usual port, and an option without a value
+            continue  # not given; an empty text is the usual port, or an option without a value
         if option == "--view" and not value and not sessions[-1].exists():
             raise SessionError(
                 f"{sessions[-1]}: no such session file; after --view allowed are a port, HOST:PORT "
                 "or nothing"
             )
         shown = f" {value[0] if isinstance(value, list) else value}".rstrip()
-        found = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
+        listed = ", ".join(map(str, sessions[:3])) + (", ..." if len(sessions) > 3 else "")
         raise SessionError(
-            f"{option}{shown}: found {len(sessions)} sessions ({found}), allowed with one only"
+            f"{option}{shown}: found {len(sessions)} sessions ({listed}), allowed with one only"
         )
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
-    """Estimate many recordings that are not done yet; say how each went, return the worst status.
+    """Run all recordings that are not done yet; report each, and return the highest exit status.
 
-    Workers count on a cluster only where it is a local one. Raises SessionError if there is no
-    folder for the poses, or an option serves a single recording.
+    The number of workers has no effect on a cluster that is not local. Raises SessionError if there
+    is no folder for the poses, or an option is for a single recording.
     """
     _refuse_alone(sessions, request)
     folder = _folder(request.poses, len(sessions))
@@ -127,18 +127,18 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
     outcomes = {k: outcome for k, outcome in enumerate(before) if outcome is not None}
     if outcomes:
         say(f"{len(outcomes)} of {len(jobs)} recordings are done already")
-    left = [k for k in range(len(jobs)) if k not in outcomes]
+    remaining = [k for k in range(len(jobs)) if k not in outcomes]
     try:
         with _doing(request) as (executor, function):
-            for place, result in executor.run(function, [jobs[k] for k in left]):
-                number = left[place]
+            for place, result in executor.run(function, [jobs[k] for k in remaining]):
+                number = remaining[place]
                 outcomes[number] = _outcome_of(jobs[number], result)
                 say(f"{sessions[number]}: {_line(outcomes[number])}")
     finally:
         ended = [outcomes[k] for k in sorted(outcomes)]
-        # what killed workers left of recordings that others did after them
-        done = {f".{one.name}" for one in ended if one.state == DONE}
-        for part in [each for each in folder.glob(".*.*") if each.stem in done]:
+        # remove what killed workers have left of recordings that others finished
+        done = {f".{outcome.name}" for outcome in ended if outcome.state == DONE}
+        for part in [path for path in folder.glob(".*.*") if path.stem in done]:
             shutil.rmtree(part, ignore_errors=True)
         _write_summary(folder, ended, len(jobs))
     return _say_all(folder, ended)
@@ -146,7 +146,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
 
 @contextmanager
 def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
-    """What does the jobs, and how."""
+    """Yield the executor of the jobs, and the function that it calls for each."""
     workers = request.workers
     if request.scheduler is not None:
         with on_cluster(request.scheduler, workers if workers > 1 else None) as cluster:
@@ -163,7 +163,7 @@ def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
 
 
 def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
-    """How a job ended, also where its workers were lost again and again."""
+    """Return the outcome of a job, a failure if its workers were lost repeatedly."""
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
@@ -191,7 +191,7 @@ def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[J
 
 
 def names_of(sessions: Sequence[Path]) -> list[str]:
-    """A name for each session: its own or its folder's, with as many folders as tell it apart."""
+    """Return distinct names of sessions, of the file or its folder, with more folders as needed."""
     parts = [
         [*session.absolute().parent.parts[1:], *([session.stem] * (session.stem != USUAL_STEM))]
         for session in sessions
@@ -199,7 +199,7 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
     depths = [1] * len(parts)
     while True:
         names = ["-".join(part[-depth:]) for part, depth in zip(parts, depths, strict=True)]
-        counts = Counter(map(str.casefold, names))  # some file systems know no capitals
+        counts = Counter(map(str.casefold, names))  # some file systems ignore case
         twins = [k for k, name in enumerate(names) if counts[name.casefold()] > 1]
         shallow = [k for k in twins if depths[k] < len(parts[k])]
         if not shallow:
@@ -209,12 +209,12 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 
 
 def _options(request: RunRequest) -> tuple[str, ...]:
-    """Of a run of one session."""
+    """Return the options for the run of one session."""
     values = {"format": request.format_name, "step": request.step}
     values |= {"start": request.start, "stop": request.stop}
     flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
-    given = [f"--{name}={value}" for name, value in values.items() if value is not None]
-    return (*given, *(f"--{name}" for name, is_on in flags.items() if is_on))
+    named = [f"--{name}={value}" for name, value in values.items() if value is not None]
+    return (*named, *(f"--{name}" for name, is_on in flags.items() if is_on))
 
 
 def _sha256(session: Path) -> str:
@@ -225,7 +225,7 @@ def _sha256(session: Path) -> str:
 
 
 def _beginning(path: Path) -> bytes:
-    """The bytes of a file, or one more than are allowed where it has more."""
+    """Return the bytes of a file; of too large a file, one more than allowed."""
     with path.open("rb") as file:
         return file.read(MOST_BYTES + 1)
 
@@ -247,19 +247,19 @@ def _folder(folder: Path | None, count: int) -> Path:
 
 
 def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
-    """Raise a SessionError where what is there under the name of a job is of another session."""
+    """Raise SessionError if the folder of a job exists and belongs to another session."""
     for job in jobs:
         for name in (job.name, f".{job.name}.{UNFINISHED}"):
-            there = recording_job.told(folder / name)
-            if there is not None and Path(there.session).resolve() != Path(job.session).resolve():
+            other = recording_job.outcome_in(folder / name)
+            if other is not None and Path(other.session).resolve() != Path(job.session).resolve():
                 raise SessionError(
-                    f"-o {folder}: {name} in it is of {there.session}, not of {job.session}; name "
+                    f"-o {folder}: {name} in it is of {other.session}, not of {job.session}; name "
                     "another folder, or remove that one"
                 )
 
 
 def _line(outcome: Outcome) -> str:
-    """How a recording went."""
+    """Return the result of a recording in words."""
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
     text = frames_text(outcome.frames, outcome.bodies)
@@ -267,13 +267,13 @@ def _line(outcome: Outcome) -> str:
     return text + warnings
 
 
-def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> None:
+def _write_summary(folder: Path, outcomes: Sequence[Outcome], total: int) -> None:
     states = Counter(outcome.state for outcome in outcomes)
     summary = {
-        "recordings": asked,
+        "recordings": total,
         "done": states[DONE],
         "failed": states[FAILED],
-        "not_done": asked - states[DONE] - states[FAILED],
+        "not_done": total - states[DONE] - states[FAILED],
         "results": [asdict(outcome) for outcome in outcomes],
     }
     recording_job.write_json(folder / SUMMARY, summary)
@@ -286,7 +286,7 @@ def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> Non
 
 
 def _say_all(folder: Path, outcomes: Sequence[Outcome]) -> int:
-    """Say how many are done, and once more which failed; the largest exit status."""
+    """Print how many recordings are done and failed; return the highest exit status."""
     failed = [outcome for outcome in outcomes if outcome.state == FAILED]
     done = sum(outcome.state == DONE for outcome in outcomes)
     parts = f"{done} done" + (f", {len(failed)} failed" if failed else "")

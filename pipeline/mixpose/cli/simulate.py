@@ -1,4 +1,4 @@
-"""``mixpose simulate``: a recording with its truth."""
+"""``mixpose simulate``: render a recording with its true poses."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mixpose.simulation import SimulationOptions, simulate
 from mixpose.simulation.session_copy import SESSION_NAME
 
 
-def delays_of(given: list[str]) -> dict[str, float]:
-    """Seconds by sensor, of texts NAME=SECONDS. Raises SessionError if a text is not like that."""
+def delays_of(texts: list[str]) -> dict[str, float]:
+    """Return seconds by sensor from texts NAME=SECONDS; SessionError if a text has another form."""
     delays = {}
-    for text in given:
+    for text in texts:
         name, _, seconds = text.rpartition("=")
         delays[name] = as_number(seconds)
         if not name or not abs(delays[name]) <= LONGEST_DELAY_S:
@@ -31,24 +31,20 @@ def delays_of(given: list[str]) -> dict[str, float]:
 
 def simulate_session(request: SimulateRequest) -> None:
     """Render the recording of a session into a folder."""
-    names = {one.name for one in fields(SimulationOptions)} - {"delay"}
-    given = {name: value for name, value in vars(request).items() if name in names}
-    options = SimulationOptions(**given, delay=delays_of(request.delay or []))
+    names = {entry.name for entry in fields(SimulationOptions)} - {"delay"}
+    values = {name: value for name, value in vars(request).items() if name in names}
+    options = SimulationOptions(**values, delay=delays_of(request.delay or []))
     folder, overwrite = request.output, request.overwrite
     refuse_stdout(folder, "-o", "a recording", "a folder, as -o recording")
     session = load_session(request.session)
-    with bar("simulating", options.frames) as moved:
+    with bar("simulating", options.frames) as tick:
         unused = simulate(
-            session,
-            folder,
-            options,
-            overwrite=overwrite,
-            progress=lambda done: moved(completed=done),
+            session, folder, options, overwrite=overwrite, progress=lambda k: tick(completed=k)
         )
     if unused:
-        typed = {one.name: option_name(one) for one in fields(SimulateRequest)}
-        told = ", ".join(typed[name] for name in unused)
-        warn(f"{told}: no sensor or body of this session has what that is about")
+        typed = {entry.name: option_name(entry) for entry in fields(SimulateRequest)}
+        listed = ", ".join(typed[name] for name in unused)
+        warn(f"{listed}: no sensor or body of this session has what that is about")
     count = counted(options.frames, "frame")
     print(
         f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}", file=sys.stderr

@@ -1,4 +1,4 @@
-"""``mixpose smooth``: pose lines, each with what all frames say."""
+"""``mixpose smooth``: smooth poses by all frames before and after them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 def smooth_poses(request: SmoothRequest) -> None:
     """Smooth the poses of a file and write them.
 
-    Raises RecordingError if they were smoothed before, were foretold, or say too little.
+    Raises RecordingError if they were smoothed before, are predictions, or lack what is needed.
     """
-    path, output = request.poses, output_of(request.output)
+    path, output, fill_s = request.poses, output_of(request.output), request.fill
     poses = read_poses(path)
     if poses.header.get("smoothed"):
         raise RecordingError(
@@ -44,19 +44,19 @@ def smooth_poses(request: SmoothRequest) -> None:
         )
     if output is not None:
         refuse_to_overwrite(output, [path])
-        told = "smoothed poses are JSON lines, of which mixpose convert makes other formats"
-        refuse_suffix(output, (".jsonl", ".json", ".ndjson"), told)
+        hint = "smoothed poses are JSON lines, of which mixpose convert makes other formats"
+        refuse_suffix(output, (".jsonl", ".json", ".ndjson"), hint)
     bodies = {}
     for label in dict.fromkeys(line.label for line in poses.poses):
-        own = [line for line in poses.poses if line.label == label]
-        symmetries = poses.symmetries.get(own[0].object)
+        lines = [line for line in poses.poses if line.label == label]
+        symmetries = poses.symmetries.get(lines[0].object)
         try:
-            bodies[label] = smooth_body(own, symmetries, fill_s=request.fill, motion=request.motion)
+            bodies[label] = smooth_body(lines, symmetries, fill_s=fill_s, motion=request.motion)
         except RecordingError as error:
             raise RecordingError(f"{path}: {error}") from error
     _write(poses, bodies, output)
     for label, body in bodies.items():
-        _tell(label, body, poses.unit)
+        _report(label, body, poses.unit)
     if output is not None:
         count = sum(body.smoothed for body in bodies.values())
         say(f"{counted(count, 'pose')} smoothed -> {output}")
@@ -68,14 +68,14 @@ def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) 
         smoothed={label: _model(body) for label, body in bodies.items()},
     )
     order = {label: k for k, label in enumerate(bodies)}
-    lines = [each for body in bodies.values() for each in body.estimates]
+    lines = [estimate for body in bodies.values() for estimate in body.estimates]
     with Output(path, "jsonl", header, whole=True) as writer:
-        for each in sorted(lines, key=lambda one: (one.frame, order[one.label])):
-            writer.write(each)
+        for estimate in sorted(lines, key=lambda estimate: (estimate.frame, order[estimate.label])):
+            writer.write(estimate)
 
 
 def _model(body: SmoothedBody) -> dict[str, Any]:
-    """How a body was taken to move, for the header."""
+    """Return the model of a body's motion for the header."""
     if body.model is None:
         return {}
     of_lengths, of_turns = np.sqrt(body.model.intensities).tolist()
@@ -91,7 +91,7 @@ def _name(body: SmoothedBody) -> str:
     return next(name for name, order in ORDERS.items() if body.model and order == body.model.order)
 
 
-def _tell(label: str, body: SmoothedBody, unit: str) -> None:
+def _report(label: str, body: SmoothedBody, unit: str) -> None:
     model = body.model
     if model is None:
         warn(f"{label}: too few poses that are ok to tell how it moves; none is smoothed")
@@ -113,13 +113,13 @@ def _tell(label: str, body: SmoothedBody, unit: str) -> None:
             f"{label}: poses scatter more than their covariances say, which are taken "
             f"{model.white:.2g} times as large"
         )
-    told = [
+    counts = [
         (body.decided, "ambiguous frame", "ok by the track"),
         (body.filled, "frame", "filled in, ambiguous and marked"),
     ]
-    for count, what, done in told:
+    for count, noun, result in counts:
         if count:
-            say(f"{label}: {counted(count, what)} {done}")
+            say(f"{label}: {counted(count, noun)} {result}")
     if body.refused:
         numbers = ", ".join(map(str, body.refused[:8])) + (", ..." if len(body.refused) > 8 else "")
         warn(f"{label}: ok, but far off the poses around them, now ambiguous: frames {numbers}")

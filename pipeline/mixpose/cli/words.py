@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and commands that take a record of them."""
+"""Arguments and options of several commands, and commands made from records of their options."""
 
 from __future__ import annotations
 
@@ -36,47 +36,47 @@ def option(
     panel: str | None = None,
     **more: Any,
 ) -> Any:
-    """A field of a record that is an option of a command, needed where the default is `...`.
+    """Return a field of a record that is an option of a command, required if the default is `...`.
 
-    Without a name it is called like the field. `panel` heads a group of options in the help, and
-    typer takes `more`.
+    The name of the option is that of the field unless given. `panel` is the title of its group in
+    the help; `more` goes to typer.
     """
     settings = {"help": meaning, "rich_help_panel": panel, **more}
     metadata = {"name": name, "settings": settings}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
-def option_name(one: Field[Any]) -> str:
-    """What is typed for a field; of a bool, too, for which typer adds one with "no-" otherwise."""
-    return one.metadata.get("name") or f"--{one.name.replace('_', '-')}"
+def option_name(entry: Field[Any]) -> str:
+    """Return the option of a field; named even for a bool, or typer would add one with "no-"."""
+    return entry.metadata.get("name") or f"--{entry.name.replace('_', '-')}"
 
 
-def taking(request: type, work: str) -> Callable[..., None]:
-    """A command whose arguments and options are the fields of a record, and its docstring the help.
+def command_for(request: type, work: str) -> Callable[..., None]:
+    """Make a command with the fields of a record as parameters and its docstring as help.
 
-    The record goes to that ``module:function`` of this room, imported when called. All raise
-    SessionError if the session or an option is wrong, or an output would overwrite something else,
-    and RecordingError if a recording or poses cannot be read. A field `debug` is whether all that
-    is known of errors is wanted, which may be asked of any command.
+    The record is passed to the ``module:function`` `work` of this package, imported when called.
+    All raise SessionError if the session or an option is wrong, or an output would overwrite
+    something else, and RecordingError if a recording or poses cannot be read. A field `debug` takes
+    the value of ``--debug``, which any command has.
     """
     hints: dict[str, Any] = get_type_hints(request, include_extras=True)
-    for one in fields(request):
-        if one.metadata:
-            names = ("-o", "--output") if one.name == "output" else (option_name(one),)
-            hints[one.name] = Annotated[
-                hints[one.name], typer.Option(*names, **one.metadata["settings"])
+    for entry in fields(request):
+        if entry.metadata:
+            names = ("-o", "--output") if entry.name == "output" else (option_name(entry),)
+            hints[entry.name] = Annotated[
+                hints[entry.name], typer.Option(*names, **entry.metadata["settings"])
             ]
     form = signature(request)
     if "debug" in hints:
-        hints["debug"] = typer.Context  # which has it
-    typed = [one.replace(annotation=hints[name]) for name, one in form.parameters.items()]
+        hints["debug"] = typer.Context  # which has the value
+    typed = [p.replace(annotation=hints[name]) for name, p in form.parameters.items()]
 
-    def called(**given: Any) -> None:
+    def command(**values: Any) -> None:
         module, _, name = work.partition(":")
-        if "debug" in given:
-            given["debug"] = bool(given["debug"].obj)
-        getattr(import_module(f"mixpose.cli.{module}"), name)(request(**given))
+        if "debug" in values:
+            values["debug"] = bool(values["debug"].obj)
+        getattr(import_module(f"mixpose.cli.{module}"), name)(request(**values))
 
-    called.__doc__, called.__annotations__ = request.__doc__, hints
-    called.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
-    return called
+    command.__doc__, command.__annotations__ = request.__doc__, hints
+    command.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
+    return command

@@ -1,6 +1,6 @@
-"""Publishing: poses to other programs while they are estimated.
+"""Publish poses to other programs while they are estimated.
 
-A new protocol is one file with its `Sender` and one line in `mixpose.publishing.message`.
+A new protocol is a file with its `Sender` and a line in `mixpose.publishing.message`.
 """
 
 from mixpose.publishing.channel import Publishing as Publishing

@@ -1,4 +1,4 @@
-"""All receivers of a run, each served in a thread of its own: whatever they do, the run goes on."""
+"""Serve the receivers of a run, each in a separate thread, so that none can stop the run."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from mixpose.poses.writing import require_finite
 from mixpose.publishing.message import Address, Message, Sender, TooLargeError, parse, sender_for
 from mixpose.records import Estimate, FrameSet
 
-_REMEMBERED = 10_000  # latencies: a live source may run for days
+_REMEMBERED = 10_000  # latencies kept: a live source may run for days
 
 Foresee = Callable[[Estimate], Estimate]
-"""Makes of an estimate the one that is foretold."""
+"""A function that returns the prediction after an estimate."""
 
 
 @dataclass(frozen=True)
 class PublishingRules:
-    """How long receivers are waited for."""
+    """Limits of what a run keeps and waits for receivers."""
 
     waiting: int = constant(
-        100, "poses for one receiver: a second of a camera that gives 100 frames in it"
+        100, "poses kept for one receiver: one second of a camera of 100 frames a second"
     )
     buffer: int = constant(2**16, "bytes that the system holds of a connection: some 20 poses")
     retry_s: float = constant(
-        0.5, "between attempts to reach a receiver: 50 frames at 100 a second"
+        0.5, "between attempts to connect to a receiver: 50 frames at 100 a second"
     )
-    connect_s: float = constant(2.0, "to reach a receiver: a round trip by satellite takes 0.6 s")
-    farewell_s: float = constant(2.0, "for what still waits at the end: as long as to connect")
+    connect_s: float = constant(2.0, "to connect: a round trip by satellite takes 0.6 s")
+    farewell_s: float = constant(2.0, "for poses that still wait at the end: as long as to connect")
     stuck_s: float = constant(
-        0.25, "in one send: longer takes a receiver that does not read, which no end waits for"
+        0.25, "for one send: a receiver that takes longer does not read, and is not waited for"
     )
 
 
 class Backlog:
-    """Messages in their order; when there are too many, the oldest goes."""
+    """A queue of messages that drops the oldest when it is full."""
 
     def __init__(self, most: int) -> None:
         self._messages = deque[Message]()
@@ -51,7 +51,7 @@ class Backlog:
         self.dropped = 0
 
     def put(self, message: Message) -> None:
-        """Add the newest message, at once."""
+        """Add the newest message without waiting."""
         with self._changed:
             if len(self._messages) == self._most:
                 self._messages.popleft()
@@ -60,7 +60,7 @@ class Backlog:
             self._changed.notify()
 
     def put_back(self, message: Message) -> None:
-        """Add again the one that was taken last, if there is room for it."""
+        """Put the message that was taken last back at the front, if there is room."""
         with self._changed:
             if len(self._messages) == self._most:
                 self.dropped += 1
@@ -68,31 +68,31 @@ class Backlog:
                 self._messages.appendleft(message)
 
     def take(self) -> Message | None:
-        """The oldest message, as soon as there is one; None at the end."""
+        """Wait for a message and return the oldest; None at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._messages or self.has_ended)
             return self._messages.popleft() if self._messages else None
 
     def end(self) -> None:
-        """No further messages come."""
+        """Announce that no further messages come."""
         with self._changed:
             self.has_ended = True
             self._changed.notify_all()
 
-    def waits_for_end(self, seconds: float) -> bool:
-        """Whether the end comes within some seconds."""
+    def wait_for_end(self, seconds: float) -> bool:
+        """Wait at most so many seconds; return whether the end has come."""
         with self._changed:
             return self._changed.wait_for(lambda: self.has_ended, seconds)
 
-    def give_up(self) -> None:
-        """Drop all that is left."""
+    def drop_all(self) -> None:
+        """Drop all remaining messages."""
         with self._changed:
             self.dropped += len(self._messages)
             self._messages.clear()
 
 
 class Channel:
-    """Sends messages to one receiver, and counts and tells what becomes of them."""
+    """Send messages to one receiver in a thread; count and report what becomes of them."""
 
     def __init__(
         self,
@@ -107,33 +107,33 @@ class Channel:
         self._stamped_by: str | None = None
         self._sent = self._unheard = self._too_large = self._failed = 0
         self._is_away = False
-        self._began: float | None = None  # when the send began that goes on
+        self._began: float | None = None  # when the current send began
         self._thread = threading.Thread(target=self._work, name="mixpose-publish", daemon=True)
 
     def start(self) -> None:
-        """Begin to reach the receiver."""
+        """Start the thread, which connects to the receiver."""
         self._thread.start()
 
     def put(self, message: Message) -> None:
-        """Send a message when its turn comes."""
+        """Queue a message, unless it is not ok and only ok poses are to be published."""
         if message.estimate.status == "ok" or self._address.options.get("only") != "ok":
             self._backlog.put(message)
 
     def end(self) -> None:
-        """Nothing more is put."""
+        """Announce that no further messages come."""
         self._backlog.end()
 
     def close(self) -> None:
-        """After the end: send what still waits, but not for long, and let go."""
+        """After the end, send the remaining messages for a limited time, and disconnect."""
         began, rules = self._began, self._rules
         is_stuck = began is not None and time.monotonic() - began > rules.stuck_s
         self._thread.join(0.0 if is_stuck else rules.farewell_s)
         self._sender.close()
         self._thread.join(rules.farewell_s)
-        self._backlog.give_up()
+        self._backlog.drop_all()
 
     def text(self) -> str:
-        """One line: how many poses were sent, dropped, and how late they were."""
+        """Return a line: how many poses were sent and dropped, and their latency."""
         lost = self._sender.dropped
         dropped, sent = self._backlog.dropped + lost, self._sent - lost
         text = f"published to {self._address.text}: {sent} pose{'s' * (sent != 1)}"
@@ -168,10 +168,10 @@ class Channel:
                     )
                 is_connected = False
                 self._sender.close()
-                if self._backlog.waits_for_end(self._rules.retry_s):
-                    self._backlog.give_up()
+                if self._backlog.wait_for_end(self._rules.retry_s):
+                    self._backlog.drop_all()
                 continue
-            except Exception as error:  # of this message alone: the next may go
+            except Exception as error:  # of this message alone: the next may succeed
                 self._began = None
                 self._count_unsent(message, error)
                 continue
@@ -185,7 +185,7 @@ class Channel:
                 self._stamped_by = message.moment.event
 
     def _count_unsent(self, message: Message, error: Exception) -> None:
-        """Count a message that no receiver can get, and tell the first of its kind."""
+        """Count a message that cannot be sent; warn of the first of its kind."""
         is_large = isinstance(error, TooLargeError)
         self._too_large += is_large
         self._failed += not is_large
@@ -200,11 +200,11 @@ class Channel:
 
 
 class Publishing:
-    """Publishes estimates to receivers, which neither slow a run nor end it.
+    """Publish estimates to receivers, which neither slow nor stop the run.
 
-    It tells people lines. Of bodies by whose label there is something to `foresee` by, what that
-    makes of an estimate is published, `ahead_s` later. A `SessionError` if an address is wrong, its
-    package is not installed, or it cannot be listened at.
+    `tell` prints messages. For labels in `foresee` the prediction `ahead_s` after an estimate is
+    published in its place. Raises SessionError if an address is wrong, its package is not
+    installed, or a server cannot listen at it.
     """
 
     def __init__(
@@ -218,9 +218,7 @@ class Publishing:
     ) -> None:
         self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
         addresses = [parse(url) for url in urls]
-        self._channels = [
-            Channel(each, sender_for(each, header), tell, rules) for each in addresses
-        ]
+        self._channels = [Channel(a, sender_for(a, header), tell, rules) for a in addresses]
 
     def __enter__(self) -> Publishing:
         for channel in self._channels:
@@ -239,9 +237,9 @@ class Publishing:
             self._tell(channel.text())
 
     def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
-        """Publish an estimate; a `SessionError` where it is foretold, and has no time."""
+        """Publish an estimate; SessionError if it is to be predicted and has no time."""
         require_finite(estimate)
-        # what tells its offsets holds all that the frame was made from
+        # without `measured`, which refers to all data of the frame
         estimate = replace(estimate, measured=dict)
         foresee = self._foresee.get(estimate.label)
         if foresee is not None:

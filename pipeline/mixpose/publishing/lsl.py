@@ -24,11 +24,11 @@ _FLUSH_S = 0.5  # outlets send in a thread of their own, which ends with them
 
 
 class LslSender(Sender):
-    """An outlet ``lsl://name``; of several bodies ``name-<body>`` for each.
+    """An outlet ``lsl://name``; for several bodies ``name-<body>`` for each.
 
     Channels (float64, irregular rate): x y z in the unit of the session, the quaternion x y z w,
-    the status (0 lost, 1 ambiguous, 2 ok) and the frame number; NaN, as LSL has it, for the pose of
-    a lost frame.  The time of a sample is when its frame was taken, by LSL's own clock.
+    the status (0 lost, 1 ambiguous, 2 ok) and the frame number; NaN, as usual in LSL, for the pose
+    of a lost frame.  The time of a sample is that of its frame by LSL's clock.
     """
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -38,7 +38,7 @@ class LslSender(Sender):
         address.needs("pylsl", "lsl")
         try:
             import pylsl  # noqa: PLC0415 - an extra
-        except RuntimeError as error:  # the package is there, and its library is not
+        except RuntimeError as error:  # the package is installed without its library
             raise address.error(
                 f"liblsl cannot be loaded: {' '.join(str(error).split())}"
             ) from error
@@ -46,7 +46,7 @@ class LslSender(Sender):
         names = {label: f"{address.name}-{label}" for label in header.labels}
         if len(names) == 1:
             names = dict.fromkeys(names, address.name)
-        # from the start, so that receivers find them before the first pose
+        # made now, so that receivers find them before the first pose
         self._outlets = {
             label: pylsl.StreamOutlet(_info(pylsl, name, header)) for label, name in names.items()
         }
@@ -64,14 +64,14 @@ class LslSender(Sender):
         return heard
 
     def close(self) -> None:
-        """Let what was pushed go out, and end the streams."""
+        """Wait until samples are sent, and end the streams."""
         if any(outlet.have_consumers() for outlet in self._outlets.values()):
             time.sleep(_FLUSH_S)
         self._outlets.clear()
 
 
 def _info(pylsl: Any, name: str, header: Header) -> Any:
-    """What an outlet says of its stream."""
+    """Return the description of an outlet's stream."""
     info = pylsl.StreamInfo(
         name, "MoCap", len(_CHANNELS), pylsl.IRREGULAR_RATE, pylsl.cf_double64, f"mixpose-{name}"
     )

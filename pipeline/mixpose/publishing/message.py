@@ -1,4 +1,4 @@
-"""What is published, the addresses it goes to, and the protocols, by the scheme of these."""
+"""Messages that are published, addresses of receivers, and protocols by scheme."""
 
 from __future__ import annotations
 
@@ -20,64 +20,64 @@ from mixpose.records import Estimate, Moment
 
 @dataclass(frozen=True)
 class Address:
-    """An address, taken apart."""
+    """The parts of an address."""
 
     text: str  # for messages: without a password
     scheme: str
-    host: str  # empty where there is none
+    host: str  # empty if there is none
     port: int | None
-    path: str  # without a slash before it or behind it
-    name: str  # host and path as they are written, where they are no host but a name
+    path: str  # without slashes at its ends
+    name: str  # host and path as they are written, for schemes with a name in place of a host
     user: str | None
     password: str | None
-    options: Mapping[str, str]  # what stands behind a question mark
+    options: Mapping[str, str]  # after the question mark
 
     def error(self, reason: str) -> SessionError:
-        """An error about this address."""
+        """Return an error about this address."""
         return SessionError(f"--publish {self.text}: {reason}")
 
     def place(
         self, example: str, port: int | None = None, *, bare: bool = False
     ) -> tuple[str, int]:
-        """Host and port, this port where none is written, or an error that shows an example.
+        """Return host and port, by default `port`; raise an error with an example if none is known.
 
-        `bare` allows nothing behind them.
+        `bare` allows no path.
         """
-        found = self.port or port
+        written = self.port or port
         if bare and self.path:
             raise self.error(f"found {self.path!r} behind host and port; allowed: {example}")
-        if not self.host or found is None:
+        if not self.host or written is None:
             raise self.error(f"found no host and port; allowed: {example}")
         self.require_host(self.host)
-        return self.host, found
+        return self.host, written
 
     def require_host(self, host: str) -> None:
-        """Raise an error for what can be no name of a host, as one with two dots in a row."""
+        """Raise an error for an invalid name of a host, like one with two dots in a row."""
         try:
-            host.encode("idna")  # as systems look it up
+            host.encode("idna")  # as in a look-up
         except UnicodeError:
             raise self.error(
                 f"host: found {host!r}; allowed: a number, or words with a dot between them"
             ) from None
 
     def allow(self, *names: str) -> None:
-        """Raise an error for options other than these, and those that all addresses have."""
-        values = {self.options["only"]} if "only" in self.options else set()
-        checks = ("option", set(self.options), {*names, "only"}), ("only", values, {"ok"})
-        for what, found, allowed in checks:
-            for each in found - allowed:
+        """Raise an error for options other than these and those of all addresses."""
+        only = {self.options["only"]} if "only" in self.options else set()
+        checks = ("option", set(self.options), {*names, "only"}), ("only", only, {"ok"})
+        for kind, values, allowed in checks:
+            for value in values - allowed:
                 listed = ", ".join(sorted(allowed))
-                raise self.error(f"{what}: found {each}; allowed: {listed}")
+                raise self.error(f"{kind}: found {value}; allowed: {listed}")
 
     def needs(self, package: str, extra: str) -> None:
-        """Raise an error that names the extra where a package is not installed."""
+        """Raise an error that names the extra if a package is not installed."""
         require_package(f"--publish {self.text}", package, extra)
 
 
 def parse(url: str) -> Address:
-    """Take an address apart; a `SessionError` if it is none, or of a scheme that is not allowed."""
-    allowed = ", ".join(f"{each}://" for each in SENDERS)
-    # a password is for the receiver, not for those who read what is said
+    """Split an address into its parts; SessionError if it is none, or has an unknown scheme."""
+    allowed = ", ".join(f"{scheme}://" for scheme in SENDERS)
+    # messages must not show the password
     text = re.sub(r"//[^/]*@", "//", url)
     try:
         parts = urlsplit(url, allow_fragments=False)
@@ -106,14 +106,14 @@ def parse(url: str) -> Address:
 
 @dataclass(frozen=True)
 class Message:
-    """An estimate on its way."""
+    """An estimate to be sent."""
 
     estimate: Estimate
-    # when its frame was taken, by `time.monotonic`; None of a recording
+    # when its frame was taken, by `time.monotonic`; None for a recording
     moment: Moment | None = None
-    ahead_s: float = 0.0  # how much later the pose is foretold for
-    # the moment of the pose, s since 1970, the same for all receivers; None of a recording
-    unix_s: float | None = field(init=False, default=None)  # the same for all receivers
+    ahead_s: float = 0.0  # how much later than the frame the pose is predicted for
+    # the time of the pose, s since 1970, the same for all receivers; None for a recording
+    unix_s: float | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         if self.age_s is not None:
@@ -121,17 +121,17 @@ class Message:
 
     @property
     def age_s(self) -> float | None:
-        """Seconds from the moment that the pose is of to now; negative if it is to come."""
+        """Seconds from the time of the pose to now; negative if it is in the future."""
         return None if self.moment is None else self.late_s - self.ahead_s
 
     @property
     def late_s(self) -> float:
-        """Seconds from the moment of the frame to now; 0 of a recording."""
+        """Seconds from the time of the frame to now; 0 for a recording."""
         return 0.0 if self.moment is None else time.monotonic() - self.moment.seconds
 
     @cached_property
     def text(self) -> str:
-        """The pose line, and in it when the frame was taken, without an end of line."""
+        """The pose line with the time of its frame, without a line end."""
         line = pose_line(self.estimate)
         if self.moment is not None:
             line["stamp_s"], line["stamp_of"] = self.unix_s, self.moment.event
@@ -141,48 +141,47 @@ class Message:
 
 
 def header_text(header: Header) -> str:
-    """The header line, without an end of line."""
+    """Return the header line without a line end."""
     return json.dumps(header_line(header), allow_nan=False)
 
 
 def path_word(label: str) -> str:
-    """What a body is called in topics and paths, which allow few characters."""
+    """Return the name of a body in topics and paths, which allow few characters."""
     word = re.sub(r"\W", "_", label, flags=re.ASCII)
     return f"_{word}" if word[:1].isdigit() else word
 
 
 def path_words(labels: Sequence[str]) -> Mapping[str, str]:
-    """What bodies are called in topics and paths, by label; no two are alike."""
+    """Return distinct names of bodies in topics and paths, by label."""
     return dict(zip(labels, distinct(labels, path_word), strict=True))
 
 
 class TooLargeError(Exception):
-    """What a protocol cannot carry: how large it is and what to do, in words."""
+    """A message is too large for a protocol; the text says how large, and what to do."""
 
 
 class Sender:
-    """Sends poses by one protocol.
+    """Send poses by one protocol.
 
-    It is made with an `Address` and the `Header` of the run, and refuses with a `SessionError` what
-    is wrong about them. All else is called in a thread of its own, so that it may wait; an
-    `OSError` says that the receiver is not there, or has gone away, a `TooLargeError` that no
-    receiver can get this pose.
+    It is made from an `Address` and the `Header` of the run, and raises SessionError if they are
+    wrong. Other methods run in a separate thread and may wait; an OSError says that the receiver is
+    not there or has gone, a `TooLargeError` that no receiver can get this pose.
     """
 
-    dropped = 0  # of the poses that were handed to it those that no receiver got
+    dropped = 0  # poses passed to `send` that reached no receiver
 
     def connect(self) -> None:
-        """Reach the receiver, where it does not come by itself; again after it was away."""
+        """Connect to the receiver, if the protocol needs it; again after it was away."""
 
     def send(self, message: Message) -> bool:
-        """Send a pose, and return whether anybody was there to hear it."""
+        """Send a pose; return whether there was any receiver."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Let go of the receiver.  Called from another thread, it ends a `send` that waits."""
+        """Disconnect.  Called from another thread, it ends a `send` that waits."""
 
 
-# module and what makes a sender there: only what is asked for is loaded
+# module and class or function that makes a sender; only those in use are imported
 SENDERS: Mapping[str, str] = {
     "udp": "sockets:UdpSender",
     "tcp": "sockets:TcpSender",
@@ -195,7 +194,7 @@ SENDERS: Mapping[str, str] = {
 
 
 def sender_for(address: Address, header: Header) -> Sender:
-    """What sends the poses of a run, or a `SessionError` that says why it cannot."""
+    """Return the sender of a run's poses to an address; SessionError if it cannot be made."""
     module, _, name = SENDERS[address.scheme].partition(":")
     make: Callable[[Address, Header], Sender] = getattr(
         import_module(f"mixpose.publishing.{module}"), name

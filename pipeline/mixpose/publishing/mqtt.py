@@ -1,4 +1,4 @@
-"""MQTT 3.1.1 by paho, for what hangs on a broker."""
+"""MQTT 3.1.1 by paho, for receivers that are connected to a broker."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 _PORT = 1883
 _HEADER = "header"  # its topic, which no body has
-_LOOK_S = 0.2  # how often to see, while a message waits, that the broker is still there
+_LOOK_S = 0.2  # between tests of the connection while a message waits
 
 
 class MqttSender(Sender):
-    """Publishes pose lines to ``mqtt://user:password@host:port/topic``, topics ``topic/<body>``.
+    """Publish pose lines to ``mqtt://user:password@host:port/topic``, topics ``topic/<body>``.
 
-    Quality of service 0: at most once, as what is late is of no use.  ``topic/header`` is retained.
+    Quality of service 0, at most once, as late poses are useless.  ``topic/header`` is retained.
     """
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -68,7 +68,7 @@ class MqttSender(Sender):
         self._publish(_HEADER, self._header, retain=True)
 
     def send(self, message: Message) -> bool:
-        """Publish the line of one body, and wait until it is on its way."""
+        """Publish the line of one body, and wait until it is sent."""
         self._publish(self._words[message.estimate.label], message.text)
         return True
 
@@ -85,7 +85,7 @@ class MqttSender(Sender):
             raise ConnectionError("the broker has gone")
 
     def close(self) -> None:
-        """Disconnect; where a message waits for a broker that does not read, by force."""
+        """Disconnect; by force if a message waits for a broker that does not read."""
         if self._client is None:
             return
         connection = self._client.socket()

@@ -1,7 +1,7 @@
-"""ROS 2: by rclpy where ROS is installed, else by a rosbridge.
+"""ROS 2: by rclpy if ROS is installed, else by a rosbridge.
 
-rclpy comes with ROS and with no package index.  A rosbridge is JSON over a WebSocket, where ROS is
-on another machine or in a container:
+rclpy comes with ROS only, and is in no package index.  A rosbridge takes JSON over a WebSocket, for
+ROS on another machine or in a container:
 https://github.com/RobotWebTools/rosbridge_suite/blob/ros2/ROSBRIDGE_PROTOCOL.md
 """
 
@@ -30,7 +30,7 @@ _DEPTH = 10  # of the queues of publishers, as in ROS's examples
 
 
 def ros2_sender(address: Address, header: Header) -> Sender:
-    """What publishes to ``ros2://topic``; by a bridge where that says ``?bridge=host:port``."""
+    """Return the sender for ``ros2://topic``; by a bridge for ``?bridge=host:port``."""
     address.allow("bridge", "frame")
     if "bridge" in address.options or find_spec("rclpy") is None:
         return RosbridgeSender(address, header)
@@ -38,22 +38,22 @@ def ros2_sender(address: Address, header: Header) -> Sender:
 
 
 class Topics(NamedTuple):
-    """Topics of the poses of a run, and the frame that they are in."""
+    """Topics of the poses of a run, and their reference frame."""
 
     poses: Mapping[str, str]  # by label of a body
-    frames: Mapping[str, str]  # likewise, the frames of bodies in transforms
+    frames: Mapping[str, str]  # by label, the frames of bodies in transforms
     unit: str
     frame_id: str
 
     @property
     def kinds(self) -> dict[str, str]:
-        """What kind of messages go to each topic, transforms last."""
+        """The kind of messages by topic, transforms last."""
         kinds = dict.fromkeys(self.poses.values(), "geometry_msgs/msg/PoseWithCovarianceStamped")
         return {**kinds, TRANSFORMS: "tf2_msgs/msg/TFMessage"}
 
 
 def topics(address: Address, header: Header) -> Topics:
-    """Topics by ``ros2://topic``, of several bodies one each below it, or a `SessionError`."""
+    """Return the topics by ``ros2://topic``, one per body below it if there are several."""
     names = address.name.split("/")
     if not all(part == path_word(part) and part for part in names):
         raise address.error(
@@ -68,8 +68,8 @@ def topics(address: Address, header: Header) -> Topics:
     return Topics(poses, words, header.unit, address.options.get("frame", "world"))
 
 
-def ros_messages(message: Message, to: Topics) -> list[tuple[str, dict[str, Any]]]:
-    """The pose of a message and its transform, in metres, fields by topic; none of a lost frame.
+def ros_messages(message: Message, targets: Topics) -> list[tuple[str, dict[str, Any]]]:
+    """Return pose and transform of a message, in metres, as topics and fields; none if lost.
 
     The stamp is when the frame was taken: Unix time of a live source, the time of a recording's
     frame or, without times, its number.
@@ -79,21 +79,21 @@ def ros_messages(message: Message, to: Topics) -> list[tuple[str, dict[str, Any]
         return []
     recorded = estimate.frame if estimate.time_s is None else estimate.time_s
     seconds = float(recorded if message.unix_s is None else message.unix_s)
-    fields = pose_message(estimate, to.unit, seconds, to.frame_id)
+    fields = pose_message(estimate, targets.unit, seconds, targets.frame_id)
     pose = fields["pose"]["pose"]
     transform = {
         "header": fields["header"],
-        "child_frame_id": to.frames[estimate.label],
+        "child_frame_id": targets.frames[estimate.label],
         "transform": {"translation": pose["position"], "rotation": pose["orientation"]},
     }
     return [
-        (to.poses[estimate.label], fields),
+        (targets.poses[estimate.label], fields),
         (TRANSFORMS, {"transforms": [transform]}),
     ]
 
 
 class RosNodeSender(Sender):
-    """A node ``mixpose`` that publishes to the topics of ``ros2://topic``."""
+    """Publish to the topics of ``ros2://topic`` from a node ``mixpose``."""
 
     def __init__(self, address: Address, header: Header) -> None:
         self._topics = topics(address, header)
@@ -111,7 +111,7 @@ class RosNodeSender(Sender):
         """Publish the pose of one body and its transform."""
         for topic, fields in ros_messages(message, self._topics):
             self._publishers[topic].publish(_filled(self._kinds[topic](), fields))
-        return any(one.get_subscription_count() for one in self._publishers.values())
+        return any(publisher.get_subscription_count() for publisher in self._publishers.values())
 
     def close(self) -> None:
         """End the node."""
@@ -120,19 +120,19 @@ class RosNodeSender(Sender):
 
 
 def _type(kind: str) -> Any:
-    """The class of a message, ``package/msg/Name``."""
+    """Return the class of a message, ``package/msg/Name``."""
     package, _, name = kind.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def _filled(message: Any, fields: dict[str, Any]) -> Any:
-    """A message with its fields set, those of its parts too."""
+    """Set the fields of a message and of its parts; return it."""
     for name, value in fields.items():
         if isinstance(value, dict):
             _filled(getattr(message, name), value)
         elif isinstance(value, list) and value and isinstance(value[0], dict):
-            made = _type("geometry_msgs/msg/TransformStamped")
-            setattr(message, name, [_filled(made(), each) for each in value])
+            message_type = _type("geometry_msgs/msg/TransformStamped")
+            setattr(message, name, [_filled(message_type(), entry) for entry in value])
         elif isinstance(value, list):
             setattr(message, name, array.array("d", value))
         else:
@@ -141,7 +141,7 @@ def _filled(message: Any, fields: dict[str, Any]) -> Any:
 
 
 class RosbridgeSender(Sender):
-    """Publishes to the topics of ``ros2://topic?bridge=host:port``."""
+    """Publish to the topics of ``ros2://topic?bridge=host:port``."""
 
     def __init__(self, address: Address, header: Header) -> None:
         address.needs("websockets", "ros2")
@@ -181,14 +181,14 @@ class RosbridgeSender(Sender):
 
         assert self._connection is not None
         with suppress(TimeoutError, ConnectionClosed):
-            # the bridge says something only where it refuses
+            # the bridge answers only to refuse
             answer = json.loads(self._connection.recv(timeout=0))
             if answer.get("op") == "status" and answer.get("level") == "error":
                 raise ConnectionError(f"the rosbridge refuses: {answer.get('msg')}")
         return True
 
     def close(self) -> None:
-        """Close the connection; where a send waits, for which its lock is held, by force."""
+        """Close the connection; by force if a send waits, which holds its lock."""
         if self._connection is None:
             return
         if self._is_sending:
@@ -196,13 +196,13 @@ class RosbridgeSender(Sender):
         else:
             self._connection.close()
 
-    def _say(self, what: dict[str, Any]) -> None:
+    def _say(self, operation: dict[str, Any]) -> None:
         from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
         assert self._connection is not None
         self._is_sending = True
         try:
-            self._connection.send(json.dumps(what, allow_nan=False))
+            self._connection.send(json.dumps(operation, allow_nan=False))
         except ConnectionClosed as error:
             raise ConnectionError("the rosbridge has gone") from error
         finally:

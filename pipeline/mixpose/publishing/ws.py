@@ -21,40 +21,40 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
-_QUIET = logging.Logger("mixpose", logging.CRITICAL)  # who connects and then does not is no news
+_QUIET = logging.Logger("mixpose", logging.CRITICAL)  # failed connections are not reported
 
 
 @dataclass(eq=False)
 class _Line:
-    """A pose, and what became of it."""
+    """A pose line and its delivery."""
 
     text: str
-    waiting: int  # clients that it waits for
-    has_arrived: bool = False  # at any of them
+    waiting: int  # clients that are still to get it
+    has_arrived: bool = False  # at any client
 
 
 @dataclass(eq=False)
 class _Client:
-    """What waits for one browser."""
+    """The lines that wait for one browser."""
 
     connection: ServerConnection
     waiting: deque[_Line] = field(default_factory=deque)
     sending: _Line | None = None
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     has_gone: bool = False
-    began: float = 0.0  # when the send began that goes on
+    began: float = 0.0  # when the current send began
 
     def is_stuck(self) -> bool:
-        """Whether it does not read."""
+        """Test whether the browser does not read."""
         now = asyncio.get_running_loop().time()
         return self.sending is not None and now - self.began > PublishingRules.stuck_s
 
 
 class WebSocketSender(Sender):
-    """Listens at ``ws://host:port/path``; who connects there gets the header and further lines.
+    """Listen at ``ws://host:port/path``; clients get the header and all further lines.
 
-    Each gets what it is quick enough for.  Who asks for another path is refused, so that a path
-    that nobody guesses keeps others out.
+    A slow client misses lines.  Requests for other paths are refused, so that a path that nobody
+    can guess keeps others out.
     """
 
     def __init__(self, address: Address, header: Header) -> None:
@@ -66,7 +66,7 @@ class WebSocketSender(Sender):
         try:
             kind = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._socket = socket.create_server((host, port), family=kind)
-            keep_little(self._socket)  # and so do the connections that it takes
+            keep_little(self._socket)  # accepted connections inherit it
         except OSError as error:
             raise address.error(
                 f"cannot be listened at: {error.strerror}; name a free port of this machine"
@@ -78,29 +78,29 @@ class WebSocketSender(Sender):
         self._thread.start()
 
     def send(self, message: Message) -> bool:
-        """Hand a line to all who are there."""
+        """Queue a line for all clients."""
         if not self._clients:
             return False
         self._loop.call_soon_threadsafe(self._hand_out, message.text)
         return True
 
     def close(self) -> None:
-        """Let what waits go out, and stop listening."""
+        """Send the waiting lines, and stop listening."""
         with suppress(RuntimeError):  # closed already
             self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join(2 * PublishingRules.farewell_s)
 
     def _hand_out(self, text: str) -> None:
         line = _Line(text, len(self._clients))
-        self.dropped += not line.waiting  # all have gone meanwhile
+        self.dropped += not line.waiting  # all clients have gone meanwhile
         for client in self._clients:
             if len(client.waiting) == PublishingRules.waiting:
-                self._let_go(client.waiting.popleft())
+                self._release(client.waiting.popleft())
             client.waiting.append(line)
             client.changed.set()
 
-    def _let_go(self, line: _Line) -> None:
-        """One client less has a line to come; it is dropped if it came to none."""
+    def _release(self, line: _Line) -> None:
+        """Count one client less for a line; it is dropped if it reached none."""
         line.waiting -= 1
         self.dropped += not (line.waiting or line.has_arrived)
 
@@ -115,15 +115,15 @@ class WebSocketSender(Sender):
             self._serve_one,
             sock=self._socket,
             process_request=self._refuse_other_paths,
-            compression=None,  # takes longer than the way
+            compression=None,  # which takes longer than it saves
             close_timeout=PublishingRules.farewell_s,
             logger=_QUIET,
         ):
             await self._end.wait()
             deadline = self._loop.time() + PublishingRules.farewell_s
-            # for what is still to be sent to those who read
+            # until all waiting lines are sent to clients that read
             while self._loop.time() < deadline and any(
-                one.waiting or one.sending for one in self._clients if not one.is_stuck()
+                c.waiting or c.sending for c in self._clients if not c.is_stuck()
             ):
                 await asyncio.sleep(0.01)
             for client in self._clients:
@@ -152,7 +152,7 @@ class WebSocketSender(Sender):
                     client.began, client.sending = self._loop.time(), client.waiting.popleft()
                     await connection.send(client.sending.text)
                     client.sending.has_arrived = True
-                    self._let_go(client.sending)
+                    self._release(client.sending)
                     client.sending = None
         except ConnectionClosed:
             return
@@ -160,12 +160,12 @@ class WebSocketSender(Sender):
             self._clients.discard(client)
             for line in (client.sending, *client.waiting):
                 if line is not None:
-                    self._let_go(line)
+                    self._release(line)
             reading.cancel()
 
 
 async def _heed(connection: ServerConnection, client: _Client) -> None:
-    """Read what a client says, so that answers to pings are not held up behind it, to its end."""
+    """Read and drop what a client sends until it goes, so that pings are answered in time."""
     async for _ in connection:
         pass
     client.has_gone = True

@@ -1,9 +1,9 @@
-"""Where the page of a run is, and who may open it.
+"""The address of the page of a run, and access to it.
 
-Where only this machine can open it, a page of another site must not either: a browser lets any
-site open connections to the loopback interface, and names whoever asks in ``Origin``; a name of
-another site that is made to lead here (DNS rebinding) stands in ``Host``.  Where others can open
-it, the address that the run told holds a token, which is kept in a cookie from then on.
+If only this machine can open the page, scripts of other sites must not: a browser lets any site
+connect to the loopback interface, but names that site in ``Origin``; a name of another site that
+is made to lead here (DNS rebinding) is in ``Host``.  If other machines can open it, the printed
+address has a token, which a cookie keeps from then on.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _TEXT = re.compile(r"(?:(?P<host>[^:\[\]\s]+|\[[0-9A-Fa-f:.]+\]):)?(?P<port>[0-9
 
 @dataclass(frozen=True)
 class Place:
-    """A listening socket, and who may open what it serves."""
+    """A listening socket, and the token that a browser needs."""
 
-    socket: socket.socket  # bound and listening: a browser that is early waits
-    token: str | None  # what the address has to hold; None where only this machine can open it
+    socket: socket.socket  # bound and listening: an early browser waits
+    token: str | None  # part of the address; None if only this machine can open it
 
     @property
     def port(self) -> int:
@@ -43,9 +43,9 @@ class Place:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         host = str(self.socket.getsockname()[0])
-        if ipaddress.ip_address(host).is_unspecified:  # every network: a name that others know
+        if ipaddress.ip_address(host).is_unspecified:  # all networks: name this machine instead
             host = socket.gethostname()
         host = f"[{host}]" if ":" in host else host
         query = "" if self.token is None else f"?token={self.token}"
@@ -53,23 +53,23 @@ class Place:
 
 
 def listen(text: str) -> Place:
-    """Listen where ``--view`` says: at ``PORT`` or ``HOST:PORT``.
+    """Listen at the ``PORT`` or ``HOST:PORT`` of ``--view``.
 
-    Empty, that is `USUAL_PORT` of the loopback interface, or any that is free where that one is
-    taken. A `SessionError` if it is neither, or nothing can listen there.
+    An empty text is `USUAL_PORT` of the loopback interface or, if that is taken, any free port.
+    Raises SessionError if the text has another form, or the port cannot be used.
     """
     if not text:
         try:
             return _listen(LOOPBACK, USUAL_PORT)
         except OSError:
             text = "0"
-    found = _TEXT.fullmatch(text)
-    if found is None or int(found["port"]) > _LAST_PORT:
+    match = _TEXT.fullmatch(text)
+    if match is None or int(match["port"]) > _LAST_PORT:
         raise SessionError(f"--view {text}: found no port; {_ALLOWED}")
-    host, port = (found["host"] or LOOPBACK).strip("[]"), int(found["port"])
+    host, port = (match["host"] or LOOPBACK).strip("[]"), int(match["port"])
     try:
         return _listen(host, port)
-    except UnicodeError as error:  # of names that can be no host, as one with two dots in a row
+    except UnicodeError as error:  # of invalid names, like those with two dots in a row
         raise SessionError(f"--view {text}: found no host {host!r}; {_ALLOWED}") from error
     except OSError as error:
         reason = error.strerror or str(error)
@@ -88,7 +88,7 @@ def _listen(host: str, port: int) -> Place:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a request gets in place of the page."""
+    """A reply to a request in place of the page."""
 
     text: str
     status: HTTPStatus = HTTPStatus.FORBIDDEN
@@ -97,13 +97,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class Guard:
-    """Tells requests that may pass from others."""
+    """Decide which requests may reach the page."""
 
-    port: int  # of the page; cookies do not tell ports apart
-    token: str | None  # None: only this machine can open it
+    port: int  # of the page; part of the cookie's name, as cookies are shared by all ports
+    token: str | None  # None if only this machine can open it
 
     def answer(self, target: str, headers: Mapping[str, str]) -> Answer | None:
-        """What a request for a path and query gets in place of the page; None where it may pass."""
+        """Return the reply to a request in place of the page; None if it may pass."""
         host = headers.get("Host", "")
         if self.token is None and not _is_loopback(host):
             return Answer(f"Open http://127.0.0.1:{self.port}/ on the machine itself.\n")
@@ -121,7 +121,7 @@ class Guard:
         return Answer("Open the whole address that the run has told, with its token.\n")
 
     def _is_token(self, text: str) -> bool:
-        # in a time that does not tell how much of it is right
+        # in constant time, which does not show how many characters are right
         return secrets.compare_digest(text.encode(), (self.token or "").encode())
 
 
@@ -137,6 +137,6 @@ def _is_loopback(host: str) -> bool:
 
 
 def _cookie(text: str, name: str) -> str:
-    # `http.cookies` gives up all of them where one, of another service, is not as it should be
+    # `http.cookies` rejects all cookies if one, of another service, is malformed
     pairs = (part.partition("=") for part in text.split(";"))
     return next((value.strip() for key, _, value in pairs if key.strip() == name), "")

@@ -1,4 +1,4 @@
-"""What passes from the run to the page, a `Moment` or None at the end, and back."""
+"""Messages between run and page: a `Moment`, or None at the end, and a `PageMessage` back."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from mixpose.records import Estimate, Floats, RawFrame, Status
 
 @dataclass(frozen=True)
 class Pace:
-    """How often, and how much, the page is told."""
+    """Limits of what is drawn on the page, and of waiting for browsers."""
 
     most_per_second: float = constant(
-        20.0, "a motion seems to flow from about 16 pictures a second on"
+        20.0, "moments: a motion looks smooth from about 16 pictures a second on"
     )
     share: float = constant(
-        0.5, "of its time that the page draws: the rest of that processor is the run's"
+        0.5, "of its time that the page draws: the run has the other half of that processor"
     )
     history: int = constant(600, "frames in plots: about as many as a plot has pixels across")
-    trail: int = constant(200, "frames of a trail: longer ones hide the scene they are in")
+    trail: int = constant(200, "frames of a trail: longer ones hide the scene")
     patience_s: float = constant(
         30.0, "that a run on files waits for a browser: time to copy the address"
     )
     parting_s: float = constant(
         30.0,
-        "that the page outlives the run while somebody looks: a slow browser has drawn the last "
-        "frame by then, and one that is forgotten does not keep a script for ever",
+        "that the page stays open after the run: a slow browser has drawn the last frame by then, "
+        "and a forgotten one does not keep a script for ever",
     )
 
 
@@ -39,52 +39,51 @@ PACE = Pace()
 
 @dataclass(frozen=True)
 class Row:
-    """One frame in plots and trails: all that is kept of frames that are not shown."""
+    """One frame in plots and trails, kept also for frames that are not shown."""
 
     frame: int
     statuses: tuple[Status, ...]  # of the bodies, in the session's order
-    places: tuple[Floats | None, ...]  # likewise their origins (3,) in the world
-    # the largest `rms` of a sensor over the bodies, by its name; none where nothing was met
+    places: tuple[Floats | None, ...]  # origins of the bodies (3,) in the world
+    # the largest `rms` over the bodies, by name of the sensor; without sensors that met nothing
     residuals: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A sensor's frame as the page has it."""
+class ShownFrame:
+    """A sensor's frame on the page."""
 
-    frame: RawFrame | None  # None where the sensor has none
-    zoom: float = 1.0  # by which its image was shrunk
-    found: Floats | None = None  # features (M, 2), in pixels of the sensor
+    frame: RawFrame | None  # None if the sensor has none
+    zoom: float = 1.0  # scale of its image, shrunk for the page
+    features: Floats | None = None  # (M, 2), in pixels of the sensor
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame that is shown, with what has been since the one before."""
+    """A frame that is shown, with rows of the frames since the previous moment."""
 
     estimates: tuple[Estimate, ...]  # of all bodies
-    sensors: Mapping[str, Shown]
-    # of frames since the last moment and of this one, the newest `Pace.history`
+    sensors: Mapping[str, ShownFrame]
+    # of frames since the previous moment and of this one, the newest `Pace.history`
     rows: tuple[Row, ...]
-    counts: Mapping[Status, int] = field(default_factory=dict)  # poses so far
-    per_second: float = float("nan")  # frames estimated in a second, lately
+    counts: Mapping[Status, int] = field(default_factory=dict)  # number of poses so far
+    per_second: float = float("nan")  # rate of frames in the last seconds
 
 
-Wish: TypeAlias = Literal["next", "pause", "go on", "step"] | int
-"""What the page asks of the run: another moment, what was clicked; or its number of browsers."""
+PageMessage: TypeAlias = Literal["next", "pause", "go on", "step"] | int
+"""A message of the page: a request for the next moment, a click, or the number of browsers."""
 
 
 def row_of(estimates: tuple[Estimate, ...]) -> Row:
-    """What plots and trails keep of a frame."""
+    """Return the row of a frame for plots and trails."""
     residuals: dict[str, float] = {}
     for estimate in estimates:
         for name, report in estimate.sensors.items():
             if report.rms is not None and np.isfinite(report.rms):
                 residuals[name] = max(report.rms, residuals.get(name, 0.0))
+    poses = [estimate.T_world_object for estimate in estimates]
     return Row(
         estimates[0].frame,
-        tuple(one.status for one in estimates),
-        tuple(
-            None if one.T_world_object is None else one.T_world_object[:3, 3] for one in estimates
-        ),
+        tuple(estimate.status for estimate in estimates),
+        tuple(None if T is None else T[:3, 3] for T in poses),
         residuals,
     )

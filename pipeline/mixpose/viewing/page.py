@@ -1,4 +1,4 @@
-"""What is on the page: pictures of the sensors, status, plots, buttons, and the scene in space."""
+"""The page: pictures of the sensors, status, plots, buttons, and the scene in space."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for,
 from mixpose.records import Estimate, Status
 from mixpose.sensors import CloudSensor
 from mixpose.session import SensorSetup, Session
-from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, ShownFrame
 from mixpose.viewing.scene import MAGNIFICATIONS, Scene
 
 _SENSORS_PX, _CONTROL_PX = 460, 380
@@ -29,13 +29,13 @@ _INK = "#bbbbbb"
 
 
 class Page:
-    """The page of a run; `wish` asks that to pause, go on or step, and is None where it cannot."""
+    """The page of a run; `send` asks the run to pause, go on or step; None if it cannot."""
 
     def __init__(
         self,
         server: viser.ViserServer,
         session: Session,
-        wish: Callable[[Wish], None] | None,
+        send: Callable[[PageMessage], None] | None,
         *,
         paused: bool = False,
     ) -> None:
@@ -43,7 +43,7 @@ class Page:
         self._session = session
         self._last: Moment | None = None
         self._buttons: tuple[viser.GuiButtonHandle, ...] = ()
-        self._lock = threading.RLock()  # what is clicked comes from other threads
+        self._lock = threading.RLock()  # clicks come from other threads
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"mixpose: {session.path.name}")
         self._pictures = self._add_pictures()
@@ -51,8 +51,8 @@ class Page:
         main.dock_right()
         main.set_width(_CONTROL_PX)
         self._status = server.gui.add_html("<p>waiting for the first frame</p>")
-        if wish is not None:
-            self._add_buttons(wish, paused)
+        if send is not None:
+            self._add_buttons(send, paused)
         self._series = Series(server.gui, session)
         self._scene = Scene(server, session)
         self._magnified = server.gui.add_dropdown(
@@ -63,13 +63,13 @@ class Page:
         self._magnified.on_update(self._on_magnified)
 
     def show(self, moment: Moment) -> None:
-        """Show a frame; browsers that are behind get the newest only."""
+        """Show a frame; slow browsers get only the newest."""
         with self._lock:
             self._last = moment
             posed = with_bodies(self._session, moment.estimates)
             with self._server.atomic():
                 for setup in self._session.sensors:
-                    shown = moment.sensors.get(setup.name, Shown(None))
+                    shown = moment.sensors.get(setup.name, ShownFrame(None))
                     drawn = self._draw(posed, setup, shown)
                     self._pictures[setup.name].image = drawn[:, :, ::-1]
                 self._status.content = status_text(moment)
@@ -80,7 +80,7 @@ class Page:
                     self._magnified.value = f"× {self._scene.magnification}"
 
     def end(self) -> None:
-        """Say that this was the last frame."""
+        """Show that this was the last frame, and remove the buttons."""
         if self._last is not None:
             self._status.content = status_text(self._last, ended=True)
         for button in self._buttons:
@@ -88,7 +88,7 @@ class Page:
         self._server.flush()
 
     def _draw(
-        self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: Shown
+        self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: ShownFrame
     ) -> Picture:
         if isinstance(setup.sensor, CloudSensor):
             picture = np.zeros((60, 320, 3), np.uint8)
@@ -96,10 +96,10 @@ class Page:
             return picture
         if setup.sensor.dimension != 2:
             return stacked(draw_strips(posed, setup, shown.frame))
-        cameras = sum(one.sensor.dimension == 2 for one in self._session.sensors)
+        cameras = sum(other.sensor.dimension == 2 for other in self._session.sensors)
         picture, part = backdrop(setup, shown.frame, room_for(cameras) if shown.zoom == 1 else None)
         part = replace(part, zoom=part.zoom * shown.zoom)
-        picture = draw_camera(posed, setup, picture, part, shown.found)
+        picture = draw_camera(posed, setup, picture, part, shown.features)
         if shown.frame is None:
             words(picture, "no frame", (10, picture.shape[0] - 10), GREY)
         return picture
@@ -118,7 +118,7 @@ class Page:
         panel.set_width(_SENSORS_PX)
         return pictures
 
-    def _add_buttons(self, wish: Callable[[Wish], None], paused: bool) -> None:
+    def _add_buttons(self, send: Callable[[PageMessage], None], paused: bool) -> None:
         gui = self._server.gui
         self._buttons = pause, go_on, step = (
             gui.add_button("Pause", hint="The run waits after this frame.", visible=not paused),
@@ -126,10 +126,10 @@ class Page:
             gui.add_button("Step", hint="One frame, then wait."),
         )
 
-        def on(button: viser.GuiButtonHandle, what: Wish) -> None:
+        def on(button: viser.GuiButtonHandle, action: PageMessage) -> None:
             def clicked(_: object) -> None:
-                pause.visible, go_on.visible = what == "go on", what != "go on"
-                wish(what)
+                pause.visible, go_on.visible = action == "go on", action != "go on"
+                send(action)
 
             button.on_click(clicked)
 
@@ -145,19 +145,19 @@ class Page:
 
 
 def status_text(moment: Moment, *, ended: bool = False) -> str:
-    """What the page says about a frame, as HTML; names of the session are only ever words in it."""
+    """Return the status of a frame as HTML; names of the session are escaped."""
     first = moment.estimates[0]
     when = "" if first.time_s is None else f", {first.time_s:.3f} s"
     counts = ", ".join(f"{moment.counts.get(s, 0)} {_coloured(s)}" for s in STATUS_COLOURS)
     speed = f"{moment.per_second:.3g} frames a second" if moment.per_second else "one at a time"
     speed = "done" if ended else speed
     rows = ""
-    for one in moment.estimates:
-        confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
-        doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
+    for estimate in moment.estimates:
+        confidence = "" if estimate.confidence is None else f"{estimate.confidence:.4f}"
+        doubt = f" title='{html.escape(estimate.doubt, quote=True)}'" if estimate.doubt else ""
         rows += (
-            f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status)}</td>"
-            f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
+            f"<tr{doubt}><td>{html.escape(estimate.label)}</td><td>{_coloured(estimate.status)}</td>"
+            f"<td>{confidence}</td><td>{estimate.score:.2f}</td></tr>"
         )
     return (
         f"<div style='padding: 0 0.8em; font-size: 0.9em'><b>frame {first.frame}</b>{when}"
@@ -173,7 +173,7 @@ def _coloured(status: Status) -> str:
 
 
 class Series:
-    """Plots that go along with a run; residuals that are lengths have one of their own."""
+    """Plots of a run over time; residuals in px and in lengths have separate plots."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._rows: deque[Row] = deque(maxlen=PACE.history)
@@ -181,14 +181,14 @@ class Series:
         self._status = _plot(gui, "bodies by status", list(STATUS_COLOURS), colours)
         self._residuals = []
         for unit in ("px", "length"):
-            names = [one.name for one in session.sensors if one.sensor.unit == unit]
+            names = [setup.name for setup in session.sensors if setup.sensor.unit == unit]
             if names:
                 title = f"residual RMS, {unit if unit == 'px' else session.unit}"
-                several = [BODY_COLOURS[k % len(BODY_COLOURS)] for k in range(len(names))]
-                self._residuals.append((names, _plot(gui, title, names, several)))
+                palette = [BODY_COLOURS[k % len(BODY_COLOURS)] for k in range(len(names))]
+                self._residuals.append((names, _plot(gui, title, names, palette)))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Go on with some frames."""
+        """Add frames to the plots."""
         self._rows.extend(rows)
         frames = np.array([row.frame for row in self._rows], dtype=np.float64)
         self._status.data = (
@@ -212,7 +212,7 @@ def _plot(
     ]
     axis = uplot.Axis(stroke=_INK, grid={"stroke": "#444444"}, ticks={"stroke": "#444444"})
     return gui.add_uplot(
-        # the page keeps what share of the frames is shown, which of no frames is nothing
+        # the page keeps the share of the frames that is shown, which needs some frames
         data=(np.arange(2.0), *(np.full(2, np.nan) for _ in names)),
         series=(uplot.Series(label="frame"), *lines),
         title=title,

@@ -1,4 +1,4 @@
-"""The process of the page: asks for moments as fast as somebody sees them, and draws them."""
+"""The process of the page: asks for moments as fast as browsers show them, and draws them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 from mixpose.session import Session
 from mixpose.viewing.address import Place
-from mixpose.viewing.moment import PACE, Moment, Wish
+from mixpose.viewing.moment import PACE, Moment, PageMessage
 
 if TYPE_CHECKING:  # an extra
     from mixpose.viewing.page import Page
 
 _LOOK_S = 0.05
-_NICENESS = 5  # the run goes first where there are few processors
+_NICENESS = 5  # the run has priority if there are few processors
 
 
 def show(
@@ -27,26 +27,26 @@ def show(
 ) -> None:
     """Show the moments that come through a pipe until it ends.
 
-    Runs `on_files` can be paused, and are `paused` to begin with or not.
+    Runs `on_files` can be paused, and may begin `paused`.
     """
     _be_quiet()
     from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
     from mixpose.viewing.server import started  # noqa: PLC0415
 
-    wishes = Wishes(connection)
-    with started(place, on_viewers=wishes.viewers_are) as server:
-        page = Page(server, session, wishes.wish if on_files else None, paused=paused)
-        with suppress(EOFError, OSError):  # the run is gone
-            _play(connection, wishes, page)
+    messages = RunMessages(connection)
+    with started(place, on_viewers=messages.send_viewers) as server:
+        page = Page(server, session, messages.send if on_files else None, paused=paused)
+        with suppress(EOFError, OSError):  # the run has ended
+            _play(connection, messages, page)
 
 
-def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
-    asked, ready_at = False, 0.0
+def _play(connection: Connection, messages: RunMessages, page: Page) -> None:
+    is_requested, ready_at = False, 0.0
     while True:
-        if not asked and wishes.viewers and time.monotonic() >= ready_at:
-            wishes.wish("next")
-            asked = True
-        if not connection.poll(_LOOK_S if asked or not wishes.viewers else 1e-3):
+        if not is_requested and messages.viewers and time.monotonic() >= ready_at:
+            messages.send("next")
+            is_requested = True
+        if not connection.poll(_LOOK_S if is_requested or not messages.viewers else 1e-3):
             continue
         moment: Moment | None = connection.recv()
         if moment is None:
@@ -56,30 +56,30 @@ def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
         page.show(moment)
         took = time.monotonic() - began
         ready_at = began + max(1.0 / PACE.most_per_second, took / PACE.share)
-        asked = False
+        is_requested = False
 
 
-class Wishes:
-    """What the page tells the run, from any thread."""
+class RunMessages:
+    """Messages of the page to the run, from any thread."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._lock = threading.Lock()
         self.viewers = 0
 
-    def wish(self, what: Wish) -> None:
-        """Ask the run for something, or tell it."""
+    def send(self, message: PageMessage) -> None:
+        """Send a message to the run."""
         with self._lock:
-            self._connection.send(what)
+            self._connection.send(message)
 
-    def viewers_are(self, count: int) -> None:
-        """Tell how many browsers look."""
+    def send_viewers(self, count: int) -> None:
+        """Send the number of browsers that show the page."""
         self.viewers = count
-        self.wish(count)
+        self.send(count)
 
 
 def _be_quiet() -> None:
-    """Leave standard output, to which poses may go, and interrupts to the run."""
+    """Leave interrupts and standard output, which may take poses, to the run."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

@@ -1,4 +1,4 @@
-"""The server of the page: viser on a socket that is there already, behind a `Guard`."""
+"""The server of the page: viser on an existing socket, behind a `Guard`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from websockets.http11 import Request, Response
 
 from mixpose.viewing.address import ASKED_FOR, LOOPBACK, Guard, Place
 
-_MADE_S = 0.01  # between two looks at whether the server is made
+_MADE_S = 0.01  # between two tests whether the server is made
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc]
-    """A server that never opens itself to the outside, whatever a browser asks of it."""
+    """A server that ignores requests of a browser to open itself to the outside."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
@@ -28,8 +28,8 @@ class _Server(viser.ViserServer):  # type: ignore[misc]
 
 @contextmanager
 def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.ViserServer]:
-    """A server that answers on a socket, and tells the number of browsers whenever it changes."""
-    # a browser that breaks off, or one that is refused, is nothing to report
+    """Run a server on a socket; it reports the number of browsers whenever that changes."""
+    # browsers that disconnect or are refused are not reported
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     ready = threading.Event()
     with _behind(place, ready):
@@ -49,24 +49,24 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 
 @contextmanager
 def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
-    """Let a server that begins here use the socket of a place, and ask its guard first.
+    """Let a server that starts in this context use the socket of a place, and ask its guard first.
 
-    viser offers neither, so what it serves with is replaced while it begins. The socket takes
-    browsers from the start, viser only once it is made: they are held until it is `ready`. A
-    `RuntimeError` if it began otherwise, and the guard was not asked.
+    viser offers neither, so the function that it serves with is replaced while it starts. The
+    socket accepts browsers from the start; they wait until viser is `ready`. Raises RuntimeError if
+    viser started in another way, without the guard.
     """
-    usual = websockets.asyncio.server.serve
+    original_serve = websockets.asyncio.server.serve
     guard = Guard(place.port, place.token)
     guarded = []
 
     def serve(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Request) -> Response | None:
             try:
-                asked = {name: request.headers.get(name) for name in ASKED_FOR}
+                values = {name: request.headers.get(name) for name in ASKED_FOR}
             except MultipleValuesError:
-                asked = {}
-            given = {name: value for name, value in asked.items() if value is not None}
-            answer = guard.answer(request.path, given)
+                values = {}
+            present = {name: value for name, value in values.items() if value is not None}
+            answer = guard.answer(request.path, present)
             if answer is not None:
                 text = answer.text.encode()
                 headers = Headers(**answer.headers)
@@ -82,12 +82,12 @@ def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
             await handler(connection)
 
         guarded.append(True)
-        return usual(handle, sock=place.socket, process_request=process, **options)
+        return original_serve(handle, sock=place.socket, process_request=process, **options)
 
     websockets.asyncio.server.serve = serve
     try:
         yield
     finally:
-        websockets.asyncio.server.serve = usual
+        websockets.asyncio.server.serve = original_serve
     if not guarded:
         raise RuntimeError(f"viser {viser.__version__} does not serve as expected")

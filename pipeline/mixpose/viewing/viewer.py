@@ -1,4 +1,4 @@
-"""The run's side of the page: hands moments over, newest first, and waits only where asked to."""
+"""The run's side of the page: sends the newest moment on request, and waits if asked to."""
 
 from __future__ import annotations
 
@@ -18,28 +18,27 @@ from mixpose.pictures.scene import resized, room_for
 from mixpose.records import Estimate, Floats, FrameSet, GridPattern, PointPattern, RawFrame, Status
 from mixpose.session import Session
 from mixpose.viewing.address import listen
-from mixpose.viewing.moment import PACE, Moment, Row, Shown, Wish, row_of
+from mixpose.viewing.moment import PACE, Moment, PageMessage, Row, ShownFrame, row_of
 
 _LOOK_S = 0.2
-"""How often a wait looks whether it was interrupted; on some systems a wait on a lock is not."""
+"""Longest wait in seconds, after which interrupts come; some systems delay them during waits."""
 
 _LATELY_S = 2.0
-"""Over which frames per second are counted."""
+"""Seconds over which frames per second are counted."""
 
 
 _Frame: TypeAlias = tuple[FrameSet, dict[str, Floats], tuple[Estimate, ...]]
-"""A frame as the run has it, and what was found in it."""
+"""A frame set, its features by sensor, and the estimates of all bodies."""
 
 
 class Viewer:
-    """Shows a run on a page; a context for ``run(watch=...)``, announced once it is entered.
+    """Show a run on a page; a context manager, whose `watch` goes to ``run(watch=...)``.
 
-    The page is where a `text` says, as of `mixpose.viewing.address.listen`. A run `on_files` waits
-    for a browser before its first frame goes by, no longer than `Pace.patience_s`, and pauses and
-    steps as the page says; where nobody looks any more it goes on. One that begins `paused` waits
-    for the page for as long as it takes.
+    `text` is the address for `mixpose.viewing.address.listen`. A run `on_files` waits for a browser
+    after its first frame, for at most `Pace.patience_s`; the page can pause it and let it step, and
+    it goes on when no browser is left. A run that begins `paused` waits for the page without limit.
 
-    A `SessionError` if the package of the page is missing, or nothing can listen there.
+    Raises SessionError if the package of the page is missing, or the address cannot be used.
     """
 
     def __init__(
@@ -63,7 +62,7 @@ class Viewer:
         self._counts: Counter[Status] = Counter()
         self._instants: deque[float] = deque(maxlen=PACE.history)
         self._estimates: list[Estimate] = []
-        self._asked = False  # for another moment
+        self._is_requested = False  # for another moment
         self._viewers = 0
         self._paused, self._steps = paused, 0
         self._waits_for_page = on_files
@@ -80,7 +79,7 @@ class Viewer:
         return self
 
     def _begin(self, opened: ExitStack) -> None:
-        """Start the page and what talks to it; an interrupt meanwhile ends both."""
+        """Start the page and the threads that serve it; an interrupt meanwhile ends both."""
         from mixpose.viewing.process import show  # noqa: PLC0415 - loads drawing
 
         place = self._place
@@ -99,14 +98,14 @@ class Viewer:
         opened.callback(self._end)
         theirs.close()
         place.socket.close()
-        for each in (self._send, self._receive):
-            name = f"mixpose page: {each.__name__}"
-            thread = threading.Thread(target=each, name=name, daemon=True)
+        for target in (self._send, self._receive):
+            name = f"mixpose page: {target.__name__}"
+            thread = threading.Thread(target=target, name=name, daemon=True)
             thread.start()
             self._threads.append(thread)
 
     def announce(self) -> None:
-        """Tell people where the page is, and whether the run waits for it."""
+        """Print the address of the page, and whether the run waits for it."""
         begins = "; the run begins when it is open" if self._on_files else ""
         limit = f", in {PACE.patience_s:g} s at the latest" if begins and not self._paused else ""
         self._say(f"see {self._address}{begins}{limit}")
@@ -117,7 +116,7 @@ class Viewer:
         self._connection.close()
 
     def _end(self) -> None:
-        """Say that what comes from now on is nothing to warn of."""
+        """Note the end of the run, after which the end of the page needs no warning."""
         with self._state:
             self._ended = True
             self._state.notify_all()
@@ -130,7 +129,7 @@ class Viewer:
         self._opened.close()
 
     def _stay(self) -> None:
-        """Let those who look see the last frame, for a while."""
+        """Keep the page open for a while as long as browsers show it."""
         deadline = time.monotonic() + PACE.parting_s
         with self._state:
             if self._viewers and not self._gone:
@@ -142,27 +141,27 @@ class Viewer:
                 self._state.wait(_LOOK_S)
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Take one pose; with the last of a frame, show that if asked to, and wait if paused."""
+        """Take a pose; with the last of a frame, offer it to the page, and wait if paused."""
         self._estimates.append(estimate)
         if len(self._estimates) < len(self._session.labels):
             return
         estimates, self._estimates = tuple(self._estimates), []
-        found = {
+        features = {
             view.name: view.observation.pattern.points
             for view in views
             if isinstance(view.observation.pattern, PointPattern)
         }
         with self._state:
-            self._newest = frame_set, found, estimates
+            self._newest = frame_set, features, estimates
             self._rows.append(row_of(estimates))
-            self._counts.update(one.status for one in estimates)
+            self._counts.update(estimate.status for estimate in estimates)
             self._instants.append(time.monotonic())
             self._state.notify_all()
             if self._on_files:
                 self._wait()
 
     def _wait(self) -> None:
-        """Wait for the page to be open, and while the run is paused and somebody looks."""
+        """Wait until the page is open, and while the run is paused and a browser shows it."""
         deadline = time.monotonic() + self._patience
         while self._waits_for_page and not (self._viewers or self._gone):
             if time.monotonic() > deadline:
@@ -175,35 +174,35 @@ class Viewer:
         self._steps = max(self._steps - 1, 0)
 
     def _send(self) -> None:
-        """Give the page the newest moment whenever it asks for one."""
-        with suppress(OSError):  # it is gone, as `_receive` notices, too
-            while (taken := self._next()) is not None:
-                self._connection.send(self._moment(*taken))
-            self._connection.send(None)  # and the page stays as it is
+        """Send the newest moment to the page whenever it asks for one."""
+        with suppress(OSError):  # the page has ended, which `_receive` reports
+            while (update := self._next()) is not None:
+                self._connection.send(self._moment(*update))
+            self._connection.send(None)  # the end, after which the page stays as it is
 
     def _next(self) -> tuple[_Frame, tuple[Row, ...]] | None:
-        """The newest frame and all rows since the last, as soon as they are asked for."""
+        """Wait for a request; return the newest frame and all rows since the last."""
         with self._state:
-            while not self._gone and not (self._asked and self._newest is not None):
+            while not self._gone and not (self._is_requested and self._newest is not None):
                 if self._ended and self._newest is None:
                     return None
                 self._state.wait(_LOOK_S)
             if self._gone or self._newest is None:
                 return None
             frame, rows = self._newest, tuple(self._rows)
-            self._newest, self._asked = None, False
+            self._newest, self._is_requested = None, False
             self._rows.clear()
             return frame, rows
 
     def _moment(self, frame: _Frame, rows: tuple[Row, ...]) -> Moment:
-        frame_set, found, estimates = frame
+        frame_set, features, estimates = frame
         room = room_for(max(sum(s.sensor.dimension == 2 for s in self._session.sensors), 1))
         sensors = {
-            setup.name: _shown(frame_set.frames.get(setup.name), found.get(setup.name), room)
+            setup.name: _resized(frame_set.frames.get(setup.name), features.get(setup.name), room)
             for setup in self._session.sensors
         }
-        # what works out offsets holds the whole frame
-        estimates = tuple(replace(one, measured=dict) for one in estimates)
+        # without `measured`, which refers to all data of the frame
+        estimates = tuple(replace(estimate, measured=dict) for estimate in estimates)
         with self._state:
             since = time.monotonic() - _LATELY_S
             lately = sum(instant > since for instant in self._instants)
@@ -211,41 +210,41 @@ class Viewer:
         return Moment(estimates, sensors, rows, counts, lately / _LATELY_S)
 
     def _receive(self) -> None:
-        """Take what the page says until it is gone."""
+        """Receive messages of the page until it ends."""
         with suppress(EOFError, OSError):
             while True:
-                message: Wish = self._connection.recv()
+                message: PageMessage = self._connection.recv()
                 with self._state:
                     if isinstance(message, int):
                         self._viewers = message
                     elif message == "next":
-                        self._asked = True
+                        self._is_requested = True
                     elif message == "step":
                         self._paused, self._steps = True, self._steps + 1
                     else:
                         self._paused, self._steps = message == "pause", 0
                     self._state.notify_all()
         with self._state:
-            if not self._ended:  # said before the run goes on, which may be at its end by then
+            if not self._ended:  # printed before the run goes on, as that may be near its end
                 self._say("warning: the page of --view has ended; the run goes on without it")
             self._gone = True
             self._state.notify_all()
 
 
-def _shown(frame: RawFrame | None, found: Floats | None, room: tuple[int, int]) -> Shown:
-    """A frame no larger than the page has room for."""
+def _resized(frame: RawFrame | None, features: Floats | None, room: tuple[int, int]) -> ShownFrame:
+    """Return a frame for the page, its image no larger than the room for it."""
     if frame is None or isinstance(frame.data, PointPattern | GridPattern):
-        return Shown(frame, found=found)
+        return ShownFrame(frame, features=features)
     width, height = frame.data.shape[1], frame.data.shape[0]
     if width <= room[0] and height <= room[1]:
-        return Shown(frame, found=found)
+        return ShownFrame(frame, features=features)
     image, zoom = resized(frame.data, room)
-    return Shown(replace(frame, data=image), zoom, found)
+    return ShownFrame(replace(frame, data=image), zoom, features)
 
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Let a process that is started here ignore interrupts from the keyboard, as it inherits."""
+    """Start processes in this context so that they ignore interrupts from the keyboard."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
