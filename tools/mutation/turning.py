@@ -124,7 +124,7 @@ MUTANTS = (
     Mutant(
         "poses-foretold-are-held-against-their-frame",
         "poses/evaluate.py",
-        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "truth = in_unit(truth_ahead(truth, poses), unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
         "truth = in_unit(truth, unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
@@ -134,7 +134,7 @@ MUTANTS = (
     Mutant(
         "poses-foretold-numbers-by-their-frame",
         "poses/evaluate.py",
-        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "truth = in_unit(truth_ahead(truth, poses), unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
         "truth = in_unit(truth, unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
