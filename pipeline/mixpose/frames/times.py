@@ -1,6 +1,6 @@
-"""When frames were taken, from a table of times or a rate; rows of CSV files, line by line.
+"""Give frames their times, by a table or a rate; read CSV files row by row.
 
-Every complaint about a cell names the file and the line.
+Errors about a cell name the file and the line.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """A table of times; called with a frame number it gives that frame's time."""
+    """A table of times; a call with a frame number returns its time."""
 
     path: Path  # where the table comes from; only for messages
     seconds: Mapping[int, float]  # times in s by frame number
 
     def __call__(self, number: int) -> float:
-        """Time of frame `number` in s; RecordingError where the table has none."""
+        """Return the time of a frame in s; RecordingError if the table lacks it."""
         if number not in self.seconds:
             raise RecordingError(
                 f"{self.path}: no time for frame {number}; there must be a row for each frame"
@@ -62,14 +62,14 @@ def read_times(path: Path) -> FrameTimes:
 
 
 def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
-    """Those of some frame numbers that a table of times has no row for; a rate has them all."""
+    """Return the frame numbers without a row in a table of times; none with a rate."""
     if not isinstance(clock, FrameTimes):
         return []
     return [number for number in numbers if number not in clock.seconds]
 
 
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Raise a RecordingError if a table of times lacks a row for one of some frames."""
+    """Raise a RecordingError if a table of times lacks a row of these frames."""
     missing = untimed(clock, numbers)
     if not missing:
         return
@@ -83,9 +83,9 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 
 
 def clock_of(spec: SourceSpec) -> Clock | None:
-    """What gives the frames of a source their times; None where the session does not say.
+    """Return the clock for the frames of a source; None if the session states none.
 
-    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number, and
+    Raises SessionError if both `times` and `fps` are given, or `fps` is not positive, and
     RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:
@@ -101,7 +101,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
+    """Yield line numbers, from 1, and cells of the rows of a CSV file; blank lines are skipped.
 
     Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
     """
@@ -109,7 +109,7 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     cannot = reporting(RecordingError, f"{path}: cannot be read")
     try:
         with cannot, path.open(encoding="utf-8-sig", newline="") as file:
-            # a line that is longer comes in pieces, and has not as many cells as the first
+            # longer lines come in pieces, whose numbers of cells then differ from the first row
             pieces = iter(partial(file.readline, _LONGEST_LINE), "")
             reader = csv.reader(pieces, skipinitialspace=True)
             for cells in reader:
@@ -130,12 +130,12 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def header(cells: list[str]) -> tuple[str, ...]:
-    """Column names as they are compared: without blanks around them, in small letters."""
+    """Normalise column names: without blanks around them, in small letters."""
     return tuple(cell.strip().casefold() for cell in cells)
 
 
 def plain(cell: str) -> str:
-    """A cell that is to be a number; ValueError if it has what only Python takes for digits."""
+    """Return a numeric cell unchanged; ValueError for underscores, which only Python allows."""
     if "_" in cell:
         raise ValueError
     return cell
