@@ -27,7 +27,7 @@ from mixpose.errors import RecordingError
 from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
-from mixpose.trajectories.choices import unfolded
+from mixpose.trajectories.choices import unwrapped
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, predicted
 from mixpose.trajectories.smoothing import smooth_body
@@ -289,7 +289,7 @@ def test_poses_that_look_the_same_are_turned_like_the_last_that_was_ok() -> None
         pose_line(5, T, covariance),
     ]
     symmetries = np.array([np.eye(4), half_turn])
-    found = unfolded(lines, symmetries)
+    found = unwrapped(lines, symmetries)
     assert [one.T_world_object is None for one in found] == [True, False, True] + 3 * [False]
     for one in found[3:]:
         assert one.T_world_object is not None
@@ -298,7 +298,7 @@ def test_poses_that_look_the_same_are_turned_like_the_last_that_was_ok() -> None
     assert found[4].covariance is not None
     np.testing.assert_allclose(found[4].covariance[3:, 3:], covariance[3:, 3:], atol=1e-12)
     assert np.trace(found[4].covariance[:3, :3]) > np.trace(covariance[:3, :3])
-    assert unfolded(lines, symmetries[:1]) == lines
+    assert unwrapped(lines, symmetries[:1]) == lines
 
 
 def test_what_cannot_be_smoothed_is_told() -> None:

@@ -152,7 +152,7 @@ MUTANTS = (
     Mutant(
         "poses-resumed-with-another-step",
         "poses/jsonl.py",
-        '        **_sometimes("options", dict(header.options)),\n',
+        '        **_if_any("options", dict(header.options)),\n',
         "",
         "one file has poses of every frame and of every second one, with labels and without",
         ("test_cli_messages.py",),

@@ -35,12 +35,12 @@ class SilentError(RecordingError):
 
 def is_pipe(address: str) -> bool:
     """Test whether a path leads to a named pipe, or to a standard input that is a pipe."""
-    return _is(stat.S_ISFIFO, address)
+    return _has_mode(stat.S_ISFIFO, address)
 
 
 def is_device(address: str) -> bool:
     """Test whether a path leads to a device, as ``/dev/video0``."""
-    return _is(stat.S_ISCHR, address)
+    return _has_mode(stat.S_ISCHR, address)
 
 
 def is_stream(address: str) -> bool:
@@ -48,7 +48,7 @@ def is_stream(address: str) -> bool:
     return "://" in address or is_pipe(address) or is_device(address)
 
 
-def _is(kind: Callable[[int], bool], address: str) -> bool:
+def _has_mode(kind: Callable[[int], bool], address: str) -> bool:
     with contextlib.suppress(OSError, ValueError):
         return kind(Path(address).stat().st_mode)
     return False

@@ -48,38 +48,38 @@ def missing_bytes(path: Path) -> int:
 
 def _riff_end(file: BinaryIO, size: int) -> int:
     """Return the end of the last RIFF part; long AVI files have several (OpenDML)."""
-    at = 0
-    while at + 8 <= size:
-        file.seek(at)
+    offset = 0
+    while offset + 8 <= size:
+        file.seek(offset)
         head = file.read(8)
         length = int.from_bytes(head[4:], "little")
         # interrupted recorders leave a size of 0, streams one of all ones
         if head[:4] != b"RIFF" or length in (0, 2**32 - 1):
             break
-        at += 8 + length + length % 2
-    return at
+        offset += 8 + length + length % 2
+    return offset
 
 
 def _mp4_end(file: BinaryIO, size: int) -> int:
     """Return the end of the last box (ISO/IEC 14496-12, section 4.2); the rest is padding."""
-    at = 0
-    while at + 8 <= size:
-        file.seek(at)
+    offset = 0
+    while offset + 8 <= size:
+        file.seek(offset)
         head = file.read(16)
         length = int.from_bytes(head[:4])
         if length == 1:
             length = int.from_bytes(head[8:])
         if head[4:8] not in _MP4_BOXES or length < 8:  # 0 means up to the end of the file
             break
-        at += length
-    return at
+        offset += length
+    return offset
 
 
 def _matroska_end(file: BinaryIO, size: int) -> int:
     """Return the end of the segment behind the EBML header (RFC 8794); 0 if its size is unknown."""
-    at = 0
+    offset = 0
     for _ in ("header", "segment"):
-        file.seek(at)
+        file.seek(offset)
         head = file.read(12)
         if len(head) < 5 or head[4] == 0:
             return 0
@@ -88,5 +88,5 @@ def _matroska_end(file: BinaryIO, size: int) -> int:
         length = int.from_bytes(head[4 : 4 + width]) & mask
         if length == mask:
             return 0
-        at += 4 + width + length
-    return at
+        offset += 4 + width + length
+    return offset

@@ -74,7 +74,7 @@ class ImageSequence(Source):
                 "the names of its images end in times since 1970, which are taken for theirs, and "
                 "not fps; drop fps, or name a table of times"
             )
-        endings, indices = _endings(self.paths), [*range(self.length)]
+        endings, indices = _end_numbers(self.paths), [*range(self.length)]
         by_name = natural_order(self.paths)
         are_alike = len({re.sub("[0-9]+", "0", str(path)) for path in by_name}) == 1
         if are_alike and endings == [*self.numbers] and [*self.paths] != by_name:
@@ -139,11 +139,11 @@ def frame_numbers(paths: Sequence[Path]) -> list[int]:
 
     Else they are numbered by their place in `paths`, from 0.
     """
-    numbers = [number for number in _endings(paths) if number is not None]
+    numbers = [number for number in _end_numbers(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
 
 
-def _endings(paths: Sequence[Path]) -> list[int | None]:
+def _end_numbers(paths: Sequence[Path]) -> list[int | None]:
     """Return the numbers at the ends of names; nanoseconds if all are seconds since 1970."""
     stamps = [re.search(r"(?<![0-9])(1[0-9]{9})[.]([0-9]{1,9})$", path.stem) for path in paths]
     times = [int(match[1] + match[2].ljust(9, "0")) for match in stamps if match]
@@ -214,8 +214,8 @@ def _bytes_of(path: Path) -> bytes:
                 data = file.read(size)
                 # a call reads it all, unless it is interrupted or the file is cut meanwhile
                 return data if len(data) == size else data + file.read()
-    found = f"{size} bytes" if is_file else "no file"
-    raise RecordingError(f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}")
+    text = f"{size} bytes" if is_file else "no file"
+    raise RecordingError(f"{path}: found {text}; allowed: a file of at most {MOST_IMAGE_BYTES}")
 
 
 def _fault_of(data: bytes) -> str | None:
@@ -232,16 +232,16 @@ def _fault_of(data: bytes) -> str | None:
 def _png_fault(data: bytes) -> str | None:
     """Check the chunks (PNG specification, section 5) up to IEND; what follows is harmless."""
     view = memoryview(data)
-    at = len(_PNG_START)
-    while at + 12 <= len(data):
-        kind_at, content_at = at + 4, at + 8
-        check_at = content_at + int.from_bytes(view[at:kind_at])
-        at = check_at + 4
-        if at > len(data):
+    offset = len(_PNG_START)
+    while offset + 12 <= len(data):
+        kind_at, content_at = offset + 4, offset + 8
+        check_at = content_at + int.from_bytes(view[offset:kind_at])
+        offset = check_at + 4
+        if offset > len(data):
             break
         kind = data[kind_at:content_at]
         critical = not kind[0] & 0x20
-        if critical and _checksum(view[kind_at:check_at]) != int.from_bytes(view[check_at:at]):
+        if critical and _checksum(view[kind_at:check_at]) != int.from_bytes(view[check_at:offset]):
             return f"damaged: the checksum of PNG chunk {kind!r} at byte {kind_at - 4} is wrong"
         if kind == b"IEND":
             return None
@@ -252,8 +252,8 @@ def _checksum(content: memoryview) -> int:
     """Return the CRC-32, in pieces for which zlib keeps the interpreter lock."""
     # to get the lock back from a busy thread takes far longer than a chunk, and there are many
     value = 0
-    for at in range(0, len(content), _PIECE):
-        value = zlib.crc32(content[at : at + _PIECE], value)
+    for start in range(0, len(content), _PIECE):
+        value = zlib.crc32(content[start : start + _PIECE], value)
     return value
 
 
@@ -261,15 +261,15 @@ def _jpeg_is_whole(data: bytes) -> bool:
     """Test whether the end marker follows the first scan."""
     # skip the segments before the scan (ITU T.81, annex B), as a preview image in them has an end
     # marker, too
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
+    offset = 2
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == _START_OF_SCAN:
-            return data.rfind(_END_OF_IMAGE, at) >= 0
+            return data.rfind(_END_OF_IMAGE, offset) >= 0
         if marker == 0xFF:  # padding
-            at += 1
+            offset += 1
         else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4])
+            offset += 2 + int.from_bytes(data[offset + 2 : offset + 4])
     return False
 
 

@@ -106,15 +106,15 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             sensor: stack.enter_context(_Reader(source, began, _KEPT if len(sources) > 1 else 1))
             for sensor, source in sources.items()
         }
-        given = dict.fromkeys(readers, -1)
+        delivered = dict.fromkeys(readers, -1)
         stalled: set[str] = set()
         number = -1
         while number + 1 < wanted.stop:
             for sensor, reader in readers.items():
                 waits = sensor not in stalled or len(stalled) == len(readers)
-                patience = None if given[sensor] < 0 else STALLED_S if waits else 0.0
-                reader.wait(given[sensor], patience)
-            newer = {sensor: readers[sensor].newer_than(given[sensor]) for sensor in readers}
+                patience = None if delivered[sensor] < 0 else STALLED_S if waits else 0.0
+                reader.wait(delivered[sensor], patience)
+            newer = {sensor: readers[sensor].newer_than(delivered[sensor]) for sensor in readers}
             ready = {sensor: frames for sensor, frames in newer.items() if frames}
             active = [name for name in readers if name in ready or not readers[name].has_ended]
             if not active:
@@ -123,15 +123,15 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             stalled = set(active) - set(ready)
             if not ready:
                 continue
-            frames = _together(ready)
-            given.update((sensor, frame.number) for sensor, frame in frames.items())
-            number = max(number + 1, *given.values())
+            frames = _nearest_frames(ready)
+            delivered.update((sensor, frame.number) for sensor, frame in frames.items())
+            number = max(number + 1, *delivered.values())
             if number in wanted:
                 frames = {sensor: replace(frame, number=number) for sensor, frame in frames.items()}
                 yield FrameSet(number, next(iter(frames.values())).time_s, frames)
 
 
-def _together(frames_by_sensor: Mapping[str, list[RawFrame]]) -> dict[str, RawFrame]:
+def _nearest_frames(frames_by_sensor: Mapping[str, list[RawFrame]]) -> dict[str, RawFrame]:
     """Return the frame of each source that is nearest to the latest moment that all reached."""
     latest = min(_seconds(frames[-1]) for frames in frames_by_sensor.values())
     return {
@@ -193,7 +193,7 @@ class _Reader:
         while True:
             count = self._count
             try:
-                self._read_on()
+                self._read_capture()
                 return
             except (captures.SilentError, captures.NotOpenedError):
                 last_heard = time.monotonic() if self._count > count else last_heard
@@ -206,7 +206,7 @@ class _Reader:
             if self._stop.wait(_AGAIN_S):
                 return
 
-    def _read_on(self) -> None:
+    def _read_capture(self) -> None:
         address, clock = self._source.address, self._source.clock
         times = CaptureTimes(address)
         with captures.opened(address) as capture:

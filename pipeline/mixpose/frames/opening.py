@@ -149,7 +149,7 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
     )
 
 
-def _alike(name: str, wanted: str) -> float:
+def _similarity(name: str, wanted: str) -> float:
     """Return the similarity of a name to a missing one, to a tenth, regardless of case."""
     return round(SequenceMatcher(None, name.lower(), wanted.lower()).ratio(), 1)
 
@@ -170,7 +170,7 @@ def _looked_in(path: Path) -> str:
     # of files that differ in numbers alone, show the first
     kinds = {re.sub(r"[0-9]+", "0", entry.name): entry.name for entry in reversed(entries)}
     names = list(kinds.values())[::-1]
-    names.sort(key=lambda name: -_alike(name, path.name))
+    names.sort(key=lambda name: -_similarity(name, path.name))
     shown = ", ".join(names[:_SHOWN])
     more = f", ... ({len(entries)} in all)" if len(entries) > min(len(kinds), _SHOWN) else ""
     return f"{text}, where there is {shown}{more}" if entries else f"{text}, which is empty"

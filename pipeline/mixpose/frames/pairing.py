@@ -113,7 +113,7 @@ def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
     steps = [[b - a for a, b in pairwise(stamps)] for stamps in stamped.values()]
     reach = min((median_low(gaps) // _PART for gaps in steps if gaps), default=math.inf)
     for name, stamps in stamped.items():
-        numbers[name] = _nearest(stamps, known, reach)
+        numbers[name] = _nearest_known(stamps, known, reach)
         known = sorted({*known, *numbers[name]})
     # with images, the number is the stamp of the moment; else the index among all moments
     has_images = any(isinstance(sources[name], ImageSequence) for name in stamped)
@@ -132,7 +132,7 @@ def _stamps_of(source: Source) -> Sequence[int]:
     return source.stamps if isinstance(source, DetectionTable) else ()
 
 
-def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
+def _nearest_known(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
     """Replace numbers by the nearest known ones within reach; none is used twice."""
     owners: dict[int, tuple[int, int]] = {}
     for index, number in enumerate(numbers):

@@ -143,7 +143,7 @@ def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
                 f"{path}: cut short: {len(rows)} of the {promised} profiles that it promises are "
                 f"whole, from 0"
             )
-        yield number, _moderate(np.asarray(rows[number]), path, number)
+        yield number, _single_precision(np.asarray(rows[number]), path, number)
 
 
 def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -154,10 +154,10 @@ def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
             return
         if number in wanted:
             values = [finite(cell, path, line, f"bin {at}") for at, cell in enumerate(cells)]
-            yield number, _moderate(np.array(values), path, number)
+            yield number, _single_precision(np.array(values), path, number)
 
 
-def _moderate(values: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
+def _single_precision(values: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
     """Return a profile in single precision, in which its squares can be summed; else raise."""
     allowed = np.abs(values) <= LARGEST_VALUE
     if not allowed.all():

@@ -187,9 +187,9 @@ class DetectionTable(Source):
         rows = csv_rows(self.path)
         next(rows, None)
         read, name = (whole, "frame") if self._is_numbered else (finite, "time_s")
-        at = self.columns.index(name)
+        column = self.columns.index(name)
         for line, cells in rows:
-            yield read(cells[at], self.path, line, name), line, cells
+            yield read(cells[column], self.path, line, name), line, cells
 
     @cached_property
     def _contents(self) -> _Contents:

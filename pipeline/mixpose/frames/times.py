@@ -50,8 +50,8 @@ def read_times(path: Path) -> FrameTimes:
     _, cells = next(rows, (0, []))
     columns = header(cells)
     if sorted(columns) != _COLUMNS:
-        found = ",".join(cells) or "nothing"
-        raise RecordingError(f"{path}, line 1: found {found}, the header must be frame,time_s")
+        text = ",".join(cells) or "nothing"
+        raise RecordingError(f"{path}, line 1: found {text}, the header must be frame,time_s")
     frame_column, time_column = columns.index("frame"), columns.index("time_s")
     for line, cells in rows:
         number = whole(cells[frame_column], path, line, "frame")
@@ -167,5 +167,5 @@ def whole(cell: str, path: Path, line: int, column: str) -> int:
 
 
 def _complain(cell: str, path: Path, line: int, column: str, allowed: str) -> NoReturn:
-    found = repr(cell.strip()) if cell.strip() else "an empty cell"
-    raise RecordingError(f"{path}, line {line}: {column}: found {found}, allowed is {allowed}")
+    text = repr(cell.strip()) if cell.strip() else "an empty cell"
+    raise RecordingError(f"{path}, line {line}: {column}: found {text}, allowed is {allowed}")

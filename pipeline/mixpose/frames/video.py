@@ -84,7 +84,7 @@ class Video(Source):
                 if pending is not None:
                     yield pending
                     pending = None
-                time_s = _time(capture, number, time_s)
+                time_s = _time_of(capture, number, time_s)
                 if number in wanted:
                     frame = self._frame(capture, number, time_s, room)
                     if self.missing:
@@ -180,10 +180,10 @@ def _opened(address: str) -> Iterator[cv2.VideoCapture]:
     except captures.NotOpenedError as error:
         if captures.is_stream(address):
             raise
-        raise RecordingError(_unopened(address)) from error
+        raise RecordingError(_opening_fault(address)) from error
 
 
-def _unopened(address: str) -> str:
+def _opening_fault(address: str) -> str:
     """Describe why a video does not open, as far as its bytes show it."""
     try:
         container, cut = container_of(Path(address)), missing_bytes(Path(address))
@@ -199,7 +199,7 @@ def _unopened(address: str) -> str:
     )
 
 
-def _time(capture: cv2.VideoCapture, number: int, previous_s: float | None) -> float | None:
+def _time_of(capture: cv2.VideoCapture, number: int, previous_s: float | None) -> float | None:
     """Return the time of the grabbed frame in s: its stamp if it ascends, or else by the rate."""
     time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
     if math.isfinite(time_s) and (number == 0 or previous_s is None or time_s > previous_s):

@@ -37,9 +37,9 @@ class CsvWriter(PoseWriter):
     def __init__(self, stream: TextIO, header: Header) -> None:
         super().__init__(stream, header)
         self._numbered = any(count > 1 for count in header.objects.values())
-        self._rows = self._begun(header.sensors) if header.sensors else None
+        self._rows = self._with_header(header.sensors) if header.sensors else None
 
-    def _begun(self, sensors: Sequence[str]) -> csv.DictWriter[str]:
+    def _with_header(self, sensors: Sequence[str]) -> csv.DictWriter[str]:
         """Write the names of the columns, and return the writer of rows."""
         of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
         numbered = ["instance"] if self._numbered else []
@@ -52,7 +52,7 @@ class CsvWriter(PoseWriter):
         return rows
 
     def _write(self, estimate: Estimate) -> None:
-        self._rows = self._rows or self._begun(tuple(estimate.sensors))
+        self._rows = self._rows or self._with_header(tuple(estimate.sensors))
         row = {
             "frame": estimate.frame,
             "time_s": plain(estimate.time_s),
@@ -79,7 +79,7 @@ class CsvWriter(PoseWriter):
 
     def close(self) -> None:
         """Write the column names if there was no row, and flush."""
-        self._rows = self._rows or self._begun(())
+        self._rows = self._rows or self._with_header(())
         super().close()
 
 

@@ -49,7 +49,7 @@ def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
 def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
     """Return an estimate in the axes of a sensor (4, 4), so that its pose is T_sensor_object."""
     turn = np.asarray(np.kron(np.eye(2), T_sensor_world[:3, :3]), dtype=np.float64)
-    return _changed(estimate, lambda T: T_sensor_world @ T, turn)
+    return _mapped(estimate, lambda T: T_sensor_world @ T, turn)
 
 
 def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
@@ -67,14 +67,14 @@ def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
         line,
         status="ok" if line.status == reference.status == "ok" else "ambiguous",
         T_world_object=rigid.inverse(T_reference) @ T,
-        covariance=_of_both(line, reference, T[:3, 3] - T_reference[:3, 3]),
+        covariance=_relative_covariance(line, reference, T[:3, 3] - T_reference[:3, 3]),
         hypotheses=(),
         confidence=None if p is None or p_reference is None else p * p_reference,
         filled=line.filled or reference.filled,
     )
 
 
-def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
+def _relative_covariance(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
     """Return the covariance (6, 6) of a pose `arm` (3,) away from a reference, in its axes."""
     assert reference.T_world_object is not None
     if line.covariance is None or reference.covariance is None:
@@ -84,7 +84,7 @@ def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
     return np.asarray(turn @ C @ turn.T)
 
 
-def _changed(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:
+def _mapped(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:
     """Map the poses of an estimate by `motion_of`, and twists of its pose by a matrix (6, 6)."""
     T, covariance = estimate.T_world_object, estimate.covariance
     return replace(
@@ -118,7 +118,7 @@ def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
     by_twist: Floats = np.diag([ratio] * 3 + [1.0] * 3)
     lines = tuple(
         replace(
-            _changed(line, scaled, by_twist),
+            _mapped(line, scaled, by_twist),
             tip_object=None if line.tip_object is None else ratio * line.tip_object,
             points={
                 name: replace(point, at=ratio * point.at, residual=ratio * point.residual)

@@ -241,12 +241,12 @@ def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
     return twists[nearest], answers[nearest // len(poses)]
 
 
-def _spreads(twists: Sequence[tuple[int, Floats | None]], of: str = "") -> dict[str, Any]:
+def _spreads(twists: Sequence[tuple[int, Floats | None]], prefix: str = "") -> dict[str, Any]:
     """Return the spreads of angles (degrees) and distances, by fields of `Evaluation`."""
     frames = [frame for frame, twist in twists if twist is not None]
     errors = np.array([twist for _, twist in twists if twist is not None]).reshape(-1, 2, 3)
     distance, angle = np.linalg.norm(errors, axis=2).T
-    fields = {f"{of}rotation_deg": np.degrees(angle), f"{of}translation": distance}
+    fields = {f"{prefix}rotation_deg": np.degrees(angle), f"{prefix}translation": distance}
     return {name: _spread(frames, values) for name, values in fields.items()}
 
 

@@ -21,7 +21,7 @@ from mixpose.records import Floats
 
 _CLEARLY = 0.5  # distance to another body, in that to the one before, up to which it is a swap
 
-_Paired: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
+_Distances: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
 """Numbers of the poses, numbers of the truth and distances between them, by frame."""
 
 
@@ -44,10 +44,10 @@ def renumbered(
     for name in dict.fromkeys(line.object for line in truth if line.instance is not None):
         true_lines = [line for line in truth if line.object == name]
         numbered = [line for line in poses if line.object == name and line.instance is not None]
-        frames = _paired(numbered, true_lines, symmetries.get(name))
-        for number, true_number in _assigned(numbered, true_lines, frames).items():
+        frames = _distances_by_frame(numbered, true_lines, symmetries.get(name))
+        for number, true_number in _assigned_numbers(numbered, true_lines, frames).items():
             numbers[name, number] = true_number
-        of_name = _swaps(numbered, frames)
+        of_name = _counted_swaps(numbered, frames)
         swaps = Swaps(swaps.count + of_name.count, swaps.announced + of_name.announced)
     lines = tuple(
         replace(line, instance=numbers.get((line.object, line.instance), line.instance))
@@ -56,9 +56,9 @@ def renumbered(
     return lines, swaps
 
 
-def _paired(
+def _distances_by_frame(
     poses: Sequence[PoseLine], truth: Sequence[PoseLine], symmetries: Floats | None
-) -> _Paired:
+) -> _Distances:
     truths = _by_frame(truth)
     paired = {}
     for frame, lines in _by_frame(poses).items():
@@ -86,8 +86,8 @@ def _by_frame(lines: Sequence[PoseLine]) -> dict[int, list[PoseLine]]:
     return {frame: list(group) for frame, group in groupby(sorted(lines, key=frame_of), frame_of)}
 
 
-def _assigned(
-    poses: Sequence[PoseLine], truth: Sequence[PoseLine], frames: _Paired
+def _assigned_numbers(
+    poses: Sequence[PoseLine], truth: Sequence[PoseLine], frames: _Distances
 ) -> dict[int, int]:
     """Return the numbers of the truth by numbers of the poses."""
     pose_numbers = sorted({line.instance or 0 for line in poses})
@@ -103,7 +103,7 @@ def _assigned(
     return {n: numbers[n] if n in numbers else next(unused) for n in pose_numbers}
 
 
-def _swaps(poses: Sequence[PoseLine], frames: _Paired) -> Swaps:
+def _counted_swaps(poses: Sequence[PoseLine], frames: _Distances) -> Swaps:
     status = {(line.frame, line.instance or 0): line.status for line in poses}
     followed: dict[int, int] = {}
     is_doubted: dict[int, bool] = {}

@@ -50,10 +50,10 @@ def header_line(header: Header) -> dict[str, Any]:
         "mixpose": header.mixpose,
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
-        **_sometimes("objects", dict(header.objects) if len(header.labels) > 1 else {}),
-        **_sometimes("sources", dict(header.sources)),
-        **_sometimes("options", dict(header.options)),
-        **_sometimes("smoothed", dict(header.smoothed)),
+        **_if_any("objects", dict(header.objects) if len(header.labels) > 1 else {}),
+        **_if_any("sources", dict(header.sources)),
+        **_if_any("options", dict(header.options)),
+        **_if_any("smoothed", dict(header.smoothed)),
     }
 
 
@@ -71,7 +71,7 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
         "object": estimate.object,
         **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
-        **_sometimes("why", estimate.doubt),
+        **_if_any("why", estimate.doubt),
         "T_world_object": plain(T),
         "quaternion_xyzw": None if T is None else plain(rigid.quaternion_xyzw(T)),
         "covariance": None if T is None else plain(estimate.covariance),
@@ -82,25 +82,25 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
                 "used": bool(report.used),
                 "explained": plain(report.explained),
                 "rms": plain(report.rms),
-                **_sometimes("why", report.why),
-                **_sometimes("residuals", {k: _rounded(r) for k, r in report.residuals.items()}),
-                **_sometimes("labels", {k: _label(label) for k, label in report.labels.items()}),
+                **_if_any("why", report.why),
+                **_if_any("residuals", {k: _rounded(r) for k, r in report.residuals.items()}),
+                **_if_any("labels", {k: _label(label) for k, label in report.labels.items()}),
             }
             for name, report in estimate.sensors.items()
         },
-        **_sometimes("points", points),
+        **_if_any("points", points),
         "hypotheses": [
             {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
-        **_sometimes("filled", estimate.filled),
-        **_sometimes("ahead_s", estimate.ahead_s),
+        **_if_any("filled", estimate.filled),
+        **_if_any("ahead_s", estimate.ahead_s),
     }
 
 
-def _sometimes(key: str, value: Any) -> dict[str, Any]:
+def _if_any(key: str, value: Any) -> dict[str, Any]:
     """Return a key with its value, or nothing if the value is empty."""
     return {key: value} if value else {}
 

@@ -100,9 +100,9 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
     matrix = pose.T_world_object
     T = None if matrix is None else _motion(matrix, f"{where}: T_world_object")
     if (T is None) != (pose.status == "lost"):
-        found = "null or missing" if T is None else "given"
+        given = "null or missing" if T is None else "given"
         raise RecordingError(
-            f"{where}: T_world_object is {found} while status is {pose.status!r}; it is null "
+            f"{where}: T_world_object is {given} while status is {pose.status!r}; it is null "
             "where the status is 'lost' and a 4x4 matrix otherwise"
         )
     fields = dict(pose)
@@ -164,9 +164,9 @@ def _checked(model: type[_Checked], values: Mapping[str, Any], where: str) -> _C
         key = ".".join(repr(str(part))[1:-1] for part in first["loc"])  # names of any characters
         if first["type"] == "missing":
             raise RecordingError(f"{where}: {key} is missing") from error
-        found = repr(first["input"])
-        found = found if len(found) <= 60 else found[:57] + "..."
-        raise RecordingError(f"{where}: {key} is {found}; {first['msg'].lower()}") from error
+        text = repr(first["input"])
+        text = text if len(text) <= 60 else text[:57] + "..."
+        raise RecordingError(f"{where}: {key} is {text}; {first['msg'].lower()}") from error
     except OverflowError as error:
         raise RecordingError(f"{where}: a number is too large") from error
 

@@ -27,11 +27,11 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "ok_frames": _errors(evaluation, "ok_") if evaluation.ok_rotation_deg else None,
         "best_hypothesis": best if evaluation.best_rotation_deg else None,
         "nees": None if nees is None else asdict(nees),
-        **_sometimes(evaluation),
+        **_rare_entries(evaluation),
     }
 
 
-def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
+def _rare_entries(evaluation: Evaluation) -> dict[str, Any]:
     """Return the entries that only several bodies, or odd findings, have."""
     offset, swaps = evaluation.offset, evaluation.swaps
     values = {
@@ -150,8 +150,8 @@ def _row(name: str, cells: list[str]) -> str:
     return name.ljust(24) + "".join(cell.rjust(11) for cell in cells)
 
 
-def _errors(evaluation: Evaluation, of: str = "") -> dict[str, Any]:
-    turn, shift = (getattr(evaluation, f"{of}{kind}") for kind in ("rotation_deg", "translation"))
+def _errors(evaluation: Evaluation, prefix: str = "") -> dict[str, Any]:
+    turn, shift = (getattr(evaluation, f"{prefix}{key}") for key in ("rotation_deg", "translation"))
     unit = {"unit": evaluation.unit}
     return {
         "rotation_deg": None if turn is None else asdict(turn),

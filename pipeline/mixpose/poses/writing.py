@@ -99,9 +99,9 @@ class Stamps:
             if not has_time:
                 self._stream.write(f"{NO_TIMES}\n")
         if has_time != self._has_times:
-            found = "a time" if has_time else "no time"
+            text = "a time" if has_time else "no time"
             raise RecordingError(
-                f"frame {estimate.frame} has {found}, unlike the frames before it: format "
+                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
                 f"{self._format!r} needs times for all frames or for none; give the sensors "
                 "times, or write jsonl"
             )

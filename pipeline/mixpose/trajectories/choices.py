@@ -18,7 +18,7 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.trajectories.intensity import SmoothingRules
 from mixpose.trajectories.motion import States, predicted, updated
-from mixpose.trajectories.track import MotionModel, Track, begun, noise_of, white_parts
+from mixpose.trajectories.track import MotionModel, Track, initial_states, noise_of, white_parts
 
 _NONE = -1  # the choice that a frame shows something else
 
@@ -48,7 +48,7 @@ def choices(
 
     The poses of the track are ignored; its covariances are those of all alternatives.
     """
-    paths, log_likelihoods = _followed(track, alternatives, model, rules)
+    paths, log_likelihoods = _likely_paths(track, alternatives, model, rules)
     path_weights = np.exp(log_likelihoods - log_likelihoods.max())
     path_weights /= path_weights.sum()
     results = []
@@ -64,7 +64,7 @@ def choices(
     return results
 
 
-def _followed(
+def _likely_paths(
     track: Track, alternatives: Sequence[Alternatives], model: MotionModel, rules: SmoothingRules
 ) -> tuple[list[tuple[int, ...]], Floats]:
     """Return the likeliest paths, choices with `_NONE` before the first, and log likelihoods."""
@@ -73,10 +73,10 @@ def _followed(
 
     def states_at(k: int) -> States:
         rivals = alternatives[k]
-        states = begun(track, model.order, white[k].repeat(len(rivals.poses), axis=0))
+        states = initial_states(track, model.order, white[k].repeat(len(rivals.poses), axis=0))
         return states._replace(poses=rivals.poses)
 
-    def ahead_of(states: States, k: int) -> tuple[States, Floats]:
+    def predict(states: States, k: int) -> tuple[States, Floats]:
         """Return the states predicted for time k, and log likelihoods that it shows none."""
         elapsed, count = float(track.times[k] - track.times[k - 1]), len(states.poses)
         ahead, _ = predicted(states, elapsed, np.repeat(noise, count, axis=0))
@@ -87,7 +87,7 @@ def _followed(
     paths: list[tuple[int, ...]] = [(k,) for k in range(len(states.poses))]
     logs: Floats = np.log(alternatives[0].weights)
     for k in range(1, len(alternatives)):
-        ahead, log_none = ahead_of(states, k)
+        ahead, log_none = predict(states, k)
         rivals, new_states = alternatives[k], list[States]()
         new_paths: list[tuple[int, ...]] = []
         new_logs: list[float] = []
@@ -101,7 +101,7 @@ def _followed(
             new_paths += [(*path, _NONE) for path in paths]
             new_logs += (logs + log_none).tolist()
         if log_unstarted > -np.inf:  # earlier frames are as far off as from a track begun at k - 1
-            log_unstarted += float(ahead_of(states_at(k - 1), k)[1].max())
+            log_unstarted += float(predict(states_at(k - 1), k)[1].max())
             new_states.append(states_at(k))
             new_paths += [(*[_NONE] * k, j) for j in range(len(rivals.poses))]
             new_logs += (log_unstarted + np.log(rivals.weights)).tolist()
@@ -114,7 +114,7 @@ def _followed(
     return paths, logs
 
 
-def unfolded(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseLine]:
+def unwrapped(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseLine]:
     """Replace poses by those that look the same, by (n, 4, 4), and turn least from the last."""
     if symmetries is None or len(symmetries) < 2:
         return list(lines)
@@ -125,19 +125,19 @@ def unfolded(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseL
             results.append(line)
             continue
         previous = line.T_world_object if previous is None else previous
-        results.append(_turned(line, line.T_world_object, previous, symmetries))
+        results.append(_least_turned(line, line.T_world_object, previous, symmetries))
         if line.status == "ok":
             previous = results[-1].T_world_object
     return results
 
 
-def _turned(line: PoseLine, T: Floats, reference: Floats, symmetries: Floats) -> PoseLine:
+def _least_turned(line: PoseLine, T: Floats, reference: Floats, symmetries: Floats) -> PoseLine:
     """Return a line at T with its poses replaced by those turned least from a reference."""
-    S, C, tip = _nearest(T, reference, symmetries), line.covariance, line.tip_object
+    S, C, tip = _nearest_symmetry(T, reference, symmetries), line.covariance, line.tip_object
     rivals = []
     for hypothesis in line.hypotheses:
         rival = hypothesis.T_world_object
-        turned = rival @ _nearest(rival, reference, symmetries)
+        turned = rival @ _nearest_symmetry(rival, reference, symmetries)
         rivals.append(replace(hypothesis, T_world_object=turned))
     return replace(
         line,
@@ -148,6 +148,6 @@ def _turned(line: PoseLine, T: Floats, reference: Floats, symmetries: Floats) ->
     )
 
 
-def _nearest(T: Floats, reference: Floats, symmetries: Floats) -> Floats:
+def _nearest_symmetry(T: Floats, reference: Floats, symmetries: Floats) -> Floats:
     angles = rigid.rotation_angle_deg(np.broadcast_to(reference, symmetries.shape), T @ symmetries)
     return np.asarray(symmetries[int(np.argmin(angles))])

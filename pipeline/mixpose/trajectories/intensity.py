@@ -19,7 +19,7 @@ from mixpose.trajectories.track import (
     MotionModel,
     SmoothedTrack,
     Track,
-    begun,
+    initial_states,
     noise_of,
     smooth_track,
     white_parts,
@@ -86,7 +86,7 @@ def fitted_model(
     for name, order in ORDERS.items():
         x[2] = 0.0
         for width, points, along in _COARSE:
-            x, log_likelihood = _along(blocks, order, x, width, points, along, rules)
+            x, log_likelihood = _searched_along(blocks, order, x, width, points, along, rules)
         if name == motion or (motion is None and log_likelihood > best[0]):
             best = (log_likelihood, order, x)
         elif motion is None:
@@ -99,7 +99,7 @@ def fitted_model(
     if not np.isfinite(likely):
         raise OverflowError("no motion has a likelihood")
     for width, points in _FINE:
-        x_best, _ = _along(blocks, order, x_best, width, points, (*_SHARE, *_EACH), rules)
+        x_best, _ = _searched_along(blocks, order, x_best, width, points, (*_SHARE, *_EACH), rules)
     intensities = _intensities(track, order, x_best[None, :2])[0]
     model = MotionModel(order, intensities, float(np.exp(x_best[2])))
     return replace(model, white=_white(blocks, model, rules))
@@ -148,7 +148,7 @@ def smooth_with_sudden_motion(
         if np.abs(change).max(initial=0.0) < rules.settled:
             break
     result = smooth_track(track, model, np.exp(logs))
-    share = _usual(logs) / np.exp(logs)
+    share = _usual_scales(logs) / np.exp(logs)
     prior = 0.5 * rules.tail * (np.log(share) - share).sum(axis=1)
     return result, result.logs + np.append(0.0, prior), logs
 
@@ -159,11 +159,11 @@ def _fixed_point(track: Track, model: MotionModel, logs: Floats, rules: Smoothin
     step_noises = smooth_track(track, model, scales).step_noises
     squared = np.stack([step.squared for step in step_noises])
     degrees = np.stack([step.degrees for step in step_noises])
-    energy = scales * squared + rules.tail * _usual(logs)
+    energy = scales * squared + rules.tail * _usual_scales(logs)
     return np.asarray(np.log(energy / (np.maximum(degrees, 0.0) + rules.tail)))
 
 
-def _usual(logs: Floats) -> Floats:
+def _usual_scales(logs: Floats) -> Floats:
     """Return the usual factors μ (2,)."""
     return np.asarray(1 / np.exp(-logs).mean(axis=0))
 
@@ -211,7 +211,7 @@ _COARSE = (
 _FINE = ((0.5, 5), (0.15, 3))
 
 
-def _along(
+def _searched_along(
     blocks: list[Track],
     order: int,
     x: Floats,
@@ -237,7 +237,7 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
     white = white_parts(track, np.exp(x[:, 2]))
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
     if_outlier = outlier_logs(track, white, rules)
-    states = begun(track, order, white[0])
+    states = initial_states(track, order, white[0])
     steps = np.diff(track.times).tolist()
     total, was_outlier = np.zeros(len(x)), np.zeros(len(x), bool)
     for k, elapsed in enumerate(steps, 1):

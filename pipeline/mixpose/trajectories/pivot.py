@@ -89,9 +89,9 @@ def find_tip(pivoting: Pivoting) -> Tip:
             "which the tool turns about its tip"
         )
     _require_turns(pivoting, 1.0, rules)
-    kept = _alike(pivoting, rules)
+    kept = _start_poses(pivoting, rules)
     for iteration in range(10):
-        x, information, squared = _solved(pivoting, kept, rules)
+        x, information, squared = _fitted(pivoting, kept, rules)
         # the median of χ² of three degrees is 2.37; a slipping tip enlarges all distances
         typical = max(1.0, float(np.median(squared[kept])) / 2.366)
         inliers = squared <= typical * chdtri(3, rules.foreign)
@@ -100,14 +100,14 @@ def find_tip(pivoting: Pivoting) -> Tip:
             break
         kept = inliers
     inlying = pivoting.part(kept)
-    offsets, by_poses, _ = _at_tip(inlying, x, np.zeros((len(inlying.poses), 12)))
+    offsets, by_poses, _ = _tip_offsets(inlying, x, np.zeros((len(inlying.poses), 12)))
     expected = _covariances(inlying, by_poses)
     scale = float(squared[kept].sum() / (3 * len(offsets) - 6))
     factor = max(1.0, scale)
     # turns of the inlying poses alone, as those of wrong poses mean nothing
     turns, directions = _require_turns(inlying, factor, rules)
-    covariance = factor * _of_tip(information[kept])
-    held_out, ratio, enlarged = _held_out(inlying, x[:3], information[kept], factor, rules)
+    covariance = factor * _tip_covariance(information[kept])
+    held_out, ratio, enlarged = _cross_validated(inlying, x[:3], information[kept], factor, rules)
     return Tip(
         place=x[:3],
         covariance=covariance * ratio * enlarged,
@@ -159,7 +159,7 @@ def _linear(pivoting: Pivoting) -> tuple[Floats, Floats]:
     return A, pivoting.references[:, :3, 3] - pivoting.poses[:, :3, 3]
 
 
-def _alike(pivoting: Pivoting, rules: PivotRules) -> Mask:
+def _start_poses(pivoting: Pivoting, rules: PivotRules) -> Mask:
     """Select poses (N,) for the start, by the least median (P. Rousseeuw, J. Am. Stat. Assoc. 79
     (1984) 871).
     """
@@ -173,13 +173,13 @@ def _alike(pivoting: Pivoting, rules: PivotRules) -> Mask:
     return np.asarray(distances[medians.argmin()] <= gate)
 
 
-def _solved(pivoting: Pivoting, kept: Mask, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
+def _fitted(pivoting: Pivoting, kept: Mask, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
     """Fit tip and point (6,) to the kept poses; also return information (N, 6, 6) and χ² (N,)."""
     A, b = _linear(pivoting.part(kept))
     x: Floats = np.linalg.lstsq(A.reshape(-1, 6), b.ravel(), rcond=None)[0].astype(np.float64)
     steps = np.zeros((len(pivoting.poses), 12))  # from the measured poses to the fitted ones
     for _ in range(rules.steps):
-        offsets, by_poses, by_x = _at_tip(pivoting, x, steps)
+        offsets, by_poses, by_x = _tip_offsets(pivoting, x, steps)
         W = np.linalg.inv(_covariances(pivoting, by_poses))
         weighed = by_x.swapaxes(1, 2) @ W
         information = weighed @ by_x
@@ -188,19 +188,19 @@ def _solved(pivoting: Pivoting, kept: Mask, rules: PivotRules) -> tuple[Floats, 
         step = -np.linalg.solve(information[kept].sum(axis=0), gradient)
         residuals += by_x @ step
         pulls = np.einsum("kij,kj->ki", W, residuals)
-        steps = -_spread(pivoting, np.einsum("kji,kj->ki", by_poses, pulls)[:, :, None])[..., 0]
+        steps = -_multiplied(pivoting, np.einsum("kji,kj->ki", by_poses, pulls)[:, :, None])[..., 0]
         x = x + step
         if np.linalg.norm(step) <= 1e-12 * np.linalg.norm(x):
             break
     return x, information, np.einsum("ki,ki->k", residuals, pulls)
 
 
-def _of_tip(information: Floats) -> Floats:
+def _tip_covariance(information: Floats) -> Floats:
     """Return the covariance (3, 3) of a tip by the information (n, 6, 6) of poses."""
     return np.asarray(np.linalg.inv(information.sum(axis=0))[:3, :3])
 
 
-def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
+def _tip_offsets(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
     """Return offsets (N, 3) of tips at poses moved by steps (N, 12); Jacobians by steps and x."""
     by_poses, by_x, offsets = [], [], np.zeros((len(steps), 3))
     sides = ((pivoting.poses, x[:3], 1.0), (pivoting.references, x[3:], -1.0))
@@ -216,7 +216,7 @@ def _at_tip(pivoting: Pivoting, x: Floats, steps: Floats) -> tuple[Floats, Float
     return offsets, np.concatenate(by_poses, axis=2), np.concatenate(by_x, axis=2)
 
 
-def _spread(pivoting: Pivoting, columns: Floats) -> Floats:
+def _multiplied(pivoting: Pivoting, columns: Floats) -> Floats:
     """Multiply the covariances of both poses by columns (N, 12, n)."""
     C, C_reference = pivoting.covariances, pivoting.reference_covariances
     return np.concatenate([C @ columns[:, :6], C_reference @ columns[:, 6:]], axis=1)
@@ -224,13 +224,13 @@ def _spread(pivoting: Pivoting, columns: Floats) -> Floats:
 
 def _covariances(pivoting: Pivoting, by_poses: Floats) -> Floats:
     """Return covariances (N, 3, 3) of offsets from point to tip, by Jacobians (N, 3, 12)."""
-    C = by_poses @ _spread(pivoting, by_poses.swapaxes(1, 2))
+    C = by_poses @ _multiplied(pivoting, by_poses.swapaxes(1, 2))
     # held directions have no variance, which has no inverse
     least = 1e-9 * np.trace(C, axis1=1, axis2=2).mean() + 1e-300
     return np.asarray(C + least * np.eye(3))
 
 
-def _held_out(
+def _cross_validated(
     pivoting: Pivoting, tip: Floats, information: Floats, scale: float, rules: PivotRules
 ) -> tuple[float, float, float]:
     """Return the RMS residual of held-out parts by tips of the others, and two variance factors."""
@@ -238,11 +238,11 @@ def _held_out(
     for part in np.array_split(np.arange(len(pivoting.poses)), rules.parts):
         is_used = np.ones(len(pivoting.poses), bool)
         is_used[part] = False
-        x, *_ = _solved(pivoting, is_used, rules)
-        offsets.append(_at_tip(pivoting, x, np.zeros((len(pivoting.poses), 12)))[0][part])
+        x, *_ = _fitted(pivoting, is_used, rules)
+        offsets.append(_tip_offsets(pivoting, x, np.zeros((len(pivoting.poses), 12)))[0][part])
         away = x[:3] - tip
         # in nested least squares the covariance of a difference is the difference of covariances
-        differing = scale * (_of_tip(information[is_used]) - _of_tip(information))
+        differing = scale * (_tip_covariance(information[is_used]) - _tip_covariance(information))
         squared += float(away @ np.linalg.pinv(differing) @ away)
     # tips deviate from their mean; any two of n fits share n - 2 parts
     freedom = 3 * (rules.parts - 1)

@@ -21,7 +21,7 @@ from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.trajectories import track as tracks
-from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
+from mixpose.trajectories.choices import Alternatives, Choice, choices, unwrapped
 from mixpose.trajectories.intensity import (
     SmoothingRules,
     fitted_model,
@@ -78,7 +78,7 @@ def smooth_body(
             "recording with times: add fps or times to the sensors of its session"
         )
     t = np.array([line.frame for line in ordered], float) if times is None else times
-    ordered = unfolded(ordered, symmetries)
+    ordered = unwrapped(ordered, symmetries)
     posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
     tracks.require_covariances([ordered[k] for k in posed])
     sure = [k for k in posed if ordered[k].status == "ok"]
@@ -195,7 +195,7 @@ def _smoothed(
     first, last = int(with_pose[0]), int(with_pose[-1]) + 1
     lines, frames = segment.lines[first:last], segment.frames[first:last]
     track, result = _without_outliers(track.part(slice(first, last)), model, rules)
-    persistent = max(0.0, 1.0 - model.white) * tracks.of_free(track.covariances, track.free)
+    persistent = max(0.0, 1.0 - model.white) * tracks.without_held(track.covariances, track.free)
     estimates = {}
     for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
         T, covariance = result.poses[k], result.covariances[k] + persistent[k]

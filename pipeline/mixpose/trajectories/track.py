@@ -50,7 +50,7 @@ class Track:
         return np.asarray(np.sqrt((twists**2).mean(axis=(0, 2))).repeat(3))
 
 
-def of_free(covariances: Floats, free: Mask) -> Floats:
+def without_held(covariances: Floats, free: Mask) -> Floats:
     """Return covariances (N, 6, 6) with zeros in held directions."""
     return np.where(free[:, None] & free, covariances, 0.0)
 
@@ -65,7 +65,7 @@ def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) 
     medians = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
     kinds = medians.reshape(2, 3).max(axis=1).repeat(3)
     free = medians > 1e-12 * np.where(kinds > 0, kinds, np.inf)
-    covariances = of_free(covariances, free)
+    covariances = without_held(covariances, free)
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     for kind in (slice(0, 3), slice(3, 6)):
         largest, is_free = variances[:, kind].max(axis=1), free[kind]
@@ -97,7 +97,7 @@ def white_parts(track: Track, white: Floats) -> Floats:
     return np.asarray(track.covariances[:, None] * (scale[:, :, None] * scale[:, None]))
 
 
-def begun(track: Track, order: int, covariances: Floats) -> States:
+def initial_states(track: Track, order: int, covariances: Floats) -> States:
     """Return G states at the first pose, with its covariances (G, 6, 6) and unknown rates."""
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     widths = _DIFFUSE * (track.moved + deviation)
@@ -129,7 +129,7 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
     noises = noise_of(track, model.intensities * scales)[:, None]
-    states = [begun(track, model.order, white[0])]
+    states = [initial_states(track, model.order, white[0])]
     ahead: list[tuple[States, Floats]] = []
     logs = np.zeros(len(track))
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
@@ -146,7 +146,7 @@ def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None)
     covariances = np.stack([state.covariances[0][:6, :6] for state in states])
     return SmoothedTrack(
         np.concatenate([state.poses for state in states]),
-        of_free(covariances, track.free),
+        without_held(covariances, track.free),
         tuple(reversed(step_noises)),
         logs,
     )
