@@ -68,7 +68,7 @@ class ImageSequence(Source):
         return f"{self.length} image{plural} {_size_text(_size(image))}{depth}, {numbers}"
 
     def caution(self) -> str | None:
-        """Describe odd numbers: a file or two may be why all are numbered by their place."""
+        """Describe odd frame numbers: stamps in spite of fps, an unnatural order, or places."""
         if self.is_stamped and self.has_fps:
             return (
                 "the names of its images end in times since 1970, which are taken for theirs, and "

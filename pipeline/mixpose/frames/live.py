@@ -29,17 +29,17 @@ from mixpose.records import FrameSet, Moment, RawFrame
 
 _CAMERA = re.compile(r"camera:(\d{1,4})")
 _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"}
-# suffixes of files, which a server sends as fast as they are read: recordings
-_FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
-_FAREWELL_S = 1.0
+# suffixes of files, which a server sends as fast as they are read
+_FILE_SUFFIXES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
+_JOIN_S = 1.0
 
-STALLED_S = 3.0  # that the others wait for a source that has delivered frames
+STALLED_S = 3.0  # longest time that others wait for a source that has delivered frames
 RETURN_S = 60.0  # longest silence of a source that has delivered frames; then the run ends
-_KEPT = 8  # newest frames of each source that are kept for pairing with others
-_AGAIN_S = 0.5  # between two attempts to open it
+_NEWEST = 8  # newest frames of each source that are kept for pairing with others
+_RETRY_S = 0.5  # between two attempts to open a source
 
 # streams with stamps by the sender's clock; for others FFmpeg invents stamps from a nominal rate
-_STAMPED = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
+_STAMPED_SCHEMES = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
 
 
 def live_address(source: str) -> str | int | None:
@@ -52,7 +52,7 @@ def live_address(source: str) -> str | int | None:
     if not location or scheme.lower() not in _SCHEMES:
         return None
     suffix = PurePosixPath(urlsplit(source).path).suffix.lower()
-    return None if scheme.lower().startswith("http") and suffix in _FILES else source
+    return None if scheme.lower().startswith("http") and suffix in _FILE_SUFFIXES else source
 
 
 def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
@@ -64,7 +64,7 @@ def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
 
 @dataclass(frozen=True)
 class LiveSource(Source):
-    """A camera or a stream, opened when its frames are asked for."""
+    """A camera or a stream, opened when its frames are requested."""
 
     kind: ClassVar[SourceKind] = "live"
     ahead: ClassVar[int] = 0
@@ -103,7 +103,7 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
     began = time.monotonic()
     with ExitStack() as stack:
         readers = {
-            sensor: stack.enter_context(_Reader(source, began, _KEPT if len(sources) > 1 else 1))
+            sensor: stack.enter_context(_Reader(source, began, _NEWEST if len(sources) > 1 else 1))
             for sensor, source in sources.items()
         }
         delivered = dict.fromkeys(readers, -1)
@@ -165,10 +165,10 @@ class _Reader:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         # a thread that waits for a silent camera longer than this ends by itself
-        self._thread.join(_FAREWELL_S)
+        self._thread.join(_JOIN_S)
 
     def wait(self, after: int, patience_s: float | None) -> None:
-        """Wait for a frame with a number above `after`, the end, or until patience ends."""
+        """Wait up to `patience_s` for a frame numbered above `after`, or the end of the source."""
         with self._changed:
             self._changed.wait_for(lambda: self.newer_than(after) or self.has_ended, patience_s)
         if self._error is not None and not self.newer_than(after):
@@ -200,10 +200,10 @@ class _Reader:
                 address = self._source.address
                 is_pipe = isinstance(address, str) and captures.is_pipe(
                     address
-                )  # its data are gone
+                )  # its pending data are gone
                 if is_pipe or not self._count or time.monotonic() - last_heard > RETURN_S:
                     raise
-            if self._stop.wait(_AGAIN_S):
+            if self._stop.wait(_RETRY_S):
                 return
 
     def _read_capture(self) -> None:
@@ -244,7 +244,7 @@ class CaptureTimes:
 
     def __init__(self, address: str | int) -> None:
         self._is_device = isinstance(address, int) or captures.is_device(address)
-        self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
+        self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED_SCHEMES)
         self._rules = ClockRules()
         self._last: tuple[float, float] | None = None  # stamp, and least difference
 

@@ -24,7 +24,7 @@ from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
 _STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # a single letter is a drive
-_SHOWN = 4  # names of files that a message lists
+_MOST_NAMES = 4  # names of files that a message lists
 
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
@@ -171,8 +171,8 @@ def _looked_in(path: Path) -> str:
     kinds = {re.sub(r"[0-9]+", "0", entry.name): entry.name for entry in reversed(entries)}
     names = list(kinds.values())[::-1]
     names.sort(key=lambda name: -_similarity(name, path.name))
-    shown = ", ".join(names[:_SHOWN])
-    more = f", ... ({len(entries)} in all)" if len(entries) > min(len(kinds), _SHOWN) else ""
+    shown = ", ".join(names[:_MOST_NAMES])
+    more = f", ... ({len(entries)} in all)" if len(entries) > min(len(kinds), _MOST_NAMES) else ""
     return f"{text}, where there is {shown}{more}" if entries else f"{text}, which is empty"
 
 

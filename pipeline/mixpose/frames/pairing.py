@@ -27,7 +27,7 @@ from mixpose.records import FrameSet, RawFrame
 
 READY_BYTES = 2**24  # for further decoded frames of a source that wait
 MOST_MORE = 13  # further frames: a pose may take as long as 16 others, and not delay a decoder
-_PART = 2  # frames half their usual distance apart are of different moments
+_REACH_DIVISOR = 2  # of the usual distance of frames: half of it apart, moments differ
 
 
 def pair(
@@ -111,7 +111,7 @@ def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
         return dict(sources)
     numbers, known = dict[str, list[int]](), list[int]()
     steps = [[b - a for a, b in pairwise(stamps)] for stamps in stamped.values()]
-    reach = min((median_low(gaps) // _PART for gaps in steps if gaps), default=math.inf)
+    reach = min((median_low(gaps) // _REACH_DIVISOR for gaps in steps if gaps), default=math.inf)
     for name, stamps in stamped.items():
         numbers[name] = _nearest_known(stamps, known, reach)
         known = sorted({*known, *numbers[name]})

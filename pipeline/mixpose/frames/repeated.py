@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mixpose.records import PointPattern, RawFrame
 
-_PIXELS = 37  # every 37th row and column of an image are compared first
+_STRIDE = 37  # every 37th row and column of an image are compared first
 
 
 def shown_by(frame: RawFrame) -> NDArray[Any] | None:
@@ -23,5 +23,5 @@ def is_same(before: NDArray[Any] | None, now: NDArray[Any]) -> bool:
     """Test whether two frames are equal to the last digit; with noise they never are."""
     if before is None or before.shape != now.shape:
         return False
-    few = np.array_equal(before[::_PIXELS, ::_PIXELS], now[::_PIXELS, ::_PIXELS])
+    few = np.array_equal(before[::_STRIDE, ::_STRIDE], now[::_STRIDE, ::_STRIDE])
     return few and bool(np.array_equal(before, now))

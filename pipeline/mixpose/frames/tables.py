@@ -18,7 +18,7 @@ import numpy as np
 from mixpose.errors import RecordingError
 from mixpose.frames import source, times
 from mixpose.frames.source import Frames, SensorKind, Source, SourceKind, SourceSpec
-from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, plain, whole
+from mixpose.frames.times import Clock, FrameTimes, column_names, csv_rows, finite, numeric, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -145,7 +145,7 @@ class DetectionTable(Source):
                 f"in frame {number}, as many are allowed; leave out what cannot be a feature"
             )
         try:
-            values = np.array([[float(plain(cell)) for cell in cells] for _, _, cells in group])
+            values = np.array([[float(numeric(cell)) for cell in cells] for _, _, cells in group])
         except ValueError:
             self._complain(group)
         if not np.isfinite(values).all():
@@ -221,7 +221,7 @@ def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTa
     """Open a table of detections; RecordingError if columns of its header are not allowed."""
     coordinates = _COORDINATES[spec.kind]
     _, cells = next(csv_rows(path), (0, []))
-    columns = header(cells)
+    columns = column_names(cells)
     fault = _header_fault(columns, coordinates)
     if fault is not None:
         raise RecordingError(

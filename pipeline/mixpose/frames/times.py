@@ -19,7 +19,7 @@ from mixpose.frames.source import SourceSpec
 Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
-_LISTED = 5  # frame numbers that a message names
+_MOST_NUMBERS = 5  # frame numbers that a message names
 _LARGEST_NUMBER = 10**255  # as many digits as a file name may have
 _LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
 
@@ -48,7 +48,7 @@ def read_times(path: Path) -> FrameTimes:
     times: dict[int, float] = {}
     rows = csv_rows(path)
     _, cells = next(rows, (0, []))
-    columns = header(cells)
+    columns = column_names(cells)
     if sorted(columns) != _COLUMNS:
         text = ",".join(cells) or "nothing"
         raise RecordingError(f"{path}, line 1: found {text}, the header must be frame,time_s")
@@ -74,8 +74,8 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
     if not missing:
         return
     assert isinstance(clock, FrameTimes), "rates lack nothing"
-    named = ", ".join(map(str, missing[:_LISTED]))
-    more = f", ... ({len(missing)} frames)" if len(missing) > _LISTED else ""
+    named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
+    more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
     raise RecordingError(
         f"{clock.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
         "table with a row for each frame of the recording, or fps in place of times"
@@ -129,12 +129,12 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise RecordingError(f"{path}: not a CSV file: {error}") from error
 
 
-def header(cells: list[str]) -> tuple[str, ...]:
+def column_names(cells: list[str]) -> tuple[str, ...]:
     """Normalise column names: without blanks around them, in small letters."""
     return tuple(cell.strip().casefold() for cell in cells)
 
 
-def plain(cell: str) -> str:
+def numeric(cell: str) -> str:
     """Return a numeric cell unchanged; ValueError for underscores, which only Python allows."""
     if "_" in cell:
         raise ValueError
@@ -144,7 +144,7 @@ def plain(cell: str) -> str:
 def finite(cell: str, path: Path, line: int, column: str) -> float:
     """Read a cell as a finite number, else raise RecordingError."""
     try:
-        value = float(plain(cell))
+        value = float(numeric(cell))
     except ValueError:
         _complain(cell, path, line, column, "a number")
     if not math.isfinite(value):
@@ -155,7 +155,7 @@ def finite(cell: str, path: Path, line: int, column: str) -> float:
 def whole(cell: str, path: Path, line: int, column: str) -> int:
     """Read a cell as a whole number (``12`` or ``12.0``), else raise RecordingError."""
     try:
-        value = int(plain(cell))
+        value = int(numeric(cell))
     except ValueError:
         number = finite(cell, path, line, column)
         value = int(number)

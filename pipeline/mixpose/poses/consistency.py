@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 _FEWEST = 5  # frames
 _ZERO = 1e-9  # length that is written as 0
-_LEFT = 0.1  # largest remaining share of errors that a constant transform explains
+_REMAINING = 0.1  # largest remaining share of errors that a constant transform explains
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def constant_offset(pairs: Sequence[tuple[Floats, Floats]]) -> ConstantOffset | 
     good = []
     for offset in candidates:  # one kind of error nearly vanishes, and the other hardly grows
         after = np.array([offset.rotation_deg_rms, offset.translation_rms])
-        if (after < _LEFT * before).any() and (after < 1.1 * before).all():
+        if (after < _REMAINING * before).any() and (after < 1.1 * before).all():
             good.append(offset)
     return min(good, key=lambda offset: offset.translation_rms) if good else None
 

@@ -19,7 +19,7 @@ from mixpose import rigid
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 
-_CLEARLY = 0.5  # distance to another body, in that to the one before, up to which it is a swap
+_SWAP_RATIO = 0.5  # largest distance to the new body, in that to the old one, for a swap
 
 _Distances: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
 """Numbers of the poses, numbers of the truth and distances between them, by frame."""
@@ -119,7 +119,7 @@ def _counted_swaps(poses: Sequence[PoseLine], frames: _Distances) -> Swaps:
             number, true_number = rows[i], columns[j]
             before = followed.get(number)
             if before is not None and before != true_number and before in columns:
-                if distances[i, j] > _CLEARLY * distances[i, columns.index(before)]:
+                if distances[i, j] > _SWAP_RATIO * distances[i, columns.index(before)]:
                     continue  # near neither body: a wrong pose, and no swap
                 count += 1
                 announced += is_doubted.get(number, False)

@@ -183,7 +183,7 @@ def _is_json(line: bytes) -> bool:
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """The last whole line of an interrupted run."""
+    """The end of the last whole frame of an interrupted run."""
 
     frame: int  # its frame
     lines: int  # number of lines of this frame

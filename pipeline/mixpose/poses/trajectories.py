@@ -31,10 +31,10 @@ MARKS = {"trc": ("PathFileType\t", TRC_MARK), "c3d": ("\x02P", "mixpose")}
 """Beginning of files by format, and a later mark of those that mixpose wrote."""
 
 LAST_FRAME = 2**16 - 2  # numbers from 1, in 16 bits; some readers count one beyond the last
-_STAMPED = 1000  # median step of frame numbers from which these are stamps, in us or ns
-_FARTHEST = 10**15  # most frames of a gap, more than fit in any file
-_SENSORS = 7  # sensors with a bit that says whether they measured a point
-_STEPS = 127  # values of a residual, which is a signed byte for some readers
+_STAMP_STEP = 1000  # median step of frame numbers from which these are stamps, in us or ns
+_LONGEST_GAP = 10**15  # most frames of a gap, more than fit in any file
+_MOST_SENSORS = 7  # sensors with a bit that says whether they measured a point
+_RESIDUAL_STEPS = 127  # values of a residual, which is a signed byte for some readers
 _SCALE_AT = 12  # byte of the header where the scale begins
 
 
@@ -69,14 +69,14 @@ def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
     """
     stamps = sorted({line.frame for line in lines})
     steps = [after - before for before, after in pairwise(stamps)]
-    if not steps or median_low(steps) < _STAMPED:
+    if not steps or median_low(steps) < _STAMP_STEP:
         return {number: number for number in stamps}
     times = {line.frame: line.time_s for line in lines}
     seconds = [time for number in stamps if (time := times[number]) is not None]
     elapsed = [after - before for before, after in pairwise(seconds)]
     if len(seconds) == len(stamps) and min(elapsed) > 0 and math.isfinite(sum(elapsed)):
         usual = median_low(elapsed)
-        counts = [round(min(gap / usual, float(_FARTHEST))) for gap in elapsed]
+        counts = [round(min(gap / usual, float(_LONGEST_GAP))) for gap in elapsed]
     else:
         step = median_low(steps)
         counts = [(2 * gap + step) // (2 * step) for gap in steps]
@@ -157,7 +157,7 @@ def write_c3d(path: Path, trajectories: Trajectories) -> bool:
         )
     measured = trajectories.is_measured
     residuals = np.where(measured, trajectories.residuals * ratio, 0.0)
-    scale = np.float32(max(float(residuals.max()), 1e-3) / _STEPS)
+    scale = np.float32(max(float(residuals.max()), 1e-3) / _RESIDUAL_STEPS)
     # a measured residual must not be rounded to 0, which means computed
     residuals = np.where(measured, np.maximum(residuals, 1.5 * scale), 0.0)
     residuals[~trajectories.is_known] = -1.0
@@ -173,8 +173,8 @@ def write_c3d(path: Path, trajectories: Trajectories) -> bool:
     points = np.ones((4, *trajectories.places.shape[1::-1]))
     points[:3] = ratio * trajectories.places.transpose(2, 1, 0)
     file["data"]["points"] = points
-    sensors = trajectories.by_sensor[..., :_SENSORS].transpose(2, 1, 0)
-    masks = np.zeros((_SENSORS, *points.shape[1:]), dtype=np.bool_)
+    sensors = trajectories.by_sensor[..., :_MOST_SENSORS].transpose(2, 1, 0)
+    masks = np.zeros((_MOST_SENSORS, *points.shape[1:]), dtype=np.bool_)
     masks[: len(sensors)] = sensors
     file["data"]["meta_points"]["residuals"] = residuals.T[None]
     file["data"]["meta_points"]["camera_masks"] = masks

@@ -100,7 +100,7 @@ def _likely_paths(
             new_states.append(ahead)
             new_paths += [(*path, _NONE) for path in paths]
             new_logs += (logs + log_none).tolist()
-        if log_unstarted > -np.inf:  # earlier frames are as far off as from a track begun at k - 1
+        if log_unstarted > -np.inf:  # frames before a track count as off a track begun there
             log_unstarted += float(predict(states_at(k - 1), k)[1].max())
             new_states.append(states_at(k))
             new_paths += [(*[_NONE] * k, j) for j in range(len(rivals.poses))]
@@ -115,7 +115,7 @@ def _likely_paths(
 
 
 def unwrapped(lines: Sequence[PoseLine], symmetries: Floats | None) -> list[PoseLine]:
-    """Replace poses by those that look the same, by (n, 4, 4), and turn least from the last."""
+    """Replace poses by those, equal up to symmetries (n, 4, 4), that turn least from the last."""
     if symmetries is None or len(symmetries) < 2:
         return list(lines)
     previous: Floats | None = None

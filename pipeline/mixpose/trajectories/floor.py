@@ -14,10 +14,10 @@ from mixpose.records import Estimate, Floats
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 
-_ROUNDED = 1e-4  # deg, rounding of equal true poses
-_RESTS = 5.0  # deviations: a body that is always nearer to its mean is at rest
-_FLAT = 1e-6  # of the largest spread, below which points lie on a line
-_SURELY = 3.0  # times offsets from the plane, or errors: less spread may be chance on a line
+_ROUNDING_DEG = 1e-4  # deg, rounding of equal true poses
+_REST_SIGMAS = 5.0  # deviations: a body that is always nearer to its mean is at rest
+_LINE_RATIO = 1e-6  # of the largest spread, below which points lie on a line
+_PLANE_RATIO = 3.0  # times offsets from the plane, or errors: less spread may be chance on a line
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def _is_at_rest(estimates: Sequence[Estimate]) -> bool:
     farthest = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
     error = np.sqrt(np.mean([np.trace(_covariance(e)) for e in estimates]))
     rounded = 1e-9 * np.abs(points).max()  # means of numbers of a file
-    return bool(farthest <= _RESTS * error + rounded)
+    return bool(farthest <= _REST_SIGMAS * error + rounded)
 
 
 def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
@@ -103,7 +103,7 @@ def _require_still(estimates: Sequence[Estimate], T_mean: Floats) -> None:
     poses = [e.T_world_object for e in estimates if e.T_world_object is not None]
     turned = max(rigid.rotation_angle_deg(T_mean, T) for T in poses)
     variances = [np.trace(e.covariance[3:, 3:]) for e in estimates if e.covariance is not None]
-    if turned > _RESTS * np.degrees(np.sqrt(np.mean(variances or [0.0]))) + _ROUNDED:
+    if turned > _REST_SIGMAS * np.degrees(np.sqrt(np.mean(variances or [0.0]))) + _ROUNDING_DEG:
         raise RecordingError(
             f"the body {estimates[0].label!r} turns by {turned:.3g} deg about a point that rests; "
             "allowed: a body that rests, or poses of which these points are all over the floor"
@@ -115,7 +115,7 @@ def _normal(points: Floats, sensors: Floats, covariance: Floats) -> tuple[Floats
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle)
     errors = np.sqrt(len(points) * (directions[1] @ covariance @ directions[1]))
-    if not sizes[1] > max(_FLAT * sizes[0], _SURELY * sizes[2], _SURELY * errors):
+    if not sizes[1] > max(_LINE_RATIO * sizes[0], _PLANE_RATIO * sizes[2], _PLANE_RATIO * errors):
         raise RecordingError(
             f"the points lie on a line, or in no plane: they spread by {sizes[0]:.3g}, "
             f"{sizes[1]:.3g}, of which {errors:.2g} may be errors, and {sizes[2]:.3g}; allowed: "

@@ -52,14 +52,14 @@ class SmoothingRules:
     )
     passes: int = constant(60, "most passes to fit the noise of each step; 40 suffice")
     ahead: float = constant(
-        1.5, "factor on the changes of a pass, which all have one sign: two thirds of the passes"
+        1.5, "factor on these changes, which all have one sign: it saves a third of the passes"
     )
     settled: float = constant(0.1, "change of the logarithm of a scale that ends the passes")
     foreign: float = constant(
         1e-9, "chance of a pose as far off its neighbours that is then taken for wrong"
     )
     believed: float = constant(
-        0.5, "deviation of the log of the error of covariances: 0.6 to 1.6 times, as a rule"
+        0.5, "deviation of the log of the factor by which covariances are off: 0.6 to 1.6 times"
     )
     wrong: float = constant(1e-3, "share of ok poses that are wrong: confidence is 0.999")
     reach: float = constant(3.0, "distance of a wrong pose, in usual steps")
@@ -255,6 +255,6 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
 
 
 def outlier_logs(track: Track, white: Floats, rules: SmoothingRules) -> Floats:
-    """Return log-likelihoods (N, G) of wrong poses, without −3 log 2π, by (N, G, 6, 6)."""
-    anywhere = np.diagonal(white, axis1=2, axis2=3) + (rules.reach * track.moved) ** 2
+    """Return log-likelihoods (N, G) of wrong poses, without −3 log 2π, by `white_parts`."""
+    anywhere = np.diagonal(white, axis1=2, axis2=3) + (rules.reach * track.rms_motion) ** 2
     return np.asarray(np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=2))

@@ -29,7 +29,7 @@ from mixpose.records import Floats, Indices, Mask
 
 # names of the derivative that has white noise, and its order
 ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
-# matrix whose rows give [ω], of x -> ω × x, as ω @ _ACROSS
+# ω @ _ACROSS is [ω], of x -> ω × x, row by row
 _ACROSS = np.array(
     [[0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0]]
 )

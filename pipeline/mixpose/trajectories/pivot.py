@@ -67,8 +67,8 @@ class Tip:
     covariance: Floats  # (3, 3)
     pivot: Floats  # (3,): the point where it stays, in the world or in the reference body
     residual: float  # root mean square distance of tip and point
-    expected: float  # the same as expected by the covariances of the poses
-    held_out: float  # the same of poses that were held out
+    expected: float  # residual expected by the covariances of the poses
+    held_out: float  # residual of poses that were held out
     scale: float  # squared residuals over covariances; above 1 it scales the tip's covariance
     held_out_ratio: float  # variance by held-out parts over that by residuals; > 1: errors persist
     frames: int  # number of poses used

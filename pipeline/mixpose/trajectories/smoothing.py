@@ -152,7 +152,7 @@ def _segments(
     for part in np.split(np.array(posed), cuts):
         # line, or None of a filled frame; the line before; frame and time
         rows: list[tuple[PoseLine | None, PoseLine, int, float]] = []
-        for last, k in pairwise([0, *part.tolist()]):  # k = 0 has no line before
+        for last, k in pairwise([0, *part.tolist()]):  # the first has no line before it
             line = lines[k]
             if rows and times[k] - times[last] <= fill_s + _ROUNDED_S:
                 gap, first = lines[last : k + 1], lines[last].frame
@@ -162,9 +162,9 @@ def _segments(
                 moments = np.interp([n - first for n in between], since, times[last : k + 1])
                 rows += [(None, lines[last], n, t) for n, t in zip(between, moments.tolist())]
             rows.append((line, line, line.frame, float(times[k])))
-        segment_lines, nearest_lines, frames, seconds = zip(*rows, strict=True)
+        segment_lines, posed_lines, frames, seconds = zip(*rows, strict=True)
         measured = np.array([other is not None for other in segment_lines])
-        track = replace(_track(nearest_lines, np.array(seconds)), measured=measured)
+        track = replace(_track(posed_lines, np.array(seconds)), measured=measured)
         segments.append(_Segment(segment_lines, frames, track))
     return segments
 
@@ -258,7 +258,7 @@ def _limit(track: tracks.Track, rules: SmoothingRules) -> float:
 def _without_outliers_after_first(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """Leave out poses that contradict their neighbours; the first one is right."""
+    """Leave out poses that contradict their neighbours, given that the first is right."""
     limit = _limit(track, rules)
     if_wrong = outlier_logs(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)

@@ -43,7 +43,7 @@ class Track:
         return float(np.median(steps)) if len(steps) else 1.0
 
     @property
-    def moved(self) -> Floats:
+    def rms_motion(self) -> Floats:
         """Root mean square motion (6,) from pose to pose: one value of lengths, one of turns."""
         poses = self.poses[self.measured]
         twists = rigid.twist_between(poses[:-1], poses[1:]).reshape(-1, 2, 3)
@@ -100,7 +100,7 @@ def white_parts(track: Track, white: Floats) -> Floats:
 def initial_states(track: Track, order: int, covariances: Floats) -> States:
     """Return G states at the first pose, with its covariances (G, 6, 6) and unknown rates."""
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    widths = _DIFFUSE * (track.moved + deviation)
+    widths = _DIFFUSE * (track.rms_motion + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
     G = len(covariances)
     P = np.zeros((G, 6 * order, 6 * order))
