@@ -44,7 +44,7 @@ def align_session(request: AlignRequest) -> None:
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
     _tell(session, floor, request.up)
-    say(f"{session.path.name} in the frame of {floor.by} -> {shown(request.output)}")
+    say(f"{session.path.name} in the frame of {floor.defined_by} -> {shown(request.output)}")
 
 
 def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate]:
@@ -92,13 +92,13 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
             rewriting.put_motion(table, "T_sensor_world", T, digits=digits)
     rewriting.put_starts(document, session, T_new_old)
     rewriting.put_gravity(document, session, T_new_old)
-    head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"
+    head = f"{MARK} {__version__} from {session.path.name}, {floor.defined_by}.\n"
     return rewriting.text_of(document, session, head)
 
 
 def _tell(session: Session, floor: Floor, up: Axis) -> None:
-    if floor.off is not None:
-        say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
+    if floor.rms_distance is not None:
+        say(f"the points are {floor.rms_distance:.3g} {session.unit} RMS off the floor")
     if floor.tilt_deg:
         say(f"the floor is level to {floor.tilt_deg:.2g} deg, one standard deviation")
     heights = rigid.transform(rigid.inverse(floor.T_old_new), _places(session))

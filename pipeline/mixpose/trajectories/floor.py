@@ -25,8 +25,8 @@ class Floor:
     """A new frame for the world."""
 
     T_old_new: Floats  # (4, 4): maps coordinates of the new world to those of the old one
-    by: str  # what defines it, in words
-    off: float | None = None  # RMS distance of the points from it; None if any would fit
+    defined_by: str  # in words
+    rms_distance: float | None = None  # of the points; None if any would fit
     tilt_deg: float = 0.0  # standard deviation about the least known axis; 0 of true poses
 
 

@@ -36,10 +36,10 @@ class SmoothingRules:
     block: int = constant(100, "successive poses among these: the first few fix the rates")
     fewest: int = constant(8, "poses to fit a motion; with fewer none is smoothed")
     surely: float = constant(
-        10.83, "twice the gain in log likelihood, χ² of 99.9 %, of a covariance not all white"
+        10.83, "twice the gain in log likelihood, χ² of 99.9 %, by which errors are not all white"
     )
     off: float = constant(
-        0.2, "least logarithm of that share: sudden motion changes a share of 1 to 0.9 to 1.05"
+        0.2, "least |logarithm| of the white share: sudden motion alone makes it 0.9 to 1.05"
     )
     shares: tuple[float, float] = constant(
         (-2.0, 2.0), "range of that logarithm: 4 deviations of `believed`"

@@ -32,9 +32,9 @@ class PivotRules:
 
     fewest: int = constant(10, "poses: six unknowns, three equations per pose")
     turned: float = constant(
-        1.5, "times the swing of a direction by errors alone: ten poses reach 1.45 by 0.1 %"
+        1.5, "times the swing by errors alone, which for ten poses reaches 1.45 in 0.1 % of cases"
     )
-    steps: int = constant(20, "to the likeliest tip and poses: with turns off by 1 deg 4 suffice")
+    steps: int = constant(20, "to the likeliest tip and poses: 4 suffice if turns are off by 1 deg")
     drawn: int = constant(100, "triples for the start: with 3 of 10 poses wrong, one in 3 has none")
     foreign: float = constant(1e-6, "chance of a pose as far off that is then left out")
     parts: int = constant(5, "of the recording, held out in turn")

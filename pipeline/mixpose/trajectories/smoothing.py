@@ -273,7 +273,7 @@ def _without_outliers_after_first(
         # but at a corner the other poses show the sudden motion as well
         trial, trial_logs, _ = smooth_with_sudden_motion(tracks.without(track, bad), model, rules)
         outliers = np.flatnonzero(bad)
-        starts = np.append(0, (outliers[1:] + outliers[:-1] + 1) // 2)  # nearest to each
+        starts = np.append(0, (outliers[1:] + outliers[:-1] + 1) // 2)  # of their nearest poses
         are_likelier = np.add.reduceat(trial_logs - logs, starts) + if_wrong[outliers] > 0
         bad[outliers] = are_likelier & (_misfits(track, trial, model, 1)[outliers] > limit)
         if not bad.any():
