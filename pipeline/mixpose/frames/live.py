@@ -198,9 +198,8 @@ class _Reader:
             except (captures.SilentError, captures.NotOpenedError):
                 last_heard = time.monotonic() if self._count > count else last_heard
                 address = self._source.address
-                is_pipe = isinstance(address, str) and captures.is_pipe(
-                    address
-                )  # its pending data are gone
+                # the pending data of a pipe are gone
+                is_pipe = isinstance(address, str) and captures.is_pipe(address)
                 if is_pipe or not self._count or time.monotonic() - last_heard > RETURN_S:
                     raise
             if self._stop.wait(_RETRY_S):

@@ -39,7 +39,7 @@ class SmoothingRules:
         10.83, "twice the gain in log likelihood, χ² of 99.9 %, by which errors are not all white"
     )
     off: float = constant(
-        0.2, "least |logarithm| of the white share: sudden motion alone makes it 0.9 to 1.05"
+        0.2, "least size of the log of the white share: sudden motion alone makes it 0.9 to 1.05"
     )
     shares: tuple[float, float] = constant(
         (-2.0, 2.0), "range of that logarithm: 4 deviations of `believed`"

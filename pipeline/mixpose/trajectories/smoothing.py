@@ -108,7 +108,7 @@ def smooth_body(
 
 @contextmanager
 def _checked_numbers(label: str) -> Iterator[dict[int, Estimate]]:
-    """Give a dict for estimates by frame; raise a RecordingError if any is not finite."""
+    """Collect estimates by frame within; raise RecordingError if numbers are out of range."""
     estimates: dict[int, Estimate] = {}
     try:
         with np.errstate(all="ignore"):
@@ -235,7 +235,7 @@ def _chosen(
 def _without_outliers(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """Leave out poses that contradict their neighbours; return that track, and it smoothed."""
+    """Return a track without poses that contradict their neighbours, and the smoothed track."""
     if _misfits(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
         # test the first pose as the last of the reversed track, which then also predicts it
         reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
@@ -258,7 +258,7 @@ def _limit(track: tracks.Track, rules: SmoothingRules) -> float:
 def _without_outliers_after_first(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """Leave out poses that contradict their neighbours, given that the first is right."""
+    """Return the same as `_without_outliers`, given that the first pose is right."""
     limit = _limit(track, rules)
     if_wrong = outlier_logs(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)
