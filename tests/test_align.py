@@ -90,8 +90,8 @@ def test_a_plane_through_many_points_keeps_origin_and_heading(up: str) -> None:
     # the old origin is right above or below the new one
     assert np.abs(np.delete(T_new_old[:3, 3], k)).max() < 1e-9
     assert rigid.is_rigid(found.T_old_new, 1e-12)
-    assert found.off is not None
-    assert found.off < 1e-9
+    assert found.rms_distance is not None
+    assert found.rms_distance < 1e-9
 
 
 @pytest.mark.parametrize("count", [3, 20])

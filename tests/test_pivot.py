@@ -80,7 +80,7 @@ def test_turns_that_err_by_three_degrees_bias_no_tip(reference: bool) -> None:
     # 1 ± 0.1, and less where parts that err so much, and are not quite linear in what they err by,
     # are taken to disagree; seldom so that people are told of it
     assert 0.65 < np.mean(squared) / 3 < 1.2
-    assert sum(tip.lasting > 4 for tip in tips) <= 4
+    assert sum(tip.held_out_ratio > 4 for tip in tips) <= 4
     assert np.mean([tip.scale for tip in tips]) == pytest.approx(1, abs=0.05)
 
 
@@ -121,7 +121,7 @@ def test_a_point_that_moves_on_slowly_is_in_the_deviation_of_the_tip() -> None:
         poses = pivoting.poses.copy()
         poses[:, :2, 3] += np.linspace(-1, 1, len(poses))[:, None]  # 2 mm along x and y
         tip = find_tip(pivoting._replace(poses=poses))
-        assert tip.lasting > 4  # by which it is told
+        assert tip.held_out_ratio > 4  # by which it is told
         error = tip.place - TIP
         squared.append(error @ np.linalg.solve(tip.covariance, error) / 3)
     # right is 1; by residuals alone, as if those of a hundred frames were independent, 19
@@ -295,6 +295,6 @@ def test_a_few_wrong_poses_lead_no_tip_astray() -> None:
 
 
 def test_parts_that_err_by_chance_disagree_as_often_as_rules_say() -> None:
-    told = [find_tip(run_of(seed)).lasting > 1 for seed in range(150)]
+    told = [find_tip(run_of(seed)).held_out_ratio > 1 for seed in range(150)]
     # 0.4 ± 0.04
     assert abs(np.mean(told) - PivotRules().accident) < 0.12

@@ -12,7 +12,7 @@ from pose_lines import covariance_of, pose_line, swinging, write_poses
 
 from mixpose.errors import RecordingError
 from mixpose.poses.evaluate import errors_to_truth, evaluate
-from mixpose.poses.foretold import truth_of_then
+from mixpose.poses.foretold import truth_ahead
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
@@ -101,9 +101,9 @@ def test_identical_bodies_have_the_numbers_of_then() -> None:
 def test_nothing_is_known_within_a_gap_of_the_truth() -> None:
     now, _ = moving(30)
     poses = foretold_file(now)
-    one = truth_of_then(truth_file(now, {10}), poses).poses
+    one = truth_ahead(truth_file(now, {10}), poses).poses
     assert [line.frame for line in one if line.T_world_object is None] == [29]
-    three = truth_of_then(truth_file(now, {10, 11, 12}), poses).poses
+    three = truth_ahead(truth_file(now, {10, 11, 12}), poses).poses
     assert [line.frame for line in three if line.T_world_object is None] == [9, 29]
 
 
@@ -111,7 +111,7 @@ def test_truth_of_poses_that_were_not_foretold_stays_as_it_is() -> None:
     now, _ = moving(5)
     truth = truth_file(now)
     poses = file_of([pose_line(k, T, None) for k, T in enumerate(now)])
-    assert truth_of_then(truth, poses) is truth
+    assert truth_ahead(truth, poses) is truth
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_truth_that_does_not_say_where_the_body_was_then_is_refused(
         "truth.jsonl",
     )
     with pytest.raises(RecordingError, match=said):
-        truth_of_then(truth, foretold_file(now))
+        truth_ahead(truth, foretold_file(now))
 
 
 def test_evaluate_reads_what_a_receiver_wrote(tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ from mixpose.errors import RecordingError
 from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
-from mixpose.trajectories.choices import unfolded
+from mixpose.trajectories.choices import unwrapped
 from mixpose.trajectories.intensity import SmoothingRules
-from mixpose.trajectories.motion import States, foretold
+from mixpose.trajectories.motion import States, predicted
 from mixpose.trajectories.smoothing import smooth_body
 from mixpose.trajectories.track import MotionModel, smooth_track, track_of
 
@@ -85,7 +85,7 @@ def test_a_body_without_noise_goes_on_as_its_rates_say(order: int) -> None:
     rates = rng.normal(size=(1, order - 1, 6)) * 0.5
     states = States(np.eye(4)[None], rates, np.eye(6 * order)[None] * 1e-6)
     elapsed, steps = 0.2, 1000
-    found, F = foretold(states, elapsed, np.zeros((1, 6)))
+    found, F = predicted(states, elapsed, np.zeros((1, 6)))
     T, dt = np.eye(4), elapsed / steps
     for k in range(steps):
         s = (k + 0.5) * dt
@@ -98,7 +98,7 @@ def test_a_body_without_noise_goes_on_as_its_rates_say(order: int) -> None:
         moved = rates.copy().reshape(-1)
         moved[i - 6] += 1e-4
         shifted = states._replace(rates=moved.reshape(rates.shape))
-        other, _ = foretold(shifted, elapsed, np.zeros((1, 6)))
+        other, _ = predicted(shifted, elapsed, np.zeros((1, 6)))
         slope = other.minus(found)[0] / 1e-4
         np.testing.assert_allclose(F[0, :, i], slope, atol=0.2**2 / 2 * elapsed)
 
@@ -289,7 +289,7 @@ def test_poses_that_look_the_same_are_turned_like_the_last_that_was_ok() -> None
         pose_line(5, T, covariance),
     ]
     symmetries = np.array([np.eye(4), half_turn])
-    found = unfolded(lines, symmetries)
+    found = unwrapped(lines, symmetries)
     assert [one.T_world_object is None for one in found] == [True, False, True] + 3 * [False]
     for one in found[3:]:
         assert one.T_world_object is not None
@@ -298,7 +298,7 @@ def test_poses_that_look_the_same_are_turned_like_the_last_that_was_ok() -> None
     assert found[4].covariance is not None
     np.testing.assert_allclose(found[4].covariance[3:, 3:], covariance[3:, 3:], atol=1e-12)
     assert np.trace(found[4].covariance[:3, :3]) > np.trace(covariance[:3, :3])
-    assert unfolded(lines, symmetries[:1]) == lines
+    assert unwrapped(lines, symmetries[:1]) == lines
 
 
 def test_what_cannot_be_smoothed_is_told() -> None:

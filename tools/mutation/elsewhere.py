@@ -139,8 +139,8 @@ MUTANTS = (
     Mutant(
         "trajectories-turns-of-wrong-poses-count",
         "trajectories/pivot.py",
-        "_require_turns(some, told, rules)",
-        "_require_turns(pivoting, told, rules)",
+        "_require_turns(inlying, factor, rules)",
+        "_require_turns(pivoting, factor, rules)",
         "a tip is told along an axis about which the tool did not turn",
         ("test_pivot.py",),
     ),

@@ -80,8 +80,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "frames/live.py",
-        "_AGAIN_S = 0.5  # between two attempts to open it",
-        "_AGAIN_S = 1.0  # between two attempts to open it",
+        "_RETRY_S = 0.5  # between two attempts to open a source",
+        "_RETRY_S = 1.0  # between two attempts to open a source",
         "only how soon a source that is not there yet is found",
     ),
     Harmless(

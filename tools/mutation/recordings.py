@@ -156,8 +156,8 @@ _VALUES = (
     Mutant(
         "frames-video-in-milliseconds",
         "frames/video.py",
-        "own = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000",
-        "own = capture.get(cv2.CAP_PROP_POS_MSEC)",
+        "time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000",
+        "time_s = capture.get(cv2.CAP_PROP_POS_MSEC)",
         "times of a video are a thousand times too large",
     ),
     Mutant(

@@ -8,8 +8,8 @@ MUTANTS = (
     Mutant(
         "trajectories-least-by-the-widest-pose",
         "trajectories/track.py",
-        "floor = np.where(some, _FLOOR * each[:, None], typical)",
-        "floor = np.where(some, _FLOOR * each.max(), typical)",
+        "floor = np.where(is_free, _FLOOR * largest[:, None], usual)",
+        "floor = np.where(is_free, _FLOOR * largest.max(), usual)",
         "a pose that says nothing makes all others say nothing",
         ("test_smooth_choices.py",),
     ),
@@ -48,8 +48,8 @@ MUTANTS = (
     Mutant(
         "trajectories-first-frame-shows-the-body",
         "trajectories/choices.py",
-        "before = first(0), 0.0 if alternatives[0].may_be_none else -np.inf",
-        "before = first(0), -np.inf",
+        "log_unstarted = states_at(0), 0.0 if alternatives[0].may_be_none else -np.inf",
+        "log_unstarted = states_at(0), -np.inf",
         "of hypotheses with which a recording begins one is right, though all are wrong",
         ("test_smooth_choices.py",),
     ),

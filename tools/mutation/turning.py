@@ -124,7 +124,7 @@ MUTANTS = (
     Mutant(
         "poses-foretold-are-held-against-their-frame",
         "poses/evaluate.py",
-        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "truth = in_unit(truth_ahead(truth, poses), unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
         "truth = in_unit(truth, unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
@@ -134,7 +134,7 @@ MUTANTS = (
     Mutant(
         "poses-foretold-numbers-by-their-frame",
         "poses/evaluate.py",
-        "truth = in_unit(truth_of_then(truth, poses), unit)\n"
+        "truth = in_unit(truth_ahead(truth, poses), unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
         "truth = in_unit(truth, unit)\n"
         "    symmetries = {**poses.symmetries, **truth.symmetries}\n    lines",
@@ -152,7 +152,7 @@ MUTANTS = (
     Mutant(
         "poses-resumed-with-another-step",
         "poses/jsonl.py",
-        '        **_sometimes("options", dict(header.options)),\n',
+        '        **_if_any("options", dict(header.options)),\n',
         "",
         "one file has poses of every frame and of every second one, with labels and without",
         ("test_cli_messages.py",),

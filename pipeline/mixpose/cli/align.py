@@ -92,7 +92,7 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
             rewriting.put_motion(table, "T_sensor_world", T, digits=digits)
     rewriting.put_starts(document, session, T_new_old)
     rewriting.put_gravity(document, session, T_new_old)
-    head = f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n"
+    head = f"{MARK} {__version__} from {session.path.name}, {floor.defined_by}.\n"
     return rewriting.text_of(document, session, head)
 
 

@@ -115,11 +115,11 @@ def _warn(tip: Tip) -> None:
             f"the tip is {np.sqrt(tip.scale):.2g} times as far off the point as poses err: it "
             "slipped, or the body bends; the deviations are as much larger"
         )
-    if tip.lasting > _SLIPPED**2:
+    if tip.held_out_ratio > _SLIPPED**2:
         warn(
-            f"parts of the recording tell tips {np.sqrt(tip.lasting):.2g} times as far apart as "
-            "errors of single frames would: the point moved on, or sensors and body err alike for "
-            "long; the deviations allow for it"
+            f"parts of the recording tell tips {np.sqrt(tip.held_out_ratio):.2g} times as far "
+            "apart as errors of single frames would: the point moved on, or sensors and body err "
+            "alike for long; the deviations allow for it"
         )
     values, vectors = np.linalg.eigh(tip.covariance)
     if values[-1] > PivotRules().uneven ** 2 * values[0]:

@@ -1,4 +1,4 @@
-"""Frames: raw recordings as streams, joined by frame number.
+"""Read raw recordings as streams of frames, joined by frame number.
 
 `open_source` finds and opens what a session names; `pair` joins the sources of all sensors.
 """

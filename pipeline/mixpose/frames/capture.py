@@ -1,4 +1,4 @@
-"""OpenCV's captures: opened, advanced and converted with complaints in one line."""
+"""Open, advance and convert captures of OpenCV, with errors of one line."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from mixpose.errors import RecordingError
 from mixpose.frames.containers import container_of
 from mixpose.records import Image
 
-PATIENCE_S = 10.0  # that a stream may take to open, and then to deliver its next frame
-_PIPE_BYTES = 2**20  # a raw frame in one piece; else writer and reader take turns for each 64 kB
-_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")  # of videos as FFmpeg tags them: 8 and 16 bits
+PATIENCE_S = 10.0  # longest time for a stream to open, and to deliver its next frame
+_PIPE_BYTES = 2**20  # holds a raw frame; else writer and reader alternate every 64 kB
+_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")  # tags of FFmpeg for grey videos of 8 and 16 bits
 
 
 class NotOpenedError(RecordingError):
-    """Nothing was found that OpenCV can read."""
+    """OpenCV cannot open the source."""
 
 
 class SilentError(RecordingError):
-    """A source gave no frame for too long, and has not ended."""
+    """A source delivered no frame for too long, and has not ended."""
 
 
 def is_pipe(address: str) -> bool:
-    """Whether a path leads to a named pipe, or to a standard input that is one."""
-    return _is(stat.S_ISFIFO, address)
+    """Test whether a path leads to a named pipe, or to a standard input that is a pipe."""
+    return _has_mode(stat.S_ISFIFO, address)
 
 
 def is_device(address: str) -> bool:
-    """Whether a path leads to a device, as ``/dev/video0``."""
-    return _is(stat.S_ISCHR, address)
+    """Test whether a path leads to a device, as ``/dev/video0``."""
+    return _has_mode(stat.S_ISCHR, address)
 
 
 def is_stream(address: str) -> bool:
-    """Whether frames come from somewhere that is no file."""
+    """Test whether frames come from a stream, pipe or device, and not from a file."""
     return "://" in address or is_pipe(address) or is_device(address)
 
 
-def _is(kind: Callable[[int], bool], address: str) -> bool:
+def _has_mode(kind: Callable[[int], bool], address: str) -> bool:
     with contextlib.suppress(OSError, ValueError):
         return kind(Path(address).stat().st_mode)
     return False
@@ -56,10 +56,10 @@ def _is(kind: Callable[[int], bool], address: str) -> bool:
 
 @contextmanager
 def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
-    """A capture of a file, pipe, device, address (with ``://``) or camera's index, for a while.
+    """Open a file, pipe, device, address (with ``://``) or camera by index, as a context.
 
-    Grey videos keep their depth. Raises RecordingError if it does not open, a stream or a pipe
-    within `PATIENCE_S`.
+    Grey videos keep their depth. Raises RecordingError if it does not open; a stream or a pipe has
+    `PATIENCE_S` for it.
     """
     quieten_opencv()
     with contextlib.ExitStack() as stack:
@@ -87,7 +87,7 @@ def _capture(address: str | int, stack: contextlib.ExitStack) -> cv2.VideoCaptur
 
 
 def _backend_for(address: str) -> int:
-    """What reads a file: FFmpeg alone for AVI, as OpenCV's own reader of these prints faults."""
+    """Return the backend for a file: FFmpeg for AVI, as OpenCV's own reader prints faults."""
     has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
     with contextlib.suppress(OSError):
         if has_ffmpeg and Path(address).is_file() and container_of(Path(address)) == "avi":
@@ -96,34 +96,34 @@ def _backend_for(address: str) -> int:
 
 
 def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
-    """Descriptor of a pipe that somebody writes to; closed with the stack."""
-    # it does not block, so that FFmpeg's limits of time hold for a writer that falls silent
+    """Return the descriptor of a pipe that has a writer; it is closed with the stack."""
+    # not blocking, so that the time limits of FFmpeg hold if the writer falls silent
     end = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     stack.callback(os.close, end)
-    with contextlib.suppress(ImportError, AttributeError, OSError):  # where pipes can be widened
+    with contextlib.suppress(ImportError, AttributeError, OSError):  # if pipes cannot be widened
         import fcntl  # noqa: PLC0415 - not on every system
 
         fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-    # a pipe that nobody has opened for writing reads as ended, but is not readable
+    # a pipe without a writer reads as ended, but is not readable
     if not select.select([end], [], [], PATIENCE_S)[0]:
         raise RecordingError(f"{path}: nothing was written to this pipe for {PATIENCE_S:g} s")
     return end
 
 
 def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
-    """Go to the next frame; False at the end, SilentError where a stream falls silent without."""
+    """Go to the next frame; return False at the end; SilentError if a stream falls silent."""
     began = time.monotonic()
-    found = capture.grab()
+    grabbed = capture.grab()
     silence = time.monotonic() - began
-    # FFmpeg gives up with what it has of a frame, which is damaged then
+    # after that time FFmpeg delivers an incomplete frame
     if silence > 0.9 * PATIENCE_S and (isinstance(address, int) or is_stream(address)):
         raise SilentError(f"{name_of(address)}: no frame came for {PATIENCE_S:g} s")
-    return bool(found)
+    return bool(grabbed)
 
 
 @dataclass
 class ColourRoom:
-    """Where the coloured frames of a capture are put, one after the other.
+    """The image that is reused for all coloured frames of a capture.
 
     To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
     """
@@ -138,12 +138,12 @@ def retrieve(
     expected: tuple[int, int] | None,
     room: ColourRoom | None = None,
 ) -> Image:
-    """Convert the grabbed frame to grey values, (H, W); `room` is kept from frame to frame.
+    """Convert the grabbed frame to grey values (H, W); `room` is reused from frame to frame.
 
     Raises RecordingError if it cannot be decoded or has not the expected width and height.
     """
-    found, image = capture.retrieve() if room is None else capture.retrieve(room.image)
-    if not found or image is None:
+    is_decoded, image = capture.retrieve() if room is None else capture.retrieve(room.image)
+    if not is_decoded or image is None:
         raise RecordingError(f"{name_of(address)}: frame {number} cannot be decoded")
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
@@ -162,15 +162,15 @@ def retrieve(
 
 
 def name_of(address: str | int) -> str:
-    """What people call a source of frames."""
+    """Return the name of a source of frames for messages."""
     return f"camera:{address}" if isinstance(address, int) else address
 
 
 def quieten_opencv() -> None:
-    """Turn off the messages of OpenCV and of its FFmpeg backend, but for whoever set their levels.
+    """Turn off messages of OpenCV and of its FFmpeg backend, unless the user has set their levels.
 
-    They would surround mixpose's own line on what cannot be read with dozens more. FFmpeg's level
-    counts only before the first video is opened.
+    They would hide mixpose's own line on what cannot be read among dozens. FFmpeg's level counts
+    only before the first video is opened.
     """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     if "OPENCV_LOG_LEVEL" not in os.environ:

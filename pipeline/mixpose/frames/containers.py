@@ -1,7 +1,7 @@
-"""Whether a video file is whole, told from its outermost structure.
+"""Test whether a video file is whole, by its outermost structure.
 
-A decoder reports the end of a truncated file like any other, and how many frames a container
-promises may be an estimate.  But AVI, MP4 and Matroska files state the sizes of their outermost
+A decoder reports the end of a truncated file like any other, and the number of frames in a
+container may be an estimate.  But AVI, MP4 and Matroska files state the sizes of their outermost
 parts, and these must fit into the file.
 """
 
@@ -21,7 +21,7 @@ _SLACK_BYTES = 8  # writers pad and count differently; frames are never this sma
 
 
 def container_of(path: Path) -> Container | None:
-    """Kind of container by content; None for any other.  OSError if it cannot be read."""
+    """Return the kind of container by content, or None; OSError if it cannot be read."""
     with path.open("rb") as file:
         head = file.read(12)
     if head[:4] == b"RIFF" and head[8:] == b"AVI ":
@@ -32,7 +32,7 @@ def container_of(path: Path) -> Container | None:
 
 
 def missing_bytes(path: Path) -> int:
-    """How many bytes a video file lacks of those that its outermost parts promise, as far as known.
+    """Return how many bytes of its outermost parts a video file lacks; 0 if they are unknown.
 
     Raises OSError if it cannot be read.
     """
@@ -47,39 +47,39 @@ def missing_bytes(path: Path) -> int:
 
 
 def _riff_end(file: BinaryIO, size: int) -> int:
-    """End of the last RIFF part; long AVI files have several (OpenDML)."""
-    at = 0
-    while at + 8 <= size:
-        file.seek(at)
+    """Return the end of the last RIFF part; long AVI files have several (OpenDML)."""
+    offset = 0
+    while offset + 8 <= size:
+        file.seek(offset)
         head = file.read(8)
         length = int.from_bytes(head[4:], "little")
-        # Recorders that were cut off leave a size of 0, streams one of all ones.
+        # interrupted recorders leave a size of 0, streams one of all ones
         if head[:4] != b"RIFF" or length in (0, 2**32 - 1):
             break
-        at += 8 + length + length % 2
-    return at
+        offset += 8 + length + length % 2
+    return offset
 
 
 def _mp4_end(file: BinaryIO, size: int) -> int:
-    """End of the last box (ISO/IEC 14496-12, section 4.2); what is no box counts as padding."""
-    at = 0
-    while at + 8 <= size:
-        file.seek(at)
+    """Return the end of the last box (ISO/IEC 14496-12, section 4.2); the rest is padding."""
+    offset = 0
+    while offset + 8 <= size:
+        file.seek(offset)
         head = file.read(16)
         length = int.from_bytes(head[:4])
         if length == 1:
             length = int.from_bytes(head[8:])
         if head[4:8] not in _MP4_BOXES or length < 8:  # 0 means up to the end of the file
             break
-        at += length
-    return at
+        offset += length
+    return offset
 
 
 def _matroska_end(file: BinaryIO, size: int) -> int:
-    """End of the segment that follows the EBML header (RFC 8794); 0 where its size is unknown."""
-    at = 0
+    """Return the end of the segment behind the EBML header (RFC 8794); 0 if its size is unknown."""
+    offset = 0
     for _ in ("header", "segment"):
-        file.seek(at)
+        file.seek(offset)
         head = file.read(12)
         if len(head) < 5 or head[4] == 0:
             return 0
@@ -88,5 +88,5 @@ def _matroska_end(file: BinaryIO, size: int) -> int:
         length = int.from_bytes(head[4 : 4 + width]) & mask
         if length == mask:
             return 0
-        at += 4 + width + length
-    return at
+        offset += 4 + width + length
+    return offset

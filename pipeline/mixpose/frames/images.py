@@ -1,4 +1,4 @@
-"""Image files as a source: their order, their numbers, and reading them whole or not at all."""
+"""Read image files as a source: order and number them, and refuse damaged ones."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ IMAGE_SUFFIXES = frozenset(_RASTERS | _PICTURES)
 _TOO_LARGE = f"found more pixels than are allowed, {MOST_PIXELS}"
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
-_PIECE = 4096  # bytes; zlib lets go of the lock from 5 kB on
+_PIECE = 4096  # bytes; zlib releases the interpreter lock from 5 kB on
 _JPEG_START = b"\xff\xd8\xff"
-# Nanoseconds since 1970 from 1973 to 2262, as long as an int64 holds them: no camera counts so far.
+# nanoseconds since 1970, from 1973 to the limit of an int64 in 2262: no camera counts so far
 _FIRST_STAMP, _LAST_STAMP = 10**17, 2**63
 _START_OF_SCAN = 0xDA
 _END_OF_IMAGE = b"\xff\xd9"
@@ -37,16 +37,16 @@ _END_OF_IMAGE = b"\xff\xd9"
 
 @dataclass(frozen=True)
 class ImageSequence(Source):
-    """Images of one camera, by ascending frame number."""
+    """Images of a camera, by ascending frame number."""
 
     kind: ClassVar[SourceKind] = "images"
     ahead: ClassVar[int] = 3
 
     paths: tuple[Path, ...]  # at least one
     numbers: tuple[int, ...]  # of the frames, ascending
-    resolution: tuple[int, int] | None  # px of every image; None means that of the first one read
+    resolution: tuple[int, int] | None  # px of all images; None: that of the first one read
     clock: Clock | None  # gives the time of a frame number
-    is_stamped: bool = False  # whether the numbers are times in ns, which the clock goes by
+    is_stamped: bool = False  # whether the numbers are times in ns, used by the clock
     has_fps: bool = False  # whether the session states a rate
 
     @property
@@ -60,7 +60,7 @@ class ImageSequence(Source):
         return self.numbers[0]
 
     def describe(self) -> str:
-        """One line for people; reads the first image."""
+        """Describe the source in a line; reads the first image."""
         image = read_image(self.paths[0])
         depth = "" if image.dtype == np.uint8 else f" {image.dtype}"
         plural = "" if self.length == 1 else "s"
@@ -68,39 +68,39 @@ class ImageSequence(Source):
         return f"{self.length} image{plural} {_size_text(_size(image))}{depth}, {numbers}"
 
     def caution(self) -> str | None:
-        """What is odd about the numbers: a file or two among numbered ones took them from all."""
+        """Describe odd frame numbers: stamps in spite of fps, an unnatural order, or places."""
         if self.is_stamped and self.has_fps:
             return (
                 "the names of its images end in times since 1970, which are taken for theirs, and "
                 "not fps; drop fps, or name a table of times"
             )
-        values, places = _endings(self.paths), [*range(self.length)]
+        endings, indices = _end_numbers(self.paths), [*range(self.length)]
         by_name = natural_order(self.paths)
         are_alike = len({re.sub("[0-9]+", "0", str(path)) for path in by_name}) == 1
-        if are_alike and values == [*self.numbers] and [*self.paths] != by_name:
-            after = next(k for k, path in enumerate(by_name) if path != self.paths[k])
+        if are_alike and endings == [*self.numbers] and [*self.paths] != by_name:
+            first = next(k for k, path in enumerate(by_name) if path != self.paths[k])
             return (
-                f"{self.paths[after].name} comes before {by_name[after].name}, as frames go by the "
+                f"{self.paths[first].name} comes before {by_name[first].name}, as frames go by the "
                 "last number of a name alone; should they go by others before it, name them anew"
             )
-        if self.length < 3 or [*self.numbers] != places or values == places:
+        if self.length < 3 or [*self.numbers] != indices or endings == indices:
             return None
-        bare = [path.name for path, value in zip(self.paths, values, strict=True) if value is None]
+        bare = [path.name for path, value in zip(self.paths, endings, strict=True) if value is None]
         if bare and len(bare) < self.length / 2:
             return (
                 f"{bare[0]} ends in no frame number but {self.length - len(bare)} others do, so "
                 "all are numbered by their place; leave it out of the source"
             )
         if not bare:
-            twice = next(v for v in values if values.count(v) > 1)
+            double = next(v for v in endings if endings.count(v) > 1)
             return (
-                f"two names end in the frame number {twice}, so all are numbered by their place; "
+                f"two names end in the frame number {double}, so all are numbered by their place; "
                 "leave one out of the source"
             )
         return None
 
     def check_times(self, wanted: range) -> None:
-        """See that each image in the range has a time."""
+        """Require a time for each image in the range."""
         require_times(self.clock, (number for number in self.numbers if number in wanted))
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
@@ -122,7 +122,7 @@ class ImageSequence(Source):
 
 
 def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) -> ImageSequence:
-    """Images in the given order as a source; they are numbered by `frame_numbers`."""
+    """Open images as a source, in the order of their `frame_numbers`."""
     numbers, ordered = zip(*sorted(zip(frame_numbers(paths), paths, strict=True)), strict=True)
     is_stamped = spec.times is None and all(_FIRST_STAMP <= n < _LAST_STAMP for n in numbers)
     clock = _time_of_stamp if is_stamped else clock
@@ -130,38 +130,38 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
 
 
 def _time_of_stamp(stamp: int) -> float:
-    """Nanoseconds as seconds."""
-    return stamp / 10**9  # of whole numbers, which Python rounds once
+    """Convert nanoseconds to seconds."""
+    return stamp / 10**9  # a quotient of whole numbers is rounded once
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
-    """Frame numbers of images: what names without extension end in, if all do and no two alike.
+    """Return frame numbers of images: those at the ends of names, if all have different ones.
 
-    Else the place in `paths`, from 0.
+    Else they are numbered by their place in `paths`, from 0.
     """
-    numbers = [number for number in _endings(paths) if number is not None]
+    numbers = [number for number in _end_numbers(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
 
 
-def _endings(paths: Sequence[Path]) -> list[int | None]:
-    """The number that each name ends in; nanoseconds, where all end in seconds since 1970."""
+def _end_numbers(paths: Sequence[Path]) -> list[int | None]:
+    """Return the numbers at the ends of names; nanoseconds if all are seconds since 1970."""
     stamps = [re.search(r"(?<![0-9])(1[0-9]{9})[.]([0-9]{1,9})$", path.stem) for path in paths]
-    times = [int(found[1] + found[2].ljust(9, "0")) for found in stamps if found]
-    if len(times) == len(paths) > 1 and not _are_counted([found[0] for found in stamps if found]):
+    times = [int(match[1] + match[2].ljust(9, "0")) for match in stamps if match]
+    if len(times) == len(paths) > 1 and not _are_counted([match[0] for match in stamps if match]):
         return [*times]
-    found = [re.search(r"[0-9]+$", path.stem) for path in paths]
-    return [int(one.group()) if one else None for one in found]
+    matches = [re.search(r"[0-9]+$", path.stem) for path in paths]
+    return [int(match.group()) if match else None for match in matches]
 
 
 def _are_counted(stamps: Sequence[str]) -> bool:
-    """Whether names as 1234567890.0001 have a number of a camera, and behind the point count up."""
+    """Test whether stamps as 1234567890.0001 are a constant number and a count of frames."""
     seconds, parts = zip(*(stamp.split(".") for stamp in stamps), strict=True)
     counts = sorted(map(int, parts))
     return len({*seconds}) == 1 and counts[-1] - counts[0] < 2 * len(counts)
 
 
 def natural_order(paths: Sequence[Path]) -> list[Path]:
-    """Sort paths as people do: numbers inside names by value, so that img9 precedes img10."""
+    """Sort paths with the numbers inside names by value, so that img9 precedes img10."""
 
     def key(path: Path) -> tuple[list[str | int], str]:
         pieces = re.split(r"([0-9]+)", str(path.with_suffix("")))
@@ -171,7 +171,7 @@ def natural_order(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_image(path: Path) -> Image:
-    """Read an image file as grey values (H, W): uint8, uint16 or float32, as deep as the file is.
+    """Read an image file as grey values (H, W) of its depth: uint8, uint16 or float32.
 
     Raises RecordingError if it cannot be read, is cut short, damaged or no image, or holds NaN.
     """
@@ -205,21 +205,21 @@ def read_image(path: Path) -> Image:
 
 
 def _bytes_of(path: Path) -> bytes:
-    """All of a file, in few calls of the operating system: each gives the interpreter away."""
+    """Read a whole file in few system calls, each of which releases the interpreter lock."""
     with reporting(RecordingError, f"{path}: cannot be read"):
         status = path.stat()
         is_file, size = stat.S_ISREG(status.st_mode), status.st_size
         if is_file and size <= MOST_IMAGE_BYTES:
             with path.open("rb", buffering=0) as file:
                 data = file.read(size)
-                # one call reads it all, but where it is interrupted or the file is cut meanwhile
+                # a call reads it all, unless it is interrupted or the file is cut meanwhile
                 return data if len(data) == size else data + file.read()
-    found = f"{size} bytes" if is_file else "no file"
-    raise RecordingError(f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}")
+    text = f"{size} bytes" if is_file else "no file"
+    raise RecordingError(f"{path}: found {text}; allowed: a file of at most {MOST_IMAGE_BYTES}")
 
 
 def _fault_of(data: bytes) -> str | None:
-    """What is wrong with the bytes of an image that a decoder may pass over or print about."""
+    """Describe a fault in the bytes of an image that a decoder may ignore, or print about."""
     if not data:
         return "the file is empty"
     if data.startswith(_PNG_START):
@@ -230,18 +230,18 @@ def _fault_of(data: bytes) -> str | None:
 
 
 def _png_fault(data: bytes) -> str | None:
-    """Walk the chunks (PNG specification, section 5) up to IEND; what follows it is harmless."""
+    """Check the chunks (PNG specification, section 5) up to IEND; what follows is harmless."""
     view = memoryview(data)
-    at = len(_PNG_START)
-    while at + 12 <= len(data):
-        kind_at, content_at = at + 4, at + 8
-        check_at = content_at + int.from_bytes(view[at:kind_at])
-        at = check_at + 4
-        if at > len(data):
+    offset = len(_PNG_START)
+    while offset + 12 <= len(data):
+        kind_at, content_at = offset + 4, offset + 8
+        check_at = content_at + int.from_bytes(view[offset:kind_at])
+        offset = check_at + 4
+        if offset > len(data):
             break
         kind = data[kind_at:content_at]
         critical = not kind[0] & 0x20
-        if critical and _checksum(view[kind_at:check_at]) != int.from_bytes(view[check_at:at]):
+        if critical and _checksum(view[kind_at:check_at]) != int.from_bytes(view[check_at:offset]):
             return f"damaged: the checksum of PNG chunk {kind!r} at byte {kind_at - 4} is wrong"
         if kind == b"IEND":
             return None
@@ -249,27 +249,27 @@ def _png_fault(data: bytes) -> str | None:
 
 
 def _checksum(content: memoryview) -> int:
-    """CRC-32 in pieces for which zlib keeps the interpreter lock."""
-    # chunks are many and small, and to get the lock back from a busy thread takes far longer
+    """Return the CRC-32, in pieces for which zlib keeps the interpreter lock."""
+    # to get the lock back from a busy thread takes far longer than a chunk, and there are many
     value = 0
-    for at in range(0, len(content), _PIECE):
-        value = zlib.crc32(content[at : at + _PIECE], value)
+    for start in range(0, len(content), _PIECE):
+        value = zlib.crc32(content[start : start + _PIECE], value)
     return value
 
 
 def _jpeg_is_whole(data: bytes) -> bool:
-    """Tell whether the end marker follows the first scan."""
-    # the segments before it are stepped over (ITU T.81, annex B), as a preview image inside them
-    # has an end marker of its own
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
+    """Test whether the end marker follows the first scan."""
+    # skip the segments before the scan (ITU T.81, annex B), as a preview image in them has an end
+    # marker, too
+    offset = 2
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == _START_OF_SCAN:
-            return data.rfind(_END_OF_IMAGE, at) >= 0
+            return data.rfind(_END_OF_IMAGE, offset) >= 0
         if marker == 0xFF:  # padding
-            at += 1
+            offset += 1
         else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4])
+            offset += 2 + int.from_bytes(data[offset + 2 : offset + 4])
     return False
 
 

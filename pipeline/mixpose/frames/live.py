@@ -1,8 +1,8 @@
-"""Live sources: cameras and streams that do not wait, of which only the newest frame counts.
+"""Read live sources: cameras and streams that do not wait, of which only the newest frame counts.
 
-A frame that arrives while the one before it is still being estimated is passed over when a newer
-one is there.  Numbers count all frames that arrived, so that those passed over leave gaps.  A
-source that falls silent is opened again for a while; meanwhile the others go on without it.
+A frame that arrives during the estimate of the frame before is skipped as soon as a newer one has
+arrived.  Numbers count all frames that arrived, so that skipped ones leave gaps.  A source that
+falls silent is opened again for a while; meanwhile the others go on without it.
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ from mixpose.records import FrameSet, Moment, RawFrame
 
 _CAMERA = re.compile(r"camera:(\d{1,4})")
 _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"}
-# what a server sends from a file is sent as fast as it is read
-_FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
-_FAREWELL_S = 1.0
+# suffixes of files, which a server sends as fast as they are read
+_FILE_SUFFIXES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
+_JOIN_S = 1.0
 
-STALLED_S = 3.0  # that the others wait for a source that has given frames before
-RETURN_S = 60.0  # that a source that has given frames may be away, until the run ends
-_KEPT = 8  # frames of each source to choose from where several are paired
-_AGAIN_S = 0.5  # between two attempts to open it
+STALLED_S = 3.0  # longest time that others wait for a source that has delivered frames
+RETURN_S = 60.0  # longest silence of a source that has delivered frames; then the run ends
+_NEWEST = 8  # newest frames of each source that are kept for pairing with others
+_RETRY_S = 0.5  # between two attempts to open a source
 
-# these carry the sender's clock; stamps of other streams FFmpeg makes up from a nominal rate
-_STAMPED = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
+# streams with stamps by the sender's clock; for others FFmpeg invents stamps from a nominal rate
+_STAMPED_SCHEMES = ("rtsp://", "rtsps://", "rtp://", "rtmp://", "srt://", "udp://")
 
 
 def live_address(source: str) -> str | int | None:
-    """The camera's index or address where a source is live; None where it is a recording."""
+    """Return the index or address of a live source; None for a recording."""
     if camera := _CAMERA.fullmatch(source):
         return int(camera[1])
     if captures.is_device(source):
         return source
-    scheme, _, rest = source.partition("://")
-    if not rest or scheme.lower() not in _SCHEMES:
+    scheme, _, location = source.partition("://")
+    if not location or scheme.lower() not in _SCHEMES:
         return None
     suffix = PurePosixPath(urlsplit(source).path).suffix.lower()
-    return None if scheme.lower().startswith("http") and suffix in _FILES else source
+    return None if scheme.lower().startswith("http") and suffix in _FILE_SUFFIXES else source
 
 
 def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
-    """A camera or a stream, opened when its frames are asked for."""
+    """Return a camera or a stream as a source."""
     address = live_address(source)
     assert address is not None, "recognised as live"
     return LiveSource(address, spec.resolution, clock)
@@ -64,7 +64,7 @@ def open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
 
 @dataclass(frozen=True)
 class LiveSource(Source):
-    """A camera or a stream, opened when its frames are asked for."""
+    """A camera or a stream, opened when its frames are requested."""
 
     kind: ClassVar[SourceKind] = "live"
     ahead: ClassVar[int] = 0
@@ -73,17 +73,17 @@ class LiveSource(Source):
 
     address: str | int  # of a stream or a device, or the index of a camera
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    clock: Clock | None  # gives the time of a frame; None: since the start, by its moment, in s
+    clock: Clock | None  # gives the time of a frame; None: its moment in s since the start
 
     def describe(self) -> str:
-        """One line for people."""
+        """Describe the source in a line."""
         return f"live {captures.name_of(self.address)}, opened when it is needed"
 
     def check_times(self, wanted: range) -> None:
-        """Nothing to look for: nobody knows which frames will come."""
+        """Require nothing, as future frames are unknown."""
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """The newest frame, each time there is one that has not been given yet.
+        """Yield the newest frame whenever there is a new one.
 
         Raises RecordingError if the source does not open or falls silent.
         """
@@ -93,50 +93,50 @@ class LiveSource(Source):
 
 
 def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[FrameSet, None, None]:
-    """The newest frames of all sources, once each has one that was not given yet.
+    """Yield the newest frames of all sources as soon as all have new ones.
 
-    Those of a set were captured nearest to the latest moment which all have reached: at most half a
-    period apart. Sets are numbered by the source that has given most frames. One that has ended is
-    left out of further sets, and one that is silent until it gives frames again. Raises
-    RecordingError if a source does not open or falls silent.
+    Frames of a set are those captured nearest to the latest moment that all have reached: at most
+    half a period apart. Sets are numbered by the source that has delivered most frames. A source is
+    left out of sets after its end, and while it is silent. Raises RecordingError if a source does
+    not open or falls silent.
     """
     began = time.monotonic()
     with ExitStack() as stack:
         readers = {
-            sensor: stack.enter_context(_Reader(source, began, _KEPT if len(sources) > 1 else 1))
+            sensor: stack.enter_context(_Reader(source, began, _NEWEST if len(sources) > 1 else 1))
             for sensor, source in sources.items()
         }
-        given = dict.fromkeys(readers, -1)
+        delivered = dict.fromkeys(readers, -1)
         stalled: set[str] = set()
         number = -1
         while number + 1 < wanted.stop:
             for sensor, reader in readers.items():
                 waits = sensor not in stalled or len(stalled) == len(readers)
-                patience = None if given[sensor] < 0 else STALLED_S if waits else 0.0
-                reader.wait(given[sensor], patience)
-            newer = {each: readers[each].newer_than(given[each]) for each in readers}
-            going = {each: frames for each, frames in newer.items() if frames}
-            left = [each for each in readers if each in going or not readers[each].has_ended]
-            if not left:
+                patience = None if delivered[sensor] < 0 else STALLED_S if waits else 0.0
+                reader.wait(delivered[sensor], patience)
+            newer = {sensor: readers[sensor].newer_than(delivered[sensor]) for sensor in readers}
+            ready = {sensor: frames for sensor, frames in newer.items() if frames}
+            active = [name for name in readers if name in ready or not readers[name].has_ended]
+            if not active:
                 return
-            readers = {each: readers[each] for each in left}
-            stalled = set(left) - set(going)
-            if not going:
+            readers = {sensor: readers[sensor] for sensor in active}
+            stalled = set(active) - set(ready)
+            if not ready:
                 continue
-            frames = _together(going)
-            given.update((sensor, frame.number) for sensor, frame in frames.items())
-            number = max(number + 1, *given.values())
+            frames = _nearest_frames(ready)
+            delivered.update((sensor, frame.number) for sensor, frame in frames.items())
+            number = max(number + 1, *delivered.values())
             if number in wanted:
                 frames = {sensor: replace(frame, number=number) for sensor, frame in frames.items()}
                 yield FrameSet(number, next(iter(frames.values())).time_s, frames)
 
 
-def _together(waiting: Mapping[str, list[RawFrame]]) -> dict[str, RawFrame]:
-    """Of each source the frame nearest to the latest moment that all of them have reached."""
-    latest = min(_seconds(frames[-1]) for frames in waiting.values())
+def _nearest_frames(frames_by_sensor: Mapping[str, list[RawFrame]]) -> dict[str, RawFrame]:
+    """Return the frame of each source that is nearest to the latest moment that all reached."""
+    latest = min(_seconds(frames[-1]) for frames in frames_by_sensor.values())
     return {
         sensor: min(frames, key=lambda frame: abs(_seconds(frame) - latest))
-        for sensor, frames in waiting.items()
+        for sensor, frames in frames_by_sensor.items()
     }
 
 
@@ -146,7 +146,7 @@ def _seconds(frame: RawFrame) -> float:
 
 
 class _Reader:
-    """Reads a live source in a thread of its own and keeps its newest frames."""
+    """Reads a live source in a thread and keeps its newest frames."""
 
     def __init__(self, source: LiveSource, began: float, kept: int) -> None:
         self._source, self._began = source, began
@@ -164,49 +164,48 @@ class _Reader:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        # a thread that still waits for a silent camera is left to end by itself
-        self._thread.join(_FAREWELL_S)
+        # a thread that waits for a silent camera longer than this ends by itself
+        self._thread.join(_JOIN_S)
 
     def wait(self, after: int, patience_s: float | None) -> None:
-        """Wait for a frame with a number above `after`, until none will come, or so long."""
+        """Wait up to `patience_s` for a frame numbered above `after`, or the end of the source."""
         with self._changed:
             self._changed.wait_for(lambda: self.newer_than(after) or self.has_ended, patience_s)
         if self._error is not None and not self.newer_than(after):
             raise self._error
 
     def newer_than(self, number: int) -> list[RawFrame]:
-        """Frames with numbers above this one, the newest last."""
+        """Return frames with numbers above this one, the newest last."""
         with self._changed:
             return [frame for frame in self._frames if frame.number > number]
 
     def _read(self) -> None:
         try:
             self._keep_newest()
-        except BaseException as caught:  # whatever it is, it belongs to the consumer
+        except BaseException as caught:  # the consumer raises it
             self._error = caught
         with self._changed:
             self.has_ended = True
             self._changed.notify_all()
 
     def _keep_newest(self) -> None:
-        heard = self._began
+        last_heard = self._began
         while True:
-            before = self._count
+            count = self._count
             try:
-                self._read_on()
+                self._read_capture()
                 return
             except (captures.SilentError, captures.NotOpenedError):
-                heard = time.monotonic() if self._count > before else heard
+                last_heard = time.monotonic() if self._count > count else last_heard
                 address = self._source.address
-                lost = isinstance(address, str) and captures.is_pipe(
-                    address
-                )  # what it held is gone
-                if lost or not self._count or time.monotonic() - heard > RETURN_S:
+                # the pending data of a pipe are gone
+                is_pipe = isinstance(address, str) and captures.is_pipe(address)
+                if is_pipe or not self._count or time.monotonic() - last_heard > RETURN_S:
                     raise
-            if self._stop.wait(_AGAIN_S):
+            if self._stop.wait(_RETRY_S):
                 return
 
-    def _read_on(self) -> None:
+    def _read_capture(self) -> None:
         address, clock = self._source.address, self._source.clock
         times = CaptureTimes(address)
         with captures.opened(address) as capture:
@@ -225,40 +224,39 @@ class _Reader:
 
 @dataclass(frozen=True)
 class ClockRules:
-    """What is believed of the clocks of cameras."""
+    """Rules for the clocks of cameras."""
 
-    drift: float = constant(1e-4, "by which clocks of cameras differ at most: quartz errs by 5e-5")
+    drift: float = constant(1e-4, "largest relative drift of two clocks: each quartz errs by 5e-5")
     longest_s: float = constant(
-        1.0, "from capture to arrival: stamps that are later are of another clock than they were"
+        1.0, "longest time from capture to arrival: with later stamps the clock has changed"
     )
 
 
 class CaptureTimes:
-    """Tells from the stamps of a live source when its frames were captured.
+    """Estimates from the stamps of a live source when its frames were captured.
 
-    A camera at this machine (V4L2) stamps frames by the machine's own clock, a stream by a clock
-    that is off by an unknown time. As no frame arrives before it was captured, the least difference
-    seen so far is taken for it (E. Olson, *A Passive Solution to the Sensor Synchronization
-    Problem*, IROS 2010): moments are late by the shortest transmission, and free of what others
-    took longer.
+    A camera of this machine (V4L2) stamps frames by the machine's clock, a stream by a clock with
+    an unknown offset. As frames arrive after their capture, the least difference of arrival and
+    stamp so far is taken for the offset (E. Olson, *A Passive Solution to the Sensor
+    Synchronization Problem*, IROS 2010): moments are late by the shortest transmission only.
     """
 
     def __init__(self, address: str | int) -> None:
         self._is_device = isinstance(address, int) or captures.is_device(address)
-        self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED)
+        self._has_stamps = self._is_device or str(address).lower().startswith(_STAMPED_SCHEMES)
         self._rules = ClockRules()
         self._last: tuple[float, float] | None = None  # stamp, and least difference
 
     def moment(self, stamp_s: float, arrived: float | None = None) -> Moment:
-        """When a frame was captured that arrived, now if not said, with a stamp in seconds."""
+        """Return when a frame with a stamp in s was captured; `arrived` is now by default."""
         arrived = time.monotonic() if arrived is None else arrived
         last, self._last = self._last, None
         if not self._has_stamps or not stamp_s > (0.0 if last is None else last[0]):
             return Moment(arrived, "arrival")
-        off = arrived - stamp_s
-        if self._is_device and 0 <= off < self._rules.longest_s:
+        difference = arrived - stamp_s
+        if self._is_device and 0 <= difference < self._rules.longest_s:
             return Moment(stamp_s, "capture")
-        if last is not None and off - last[1] < self._rules.longest_s:
-            off = min(off, last[1] + self._rules.drift * (stamp_s - last[0]))
-        self._last = stamp_s, off
-        return Moment(stamp_s + off, "capture")
+        if last is not None and difference - last[1] < self._rules.longest_s:
+            difference = min(difference, last[1] + self._rules.drift * (stamp_s - last[0]))
+        self._last = stamp_s, difference
+        return Moment(stamp_s + difference, "capture")

@@ -1,7 +1,6 @@
-"""From what the session says to the source that reads it.
+"""Open the source that a session names.
 
-A new kind of source is one file with its class, one line in `_OPENERS` and one rule in
-`_recognise`.
+A new kind of source is a file with its class, a line in `_OPENERS` and a rule in `_recognise`.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from mixpose.frames.tables import DetectionTable, open_table
 from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
-_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # one letter is a drive
-_SHOWN = 4  # names of files that a message lists
+_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)  # a single letter is a drive
+_MOST_NAMES = 4  # names of files that a message lists
 
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
@@ -49,7 +48,7 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
 
 
 def numbers_of(source: Source) -> set[int] | None:
-    """Numbers of all frames of a recording, as far as can be told without decoding it."""
+    """Return the frame numbers of a recording; None if only decoding it would tell."""
     if isinstance(source, ImageSequence):
         return set(source.numbers)
     if isinstance(source, DetectionTable):
@@ -58,16 +57,16 @@ def numbers_of(source: Source) -> set[int] | None:
 
 
 def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
-    """So many at most of the numbers, from the first to the last, in runs of neighbours."""
+    """Select at most `most` numbers, evenly from first to last, in runs of neighbours."""
     starts = np.linspace(0, len(numbers) - run, min(most, len(numbers)) // run)
     return [numbers[int(start) + k] for start in starts for k in range(run)]
 
 
 def open_source(spec: SourceSpec) -> Source:
-    """Find the recording of a sensor and open it, without reading more than its beginning.
+    """Find the recording of a sensor and open it; only its beginning is read.
 
     Raises SessionError if its options contradict each other or do not fit it, and RecordingError if
-    it is not there or cannot be read.
+    it does not exist or cannot be read.
     """
     clock = clock_of(spec)
     try:
@@ -86,12 +85,12 @@ def open_source(spec: SourceSpec) -> Source:
 
 
 def files_of(spec: SourceSpec) -> list[str]:
-    """The files of a recording, or the address of a live one; RecordingError if there is none."""
+    """Return the files of a recording, or a live address; RecordingError if there is none."""
     return _recognise(spec)[1]
 
 
 def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
-    """Kind of a source, and the files or the address it is read from."""
+    """Return the kind of a source, and the files or the address that it is read from."""
     source = spec.source
     if not isinstance(source, str) and len(source) == 1:
         source = source[0]
@@ -103,7 +102,7 @@ def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
         return "video", [source]
     path = spec.base / source
     if source and path.is_dir():
-        images = [each for each in path.iterdir() if _is_image(each) and each.is_file()]
+        images = [file for file in path.iterdir() if _is_image(file) and file.is_file()]
         if not images:
             raise RecordingError(f"{path}: no images in this folder; {_looked_in(path / '*')}")
         return "images", list(map(str, natural_order(images)))
@@ -114,7 +113,7 @@ def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
 
 
 def _listed(spec: SourceSpec, source: Sequence[str]) -> list[str]:
-    """Files of a list, in its own order."""
+    """Return the files of a list, in its order."""
     if not source:
         raise SessionError(f"sensor {spec.sensor!r}: source: found an empty list of images")
     paths = [spec.base / name for name in source]
@@ -127,12 +126,12 @@ def _listed(spec: SourceSpec, source: Sequence[str]) -> list[str]:
 
 
 def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
-    """Files that a glob matches: the images among them, else a single other file."""
+    """Return the files that a glob matches: the images among them, else a single other file."""
     path = spec.base / pattern
-    # Unlike Path.glob, this one takes absolute patterns.
+    # unlike Path.glob, this takes absolute patterns
     matches = glob.glob(pattern, root_dir=spec.base, recursive=True)  # noqa: PTH207
-    found = [spec.base / match for match in matches]
-    files = [match for match in found if match.is_file()]
+    paths = [spec.base / match for match in matches]
+    files = [match for match in paths if match.is_file()]
     images = [file for file in files if _is_image(file)]
     if images:
         return "images", natural_order(images)
@@ -150,35 +149,35 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
     )
 
 
-def _alike(name: str, wanted: str) -> float:
-    """How much a name is like one that is not there, to a tenth: 1 but for its case."""
+def _similarity(name: str, wanted: str) -> float:
+    """Return the similarity of a name to a missing one, to a tenth, regardless of case."""
     return round(SequenceMatcher(None, name.lower(), wanted.lower()).ratio(), 1)
 
 
 def _looked_in(path: Path) -> str:
-    """The folder where a file was looked for, and what lies there instead."""
+    """Describe the folder where a file was looked for, and its contents."""
     folder = path.parent
     while not folder.is_dir() and folder != folder.parent:
         folder = folder.parent
-    # dots and the working directory are spelled out: they may be the mistake
+    # dots and the working directory are resolved, as they may be the mistake
     text = f"looked in {folder.resolve()}"
     if folder != path.parent and not glob.has_magic(str(path.parent)):
         return f"there is no folder {path.parent.resolve()}"
     try:
-        names = natural_order([each for each in folder.iterdir() if each.name[:1] != "."])
+        entries = natural_order([entry for entry in folder.iterdir() if entry.name[:1] != "."])
     except OSError as error:
         return f"{text}, which cannot be read: {error.strerror}"
-    # files numbered alike are shown by their first
-    kinds = {re.sub(r"[0-9]+", "0", each.name): each.name for each in reversed(names)}
-    kept = list(kinds.values())[::-1]
-    kept.sort(key=lambda name: -_alike(name, path.name))
-    shown = ", ".join(kept[:_SHOWN])
-    more = f", ... ({len(names)} in all)" if len(names) > min(len(kinds), _SHOWN) else ""
-    return f"{text}, where there is {shown}{more}" if names else f"{text}, which is empty"
+    # of files that differ in numbers alone, show the first
+    kinds = {re.sub(r"[0-9]+", "0", entry.name): entry.name for entry in reversed(entries)}
+    names = list(kinds.values())[::-1]
+    names.sort(key=lambda name: -_similarity(name, path.name))
+    shown = ", ".join(names[:_MOST_NAMES])
+    more = f", ... ({len(entries)} in all)" if len(entries) > min(len(kinds), _MOST_NAMES) else ""
+    return f"{text}, where there is {shown}{more}" if entries else f"{text}, which is empty"
 
 
 def _is_image(path: Path) -> bool:
-    # Copies by macOS leave ._name.png beside name.png, which are no images.
+    # copies by macOS leave files ._name.png, which are no images
     return path.suffix.casefold() in IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
@@ -196,7 +195,7 @@ def _kind_of_file(spec: SourceSpec, path: Path) -> SourceKind:
 
 
 def _all_numbers(path: Path) -> bool:
-    """Tell whether the first row is a profile rather than a header."""
+    """Test whether the first row is a profile and not a header."""
     _, cells = next(csv_rows(path), (0, []))
     try:
         return bool([float(cell) for cell in cells])

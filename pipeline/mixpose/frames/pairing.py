@@ -1,8 +1,8 @@
-"""Frames of several sensors, joined by their numbers, or by the stamps that they go by.
+"""Join frames of several sensors, by their numbers or by their stamps.
 
-Robots' recorders name images after the nanosecond they were taken in, and cameras that were
-triggered together differ by microseconds: such frames, and those of tables that have times and no
-numbers, are paired by the nearest stamp.
+Recorders of robots name images after the nanosecond of their capture, and cameras triggered
+together differ by microseconds: such frames, and those of tables with times but no numbers, are
+paired by the nearest stamp.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ from mixpose.frames.source import Source, selection
 from mixpose.frames.tables import DetectionTable
 from mixpose.records import FrameSet, RawFrame
 
-READY_BYTES = 2**24  # for further frames of a source that wait, decoded
-MOST_MORE = 13  # of these: a pose may then take as long as sixteen others and delay no decoder
-_PART = 2  # of the usual distance of frames a half: farther apart they are different moments
+READY_BYTES = 2**24  # for further decoded frames of a source that wait
+MOST_MORE = 13  # further frames: a pose may take as long as 16 others, and not delay a decoder
+_REACH_DIVISOR = 2  # of the usual distance of frames: half of it apart, moments differ
 
 
 def pair(
     sources: Mapping[str, Source], start: int | None = None, stop: int | None = None, step: int = 1
 ) -> Generator[FrameSet, None, None]:
-    """Join the frames of all sources by number, ascending; of live ones the newest frames.
+    """Join the frames of all sources by number, ascending; of live sources the newest frames.
 
-    Numbers are those of ``range(start, stop, step)``, without `start` from the first that there is.
+    Numbers are those of ``range(start, stop, step)``, without `start` from the first existing one.
     A set lacks the sources that lack its number; its time is that of the first sensor, in the order
     of `sources`, that has one. Only a few frames of each source are in memory, decoded ahead in a
     thread where that pays; threads end with this generator.
 
     Raises at once: SessionError if `step` is less than 1, or live sources and recordings are mixed;
-    RecordingError if a table of times lacks rows for frames of that range. What cannot be read is a
-    RecordingError in place of the first set that lacks it.
+    RecordingError if a table of times lacks rows for frames of that range. A frame that cannot be
+    read raises a RecordingError in place of its set.
     """
     live = {sensor: source for sensor, source in sources.items() if isinstance(source, LiveSource)}
     if live and len(live) < len(sources):
@@ -65,10 +65,10 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
     with ExitStack() as stack:
         streams = {}
         for sensor, source in sources.items():
-            frames_of = source.frames(wanted.start, wanted.stop, wanted.step)
+            stream = source.frames(wanted.start, wanted.stop, wanted.step)
             if source.ahead:
-                frames_of = prefetch(frames_of, source.ahead, _more_ahead)
-            streams[sensor] = frames_of
+                stream = prefetch(stream, source.ahead, _more_ahead)
+            streams[sensor] = stream
         for stream in streams.values():
             stack.callback(stream.close)
         heads = {sensor: next(stream, None) for sensor, stream in streams.items()}
@@ -82,7 +82,7 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
             }
             for sensor, head in frames.items():
                 time_s = last[sensor] if head.time_s is None else head.time_s
-                if time_s < last[sensor]:  # velocities would be anything
+                if time_s < last[sensor]:  # velocities would be arbitrary
                     raise RecordingError(
                         f"sensor {sensor!r}: frame {head.number} is at {time_s:g} s and the frame "
                         f"before it at {last[sensor]:g} s; allowed are times that do not go back"
@@ -95,60 +95,60 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
 
 
 def _more_ahead(frame: RawFrame) -> int:
-    """How many more frames like this one are worth keeping ready: small ones, for slow poses."""
+    """Return how many more frames of this size to keep ready, for the time of a slow pose."""
     size = frame.data.nbytes if isinstance(frame.data, np.ndarray) else READY_BYTES
     return min(MOST_MORE, READY_BYTES // max(size, 1))
 
 
 def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
-    """Sources of which those that go by stamps count frames alike; each keeps its own times.
+    """Renumber the frames of sources that have stamps, so that they pair; they keep their times.
 
-    A frame gets the number of the nearest one of the sensors before, if that is nearer than half
-    the usual distance between frames and has no nearer one of the same sensor.
+    A frame gets the number of the nearest frame of earlier sensors, if that is nearer than half the
+    usual distance between frames, and no other frame of the same sensor is nearer to it.
     """
-    stamped = {name: found for name, source in sources.items() if (found := _stamps_of(source))}
+    stamped = {name: stamps for name, source in sources.items() if (stamps := _stamps_of(source))}
     if len(stamped) < 2:
         return dict(sources)
     numbers, known = dict[str, list[int]](), list[int]()
     steps = [[b - a for a, b in pairwise(stamps)] for stamps in stamped.values()]
-    reach = min((median_low(each) // _PART for each in steps if each), default=math.inf)
+    reach = min((median_low(gaps) // _REACH_DIVISOR for gaps in steps if gaps), default=math.inf)
     for name, stamps in stamped.items():
-        numbers[name] = _nearest(stamps, known, reach)
+        numbers[name] = _nearest_known(stamps, known, reach)
         known = sorted({*known, *numbers[name]})
-    # beside images a moment has their number, else its place among all
-    named = any(isinstance(sources[name], ImageSequence) for name in stamped)
-    places = {stamp: stamp if named else place for place, stamp in enumerate(known)}
+    # with images, the number is the stamp of the moment; else the index among all moments
+    has_images = any(isinstance(sources[name], ImageSequence) for name in stamped)
+    numbers_by_stamp = {stamp: stamp if has_images else index for index, stamp in enumerate(known)}
     renumbered = {
-        name: _renumbered(sources[name], [places[stamp] for stamp in found])
-        for name, found in numbers.items()
+        name: _renumbered(sources[name], [numbers_by_stamp[stamp] for stamp in stamps])
+        for name, stamps in numbers.items()
     }
     return {**sources, **renumbered}
 
 
 def _stamps_of(source: Source) -> Sequence[int]:
-    """Nanoseconds that frames of a source go by; none where they have numbers."""
+    """Return the stamps of a source in nanoseconds; none if its frames have numbers."""
     if isinstance(source, ImageSequence):
         return source.numbers if source.is_stamped else ()
     return source.stamps if isinstance(source, DetectionTable) else ()
 
 
-def _nearest(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
-    """For each number the nearest known one within reach, or itself; none is given twice."""
+def _nearest_known(numbers: Sequence[int], known: Sequence[int], reach: float) -> list[int]:
+    """Replace numbers by the nearest known ones within reach; none is used twice."""
     owners: dict[int, tuple[int, int]] = {}
-    for place, number in enumerate(numbers):
-        at = bisect_left(known, number)
-        near = min(known[max(at - 1, 0) : at + 1], key=lambda one: abs(one - number), default=None)
+    for index, number in enumerate(numbers):
+        k = bisect_left(known, number)
+        near = min(known[max(k - 1, 0) : k + 1], key=lambda n: abs(n - number), default=None)
         if near is not None and abs(near - number) < reach:
-            this = abs(near - number), place
-            owners[near] = min(owners.get(near, this), this)
-    found = list(numbers)
-    for near, (_, place) in owners.items():
-        found[place] = near
-    return found
+            claim = abs(near - number), index
+            owners[near] = min(owners.get(near, claim), claim)
+    result = list(numbers)
+    for near, (_, index) in owners.items():
+        result[index] = near
+    return result
 
 
 def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
-    """The same frames with other numbers, and the times that they had."""
+    """Give the frames of a source other numbers; they keep their times."""
     if isinstance(source, DetectionTable):
         return replace(source, places=numbers)
     assert isinstance(source, ImageSequence), "what has stamps"

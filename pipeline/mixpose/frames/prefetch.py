@@ -1,4 +1,4 @@
-"""Read ahead: an iterator that works in a thread while its consumer works on the last item."""
+"""Read ahead: run an iterator in a thread while its consumer works on the last item."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def prefetch(
 ) -> Generator[T, None, None]:
     """Yield `items` in order while a worker thread fetches the next ones.
 
-    The thread has ended when this generator is exhausted, closed or collected; `items` is advanced,
-    and closed if it can be, in that thread only. An exception of theirs comes out in its place. At
-    most `depth` items wait, one more may be on its way; `more`, told the first item, says how many
-    more may wait.
+    The thread ends when this generator is exhausted, closed or collected; only that thread advances
+    `items`, and closes it if it can be closed. An exception of `items` is raised in its place. At
+    most `depth` items wait, and another may be on its way; `more` is called with the first item and
+    returns how many more may wait.
     """
-    # items, each by itself in a tuple, and in the end what was raised, or None
+    # items in tuples of one, and in the end the exception raised, or None
     waiting: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()
     room: SimpleQueue[None] = SimpleQueue()
     for _ in range(max(depth, 1)):
@@ -39,8 +39,8 @@ def prefetch(
             raise entry
     finally:
         stop.set()
-        room.put(None)  # a worker that waits for room goes on, and stops
-        # The garbage collector may close this generator in the worker's own thread.
+        room.put(None)  # wakes a worker that waits for room, so that it stops
+        # the garbage collector may close this generator in the thread of the worker
         if worker is not threading.current_thread():
             worker.join()
 
@@ -52,8 +52,8 @@ def _fetch(
     stop: threading.Event,
     more: Callable[[T], int] | None,
 ) -> None:
-    """Move items to the queue, one for each piece of room, until they end, fail or are stopped."""
-    # two plain queues cost less than one that is bounded: their locks are not Python's
+    """Move items to the queue as there is room, until they end, fail or are stopped."""
+    # two unbounded queues cost less than a bounded one, as their locks are not in Python
     error: BaseException | None = None
     try:
         with contextlib.ExitStack() as closing:
@@ -66,7 +66,7 @@ def _fetch(
                 if stop.is_set():
                     break
                 waiting.put((item,))
-    except BaseException as caught:  # whatever it is, it belongs to the consumer
+    except BaseException as caught:  # the consumer raises it
         error = caught
     if not stop.is_set():
         waiting.put(error)

@@ -1,4 +1,4 @@
-"""Range profiles as a source: a signal over range, a row per frame."""
+"""Read range profiles as a source: a signal over range, a row per frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mixpose.records import GridPattern, RawFrame
 
 @dataclass(frozen=True)
 class RangeProfiles(Source):
-    """Range profiles of one sensor, numbered from 0."""
+    """Range profiles of a sensor, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "profiles"
     ahead: ClassVar[int] = 0
@@ -34,7 +34,7 @@ class RangeProfiles(Source):
 
     @cached_property
     def length(self) -> int:
-        """Number of profiles, also of those that a file cut short lacks."""
+        """Number of profiles, including those missing from a file cut short."""
         if _is_npy(self.path):
             return _map_npy(self.path)[1]
         with self.path.open("rb") as file:
@@ -42,11 +42,11 @@ class RangeProfiles(Source):
 
     @property
     def first(self) -> int | None:
-        """Number of the first profile; None if there is none."""
+        """Number of the first profile; None without profiles."""
         return 0 if self.bins else None
 
     def describe(self) -> str:
-        """One line for people."""
+        """Describe the source in a line."""
         if not self.bins:
             return "0 range profiles"
         reach = self.range_min + (self.bins - 1) * self.bin_size
@@ -57,7 +57,7 @@ class RangeProfiles(Source):
         )
 
     def check_times(self, wanted: range) -> None:
-        """See that each profile in the range has a time."""
+        """Require a time for each profile in the range."""
         require_times(self.clock, (number for number in range(self.length) if number in wanted))
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
@@ -102,7 +102,7 @@ def _is_npy(path: Path) -> bool:
 
 
 def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
-    """Map the rows that the file holds; how many it promises; and its bins."""
+    """Return the mapped rows of a file, the promised number of rows, and the number of bins."""
     try:
         with path.open("rb") as file:
             version = np.lib.format.read_magic(file)
@@ -114,7 +114,7 @@ def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
             offset = file.tell()
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    except Exception as error:  # NumPy reads the header as Python, which fails in many ways
+    except Exception as error:  # NumPy parses the header as Python, which fails in many ways
         raise RecordingError(f"{path}: not a .npy file or cut short") from error
     are_counts = all(type(count) is int and count > 0 for count in shape)
     if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or not are_counts:
@@ -143,7 +143,7 @@ def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
                 f"{path}: cut short: {len(rows)} of the {promised} profiles that it promises are "
                 f"whole, from 0"
             )
-        yield number, _moderate(np.asarray(rows[number]), path, number)
+        yield number, _single_precision(np.asarray(rows[number]), path, number)
 
 
 def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -154,11 +154,11 @@ def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
             return
         if number in wanted:
             values = [finite(cell, path, line, f"bin {at}") for at, cell in enumerate(cells)]
-            yield number, _moderate(np.array(values), path, number)
+            yield number, _single_precision(np.array(values), path, number)
 
 
-def _moderate(values: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
-    """A profile in single precision, in which squares of its values are added up."""
+def _single_precision(values: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
+    """Return a profile in single precision, in which its squares can be summed; else raise."""
     allowed = np.abs(values) <= LARGEST_VALUE
     if not allowed.all():
         at = int(np.argmin(allowed))

@@ -1,4 +1,4 @@
-"""Frames that show the same as the one before: a sensor that is frozen, or frames doubled."""
+"""Detect repeated frames: of a frozen sensor, or doubled ones."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 from mixpose.records import PointPattern, RawFrame
 
-_PIXELS = 37  # of an image every so many are compared first
+_STRIDE = 37  # every 37th row and column of an image are compared first
 
 
 def shown_by(frame: RawFrame) -> NDArray[Any] | None:
-    """The image of a frame, or its detections; None of another pattern."""
+    """Return the image of a frame, or its detections; None for another pattern."""
     if isinstance(frame.data, PointPattern):
         return frame.data.points
     return frame.data if isinstance(frame.data, np.ndarray) else None
 
 
 def is_same(before: NDArray[Any] | None, now: NDArray[Any]) -> bool:
-    """Whether two frames show the same, to the last digit; noise never does."""
+    """Test whether two frames are equal to the last digit; with noise they never are."""
     if before is None or before.shape != now.shape:
         return False
-    few = np.array_equal(before[::_PIXELS, ::_PIXELS], now[::_PIXELS, ::_PIXELS])
+    few = np.array_equal(before[::_STRIDE, ::_STRIDE], now[::_STRIDE, ::_STRIDE])
     return few and bool(np.array_equal(before, now))

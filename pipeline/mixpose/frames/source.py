@@ -1,4 +1,4 @@
-"""What a source of raw frames is: the user's words for it and what it can do."""
+"""Define sources of raw frames: their specification by the user, and their protocol."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profil
 Frames: TypeAlias = Generator[RawFrame, None, None]
 
 ALL_NUMBERS = range(-(10**256), 10**256)
-"""The numbers of all frames that there may be: those of file names have at most 255 digits."""
+"""All possible numbers of frames: those of file names have at most 255 digits."""
 
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """What the session says about the recording of one sensor."""
+    """Specification of the recording of a sensor in the session."""
 
     sensor: str  # name of the sensor; only for messages
     source: str | tuple[str, ...]  # glob, folder, file, pipe, address or ``camera:0``; or images
-    base: Path  # folder that a relative `source` starts from
+    base: Path  # folder to which `source` is relative
     kind: SensorKind  # what the sensor measures
-    resolution: tuple[int, int] | None = None  # px of every image; None means like the first one
+    resolution: tuple[int, int] | None = None  # px of all images; None: that of the first one
     times: Path | None = None  # table ``frame,time_s``, not relative to `base`
     fps: float | None = None  # frames per second: the time of frame n is n / fps
     # range of the first bin of a profile and distance from bin to bin, in length units
@@ -36,49 +36,49 @@ class SourceSpec:
 
 
 class Source(Protocol):
-    """A recording of one sensor, read as a stream; `frames` may be called any number of times."""
+    """A recording of a sensor, read as a stream; `frames` may be called any number of times."""
 
     @property
     def kind(self) -> SourceKind:
-        """What the recording consists of."""
+        """Kind of data in the recording."""
 
     @property
     def length(self) -> int | None:
-        """Number of frames; None where only reading to the end would tell."""
+        """Number of frames; None if only reading to the end would tell."""
 
     @property
     def first(self) -> int | None:
-        """Number of the first frame; None if there is none."""
+        """Number of the first frame; None without frames."""
 
     @property
     def ahead(self) -> int:
-        """How many frames are worth decoding ahead in a thread; 0 where reading is cheap."""
+        """Number of frames to decode ahead in a thread; 0 if reading is cheap."""
 
     def describe(self) -> str:
-        """One line for people: what, how many, which numbers."""
+        """Describe the source in a line: kind, number of frames, frame numbers."""
 
     def caution(self) -> str | None:
-        """What is odd about the recording though it can be read; None if nothing is."""
+        """Describe what is odd about a readable recording; None if nothing is."""
         return None
 
     def check_times(self, wanted: range) -> None:
-        """Look for a time for each frame in a range of numbers, without decoding frames.
+        """Require a time for each frame in a range of numbers, without decoding frames.
 
-        Raises RecordingError if the table of times lacks rows, as far as numbers are known before.
+        Raises RecordingError if the table of times lacks rows of frames known beforehand.
         """
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Frames by ascending number, those of ``range(start, stop, step)`` only, as `selection`.
+        """Yield the frames of ``range(start, stop, step)``, as by `selection`, in ascending order.
 
-        Skipped frames are not decoded. A RecordingError comes in place of the first frame that
+        Skipped frames are not decoded. A RecordingError is raised in place of the first frame that
         cannot be read.
         """
 
 
 def selection(start: int | None, stop: int | None, step: int, first: int | None) -> range:
-    """Frame numbers to read, as by `range`; without `start` from the first, without `stop` all.
+    """Return frame numbers to read, as `range`; without `start` from `first`, without `stop` all.
 
-    Raises SessionError if one is no whole number, or `step` less than 1.
+    Raises SessionError if an argument is not a whole number, or `step` is less than 1.
     """
     given: dict[str, Any] = {"start": start, "stop": stop, "step": step}
     for name, value in given.items():
@@ -92,7 +92,7 @@ def selection(start: int | None, stop: int | None, step: int, first: int | None)
 
 
 def numbers_text(first: int, last: int, count: int) -> str:
-    """Frame numbers for people: ``frames 1-12``, ``frames 0-5 with gaps``."""
+    """Describe frame numbers: ``frames 1-12``, ``frames 0-5 with gaps``."""
     if count == 1:
         return f"frame {first}"
     gaps = "" if last - first + 1 == count else " with gaps"

@@ -1,4 +1,4 @@
-"""Tables of detections as a source: points without labels, several to a frame."""
+"""Read tables of detections as a source: points without labels, several per frame."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from mixpose.errors import RecordingError
 from mixpose.frames import source, times
 from mixpose.frames.source import Frames, SensorKind, Source, SourceKind, SourceSpec
-from mixpose.frames.times import Clock, FrameTimes, csv_rows, finite, header, plain, whole
+from mixpose.frames.times import Clock, FrameTimes, column_names, csv_rows, finite, numeric, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -29,14 +29,14 @@ _COORDINATES: dict[SensorKind, tuple[str, ...]] = {
 }
 
 _LARGEST = 1e12  # squares of larger numbers overflow
-_SMALLEST_WEIGHT = 1e-12  # shares of smaller ones are lost beside others
+_SMALLEST_WEIGHT = 1e-12  # shares of smaller weights vanish in sums with others
 
 _Row: TypeAlias = tuple[float, int, list[str]]  # frame number or time, line in the file, cells
 
 
 @dataclass(frozen=True)
 class _Contents:
-    """What one look through a table tells."""
+    """Summary of the rows of a table."""
 
     in_order: bool
     rows: int
@@ -47,17 +47,17 @@ class _Contents:
 
 @dataclass(frozen=True)
 class DetectionTable(Source):
-    """Detections of one sensor, a row each; streamed where frames ascend, else read whole."""
+    """Detections of a sensor in rows; streamed if frames ascend, else read as a whole."""
 
     kind: ClassVar[SourceKind] = "detections"
     ahead: ClassVar[int] = 0
 
     path: Path  # the CSV file
     columns: tuple[str, ...]  # its header
-    coordinates: tuple[str, ...]  # names of the columns that make up a point, in order
-    clock: Clock | None  # gives the time of a frame number; None means the times in the table
-    places: Sequence[int] = range(2**62)  # numbers of its moments, where it has times alone
-    has_fps: bool = False  # whether the session states a rate, which times of its own stand for
+    coordinates: tuple[str, ...]  # names of the columns of a point, in order
+    clock: Clock | None  # gives the time of a frame number; None: times in the table
+    places: Sequence[int] = range(2**62)  # numbers of its times, if it has no frame numbers
+    has_fps: bool = False  # whether the session states a rate, which is ignored
 
     @property
     def length(self) -> int:
@@ -74,7 +74,7 @@ class DetectionTable(Source):
         return "frame" in self.columns
 
     def describe(self) -> str:
-        """One line for people."""
+        """Describe the source in a line."""
         contents = self._contents
         if contents.first is None or contents.last is None:
             return "0 detections"
@@ -82,7 +82,7 @@ class DetectionTable(Source):
         return f"{contents.rows} detections, {numbers}"
 
     def caution(self) -> str | None:
-        """What is odd: a rate of rows that have times and no numbers."""
+        """Warn of a rate if rows have times and no frame numbers."""
         if not self.has_fps:
             return None
         return (
@@ -91,34 +91,34 @@ class DetectionTable(Source):
         )
 
     def check_times(self, wanted: range) -> None:
-        """See that each frame in the range has a time; reads the table once more."""
+        """Require a time for each frame in the range; reads the table once more."""
         if isinstance(self.clock, FrameTimes):
-            own = (number for number in self.numbers() if number in wanted)
-            times.require_times(self.clock, own)
+            numbers = (number for number in self.numbers() if number in wanted)
+            times.require_times(self.clock, numbers)
 
     @property
     def stamps(self) -> list[int]:
-        """Its moments in nanoseconds, ascending, where they are all that its frames go by."""
+        """Times in nanoseconds, ascending, if frames have neither numbers nor a clock."""
         if self._is_numbered or self.clock is not None:
             return []
         return [int(key // 1) * 10**9 + round(key % 1 * 1e9) for key in self._keys()]
 
     def numbers(self) -> list[int]:
-        """Frame numbers, ascending, up to the first row that cannot be read."""
+        """Return frame numbers, ascending, up to the first row that cannot be read."""
         keys = self._keys()
         return list(map(int, keys if self._is_numbered else self.places[: len(keys)]))
 
     def _keys(self) -> list[float]:
         keys: set[float] = set()
-        with suppress(RecordingError):  # `frames` comes to it too
+        with suppress(RecordingError):  # `frames` raises it, too
             keys.update(key for key, _, _ in self._rows())
         return sorted(keys)
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Group the rows to frames; skipped frames are not converted.
+        """Group rows to frames; skipped frames are not converted.
 
-        The time of a frame is that of its earliest detection; a row of weight 0 only says that it
-        exists.
+        The time of a frame is that of its earliest detection; a row of weight 0 only states that
+        the frame exists.
         """
         wanted = source.selection(start, stop, step, self.first)
         rows: Iterator[_Row] = self._rows()
@@ -145,7 +145,7 @@ class DetectionTable(Source):
                 f"in frame {number}, as many are allowed; leave out what cannot be a feature"
             )
         try:
-            values = np.array([[float(plain(cell)) for cell in cells] for _, _, cells in group])
+            values = np.array([[float(numeric(cell)) for cell in cells] for _, _, cells in group])
         except ValueError:
             self._complain(group)
         if not np.isfinite(values).all():
@@ -167,7 +167,7 @@ class DetectionTable(Source):
         return values[:, self.columns.index(name)] if name in self.columns else None
 
     def _complain(self, rows: list[_Row]) -> NoReturn:
-        """Find the cell among the rows of a frame that is not as it should be."""
+        """Raise a RecordingError for the first faulty cell in rows of a frame."""
         for _, line, cells in rows:
             for name, cell in zip(self.columns, cells, strict=True):
                 value = finite(cell, self.path, line, name)
@@ -183,21 +183,21 @@ class DetectionTable(Source):
         raise AssertionError("complained about rows that are as they should be")
 
     def _rows(self) -> Iterator[_Row]:
-        """Rows of the file with what their frame goes by: its number, else its time."""
+        """Yield rows with the key of their frame: its number, or else its time."""
         rows = csv_rows(self.path)
         next(rows, None)
         read, name = (whole, "frame") if self._is_numbered else (finite, "time_s")
-        at = self.columns.index(name)
+        column = self.columns.index(name)
         for line, cells in rows:
-            yield read(cells[at], self.path, line, name), line, cells
+            yield read(cells[column], self.path, line, name), line, cells
 
     @cached_property
     def _contents(self) -> _Contents:
-        """Look through the table once, up to the first row that cannot be read."""
+        """Summary of the rows up to the first that cannot be read."""
         rows = frames = 0
         first = last = None
         in_order = True
-        with suppress(RecordingError):  # `frames` comes to it too, after the frames before it
+        with suppress(RecordingError):  # `frames` raises it, too, after earlier frames
             for key, _, _ in self._rows():
                 in_order = last is None or key >= last
                 if not in_order:
@@ -218,10 +218,10 @@ class DetectionTable(Source):
 
 
 def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTable:
-    """Open a table of detections; RecordingError if its header has other columns than it may."""
+    """Open a table of detections; RecordingError if columns of its header are not allowed."""
     coordinates = _COORDINATES[spec.kind]
     _, cells = next(csv_rows(path), (0, []))
-    columns = header(cells)
+    columns = column_names(cells)
     fault = _header_fault(columns, coordinates)
     if fault is not None:
         raise RecordingError(

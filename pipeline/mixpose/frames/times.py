@@ -1,6 +1,6 @@
-"""When frames were taken, from a table of times or a rate; rows of CSV files, line by line.
+"""Give frames their times, by a table or a rate; read CSV files row by row.
 
-Every complaint about a cell names the file and the line.
+Errors about a cell name the file and the line.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from mixpose.frames.source import SourceSpec
 Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
-_LISTED = 5  # frame numbers that a message names
+_MOST_NUMBERS = 5  # frame numbers that a message names
 _LARGEST_NUMBER = 10**255  # as many digits as a file name may have
 _LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """A table of times; called with a frame number it gives that frame's time."""
+    """A table of times; a call with a frame number returns its time."""
 
     path: Path  # where the table comes from; only for messages
     seconds: Mapping[int, float]  # times in s by frame number
 
     def __call__(self, number: int) -> float:
-        """Time of frame `number` in s; RecordingError where the table has none."""
+        """Return the time of a frame in s; RecordingError if the table lacks it."""
         if number not in self.seconds:
             raise RecordingError(
                 f"{self.path}: no time for frame {number}; there must be a row for each frame"
@@ -48,10 +48,10 @@ def read_times(path: Path) -> FrameTimes:
     times: dict[int, float] = {}
     rows = csv_rows(path)
     _, cells = next(rows, (0, []))
-    columns = header(cells)
+    columns = column_names(cells)
     if sorted(columns) != _COLUMNS:
-        found = ",".join(cells) or "nothing"
-        raise RecordingError(f"{path}, line 1: found {found}, the header must be frame,time_s")
+        text = ",".join(cells) or "nothing"
+        raise RecordingError(f"{path}, line 1: found {text}, the header must be frame,time_s")
     frame_column, time_column = columns.index("frame"), columns.index("time_s")
     for line, cells in rows:
         number = whole(cells[frame_column], path, line, "frame")
@@ -62,20 +62,20 @@ def read_times(path: Path) -> FrameTimes:
 
 
 def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
-    """Those of some frame numbers that a table of times has no row for; a rate has them all."""
+    """Return the frame numbers without a row in a table of times; none with a rate."""
     if not isinstance(clock, FrameTimes):
         return []
     return [number for number in numbers if number not in clock.seconds]
 
 
 def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Raise a RecordingError if a table of times lacks a row for one of some frames."""
+    """Raise a RecordingError if a table of times lacks a row of these frames."""
     missing = untimed(clock, numbers)
     if not missing:
         return
     assert isinstance(clock, FrameTimes), "rates lack nothing"
-    named = ", ".join(map(str, missing[:_LISTED]))
-    more = f", ... ({len(missing)} frames)" if len(missing) > _LISTED else ""
+    named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
+    more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
     raise RecordingError(
         f"{clock.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
         "table with a row for each frame of the recording, or fps in place of times"
@@ -83,9 +83,9 @@ def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
 
 
 def clock_of(spec: SourceSpec) -> Clock | None:
-    """What gives the frames of a source their times; None where the session does not say.
+    """Return the clock for the frames of a source; None if the session states none.
 
-    Raises SessionError if both `times` and `fps` are given, or `fps` is no positive number, and
+    Raises SessionError if both `times` and `fps` are given, or `fps` is not positive, and
     RecordingError if the table of times cannot be read.
     """
     if spec.times is not None and spec.fps is not None:
@@ -101,7 +101,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Lines, from 1, and cells of a CSV file, one row at a time; blank lines are left out.
+    """Yield line numbers, from 1, and cells of the rows of a CSV file; blank lines are skipped.
 
     Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
     """
@@ -109,7 +109,7 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     cannot = reporting(RecordingError, f"{path}: cannot be read")
     try:
         with cannot, path.open(encoding="utf-8-sig", newline="") as file:
-            # a line that is longer comes in pieces, and has not as many cells as the first
+            # longer lines come in pieces, whose numbers of cells then differ from the first row
             pieces = iter(partial(file.readline, _LONGEST_LINE), "")
             reader = csv.reader(pieces, skipinitialspace=True)
             for cells in reader:
@@ -129,13 +129,13 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise RecordingError(f"{path}: not a CSV file: {error}") from error
 
 
-def header(cells: list[str]) -> tuple[str, ...]:
-    """Column names as they are compared: without blanks around them, in small letters."""
+def column_names(cells: list[str]) -> tuple[str, ...]:
+    """Normalise column names: without blanks around them, in small letters."""
     return tuple(cell.strip().casefold() for cell in cells)
 
 
-def plain(cell: str) -> str:
-    """A cell that is to be a number; ValueError if it has what only Python takes for digits."""
+def numeric(cell: str) -> str:
+    """Return a numeric cell unchanged; ValueError for underscores, which only Python allows."""
     if "_" in cell:
         raise ValueError
     return cell
@@ -144,7 +144,7 @@ def plain(cell: str) -> str:
 def finite(cell: str, path: Path, line: int, column: str) -> float:
     """Read a cell as a finite number, else raise RecordingError."""
     try:
-        value = float(plain(cell))
+        value = float(numeric(cell))
     except ValueError:
         _complain(cell, path, line, column, "a number")
     if not math.isfinite(value):
@@ -155,7 +155,7 @@ def finite(cell: str, path: Path, line: int, column: str) -> float:
 def whole(cell: str, path: Path, line: int, column: str) -> int:
     """Read a cell as a whole number (``12`` or ``12.0``), else raise RecordingError."""
     try:
-        value = int(plain(cell))
+        value = int(numeric(cell))
     except ValueError:
         number = finite(cell, path, line, column)
         value = int(number)
@@ -167,5 +167,5 @@ def whole(cell: str, path: Path, line: int, column: str) -> int:
 
 
 def _complain(cell: str, path: Path, line: int, column: str, allowed: str) -> NoReturn:
-    found = repr(cell.strip()) if cell.strip() else "an empty cell"
-    raise RecordingError(f"{path}, line {line}: {column}: found {found}, allowed is {allowed}")
+    text = repr(cell.strip()) if cell.strip() else "an empty cell"
+    raise RecordingError(f"{path}, line {line}: {column}: found {text}, allowed is {allowed}")

@@ -1,4 +1,4 @@
-"""Video files and streams as a source."""
+"""Read video files and streams as a source."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Video(Source):
 
     address: str  # path of the file or pipe, or address of a stream (with ``://``)
     resolution: tuple[int, int] | None  # size that every frame must have, in px
-    clock: Clock | None  # gives the time of a frame number; None: times that the video holds
-    size: tuple[int, int] | None  # that the container states; None for a stream
-    promised: int | None  # number of frames that the container states or lets expect
+    clock: Clock | None  # gives the time of a frame number; None: times in the video
+    size: tuple[int, int] | None  # stated by the container; None for a stream
+    promised: int | None  # number of frames by the container, perhaps estimated
     missing: int  # bytes that the file lacks; see `missing_bytes`
 
     @property
@@ -42,7 +42,7 @@ class Video(Source):
         return self.promised
 
     def describe(self) -> str:
-        """One line for people."""
+        """Describe the source in a line."""
         if self.size is None:
             return f"video stream {self.address}"
         size = f"video {self.size[0]}x{self.size[1]}"
@@ -51,14 +51,14 @@ class Video(Source):
         return f"{size}, {numbers_text(0, self.promised - 1, self.promised)}"
 
     def check_times(self, wanted: range) -> None:
-        """See that each frame in the range has a time; where rows are missing, count the frames."""
+        """Require a time for each frame in the range; count the frames if rows are missing."""
         promised = [number for number in range(self.promised or 0) if number in wanted]
         if untimed(self.clock, promised):
-            there = self._count(min(promised[-1] + 1, wanted.stop))
-            require_times(self.clock, [number for number in promised if number < there])
+            count = self._count(min(promised[-1] + 1, wanted.stop))
+            require_times(self.clock, [number for number in promised if number < count])
 
     def _count(self, enough: int) -> int:
-        """Number of frames that can be read, counted up to a number that is enough."""
+        """Count the frames that can be read, up to a number that is enough."""
         with _opened(self.address) as capture:
             count = 0
             while count < enough and captures.grab(capture, self.address):
@@ -66,29 +66,29 @@ class Video(Source):
         return count
 
     def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Decode the frames in the range; those between are passed over, not converted.
+        """Decode the frames in the range; those between are skipped, not converted.
 
-        Raises RecordingError after the frames that can be read; the last one of a file that is cut
-        short may be half a frame and is left out.
+        Raises RecordingError after the frames that can be read; the last one of a file cut short
+        may be incomplete and is left out.
         """
         wanted = selection(start, stop, step, self.first)
         with _opened(self.address) as capture:
             number = 0
             time_s = None
-            held: RawFrame | None = None
+            pending: RawFrame | None = None
             room = captures.ColourRoom()
-            while number < wanted.stop or held is not None:
+            while number < wanted.stop or pending is not None:
                 if not captures.grab(capture, self.address):
                     self._check_end(capture, number, time_s)
                     return
-                if held is not None:
-                    yield held
-                    held = None
-                time_s = _time(capture, number, time_s)
+                if pending is not None:
+                    yield pending
+                    pending = None
+                time_s = _time_of(capture, number, time_s)
                 if number in wanted:
                     frame = self._frame(capture, number, time_s, room)
                     if self.missing:
-                        held = frame
+                        pending = frame
                     else:
                         yield frame
                 number += 1
@@ -107,7 +107,7 @@ class Video(Source):
         return RawFrame(number, time_s, image, moment)
 
     def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
-        """Complain where the video ends after `count` frames but should not."""
+        """Raise a RecordingError if the video should not end after `count` frames."""
         if self.missing:
             raise RecordingError(
                 f"{self.address}: cut short, {self.missing} bytes are missing; "
@@ -124,16 +124,16 @@ class Video(Source):
             raise RecordingError(f"{self.address}: damaged or cut short; {self._reached(count)}")
 
     def _reached(self, count: int) -> str:
-        """How far reading got."""
+        """Describe which frames could be read."""
         promised = f" of the {self.promised} that it promises" if self.promised else ""
         which = f"only {numbers_text(0, count - 1, count)}" if count > 0 else "no frame"
         return f"{which}{promised} could be read"
 
     def _ends_early(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> bool:
-        """Tell a lost end from a promise that was only an estimate."""
+        """Test whether the end is lost, and not the promised number a mere estimate."""
         # whole MP4 and Matroska files may hold fewer frames than FFmpeg counts (edit lists, varying
-        # rates). In other containers the *time* of the last frame tells: it is kept by a varying
-        # rate, but not where frames are lost
+        # rates). In other containers the *time* of the last frame decides: a varying rate keeps it,
+        # lost frames do not
         fps = capture.get(cv2.CAP_PROP_FPS)
         promised = self.promised or 0
         if count >= promised or last_time_s is None or not 0 < fps < math.inf:
@@ -147,8 +147,8 @@ class Video(Source):
 
 
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
-    """Open a video for its size and length, a stream or a pipe later; a RecordingError if it does
-    not.
+    """Open a video for its size and length, a stream or a pipe later; RecordingError if it does not
+    open.
     """
     if captures.is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)
@@ -173,18 +173,18 @@ def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
 
 @contextmanager
 def _opened(address: str) -> Iterator[cv2.VideoCapture]:
-    """A capture of a file, a pipe or a stream; why a file does not open is told from its bytes."""
+    """Open a file, a pipe or a stream; the error of a file says why, by its bytes."""
     try:
         with captures.opened(address) as capture:
             yield capture
     except captures.NotOpenedError as error:
         if captures.is_stream(address):
             raise
-        raise RecordingError(_unopened(address)) from error
+        raise RecordingError(_opening_fault(address)) from error
 
 
-def _unopened(address: str) -> str:
-    """Why a video does not open, as far as that can be told."""
+def _opening_fault(address: str) -> str:
+    """Describe why a video does not open, as far as its bytes show it."""
     try:
         container, cut = container_of(Path(address)), missing_bytes(Path(address))
     except OSError as error:
@@ -199,10 +199,10 @@ def _unopened(address: str) -> str:
     )
 
 
-def _time(capture: cv2.VideoCapture, number: int, before: float | None) -> float | None:
-    """Time of the grabbed frame in s: its own, or by the rate where it has none that grows."""
-    own = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-    if math.isfinite(own) and (number == 0 or before is None or own > before):
-        return own
+def _time_of(capture: cv2.VideoCapture, number: int, previous_s: float | None) -> float | None:
+    """Return the time of the grabbed frame in s: its stamp if it ascends, or else by the rate."""
+    time_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    if math.isfinite(time_s) and (number == 0 or previous_s is None or time_s > previous_s):
+        return time_s
     fps = capture.get(cv2.CAP_PROP_FPS)
     return number / fps if 0 < fps < math.inf else None

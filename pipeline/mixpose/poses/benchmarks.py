@@ -1,4 +1,4 @@
-"""Poses as benchmarks have them: TUM trajectories and BOP result tables.
+"""Write poses in formats of benchmarks: TUM trajectories and BOP result tables.
 
 TUM: ``time tx ty tz qx qy qz qw``, metres; `evo` opens them,
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
@@ -40,10 +40,10 @@ class TumWriter(PoseWriter):
 class BopWriter(PoseWriter):
     """Writes one row per frame that has a pose; lost frames are left out.
 
-    R (row by row) and t (mm) are those of `T_world_object`; the toolkit takes them for object to
-    camera: give it estimates that are relative to one (`estimates.relative_to`). `time` is how long
-    the estimate took in seconds, or -1 where that was not measured. The first object of the header
-    is `obj_id`, the next one more; names that it does not have follow as they occur.
+    R (row by row) and t (mm) are those of `T_world_object`; the toolkit expects object to camera:
+    give it estimates relative to a camera (`estimates.relative_to`). `time` is the duration of the
+    estimate in seconds, or -1 if it was not measured. Objects of the header are numbered from
+    `obj_id` on; names missing there follow as they occur.
     """
 
     def __init__(

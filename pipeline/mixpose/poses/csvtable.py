@@ -1,4 +1,4 @@
-"""A flat CSV table of poses: one row per frame, for spreadsheets and data frames."""
+"""Write poses as a flat CSV table: a row per frame, for spreadsheets and data frames."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ SENSOR_COLUMNS = ("used", "explained", "rms")
 
 
 class CsvWriter(PoseWriter):
-    """Writes one row per frame; what a frame does not have is an empty cell.
+    """Writes a row per frame; values that a frame lacks are empty cells.
 
-    Columns: `FRAME_COLUMNS` (where bodies are identical also instance, behind object),
-    `POSE_COLUMNS`, the upper triangle of the covariance, row by row, in the axes of
-    `mixpose.rigid`; where a body has a tip `TIP_COLUMNS`; confidence; score; `SENSOR_COLUMNS` of
-    each sensor, which the header names or else the first frame; latency_ms.
+    Columns: `FRAME_COLUMNS` (with identical bodies also instance, behind object), `POSE_COLUMNS`,
+    the upper triangle of the covariance, row by row, in the axes of `mixpose.rigid`; if a body has
+    a tip `TIP_COLUMNS`; confidence; score; `SENSOR_COLUMNS` of each sensor named by the header, or
+    else by the first frame; latency_ms.
     """
 
     def __init__(self, stream: TextIO, header: Header) -> None:
         super().__init__(stream, header)
         self._numbered = any(count > 1 for count in header.objects.values())
-        self._rows = self._begun(header.sensors) if header.sensors else None
+        self._rows = self._with_header(header.sensors) if header.sensors else None
 
-    def _begun(self, sensors: Sequence[str]) -> csv.DictWriter[str]:
-        """Write the names of the columns."""
+    def _with_header(self, sensors: Sequence[str]) -> csv.DictWriter[str]:
+        """Write the names of the columns, and return the writer of rows."""
         of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
         numbered = ["instance"] if self._numbered else []
         columns = [*FRAME_COLUMNS[:3], *numbered, *FRAME_COLUMNS[3:], *POSE_COLUMNS]
@@ -52,7 +52,7 @@ class CsvWriter(PoseWriter):
         return rows
 
     def _write(self, estimate: Estimate) -> None:
-        self._rows = self._rows or self._begun(tuple(estimate.sensors))
+        self._rows = self._rows or self._with_header(tuple(estimate.sensors))
         row = {
             "frame": estimate.frame,
             "time_s": plain(estimate.time_s),
@@ -78,13 +78,13 @@ class CsvWriter(PoseWriter):
         self._rows.writerow(row)  # csv writes None as an empty cell and floats by repr
 
     def close(self) -> None:
-        """Write the column names if no row did, and flush."""
-        self._rows = self._rows or self._begun(())
+        """Write the column names if there was no row, and flush."""
+        self._rows = self._rows or self._with_header(())
         super().close()
 
 
 def _pose_cells(estimate: Estimate) -> dict[str, Any]:
-    """Cells of the pose and its covariance, as far as there are any."""
+    """Return the cells of the pose and its covariance, as far as the estimate has them."""
     T = pose_of(estimate)
     if T is None:
         return {}
@@ -99,7 +99,7 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
 
 
 def _tip_cells(estimate: Estimate) -> dict[str, Any]:
-    """Cells of the tip, as far as there is one."""
+    """Return the cells of the tip, if the estimate has one."""
     tip, C = estimate.tip, estimate.tip_covariance
     upper = [] if C is None else plain(C[np.triu_indices(3)])
     return {} if tip is None else dict(zip(TIP_COLUMNS, [*plain(tip), *upper]))

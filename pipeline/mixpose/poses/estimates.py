@@ -1,4 +1,4 @@
-"""Pose lines as estimates again, in other units and axes, so that every writer can write them."""
+"""Turn pose lines into estimates in other units and axes, for any writer."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ _Posed = TypeVar("_Posed", bound=Estimate)
 
 
 def header_of(poses: PoseFile, unit: str, version: str) -> Header:
-    """What a poses file says about its run; `version` where it names no version of mixpose."""
-    found = poses.header
+    """Return the header of a poses file; `version` if it names no version of mixpose."""
+    header = poses.header
     names = dict.fromkeys(name for line in poses.poses for name in line.sensors)
     return Header(
         unit=unit,
-        session=found.get("session"),
-        session_sha256=found.get("session_sha256"),
-        mixpose=found.get("mixpose", version),
-        seed=found.get("seed", 0),
+        session=header.get("session"),
+        session_sha256=header.get("session_sha256"),
+        mixpose=header.get("mixpose", version),
+        seed=header.get("seed", 0),
         symmetries=poses.symmetries,
         sources=poses.sources,
-        options=found.get("options", {}),
+        options=header.get("options", {}),
         sensors=tuple(names),
         objects=objects_of(poses.poses),
-        smoothed=found.get("smoothed", {}),
+        smoothed=header.get("smoothed", {}),
         tips=any(line.tip_object is not None for line in poses.poses),
     )
 
 
 def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
-    """Names of the bodies with how many there are of each, in the order of the lines."""
+    """Count the bodies of each name, in the order of the lines."""
     counts: dict[str, int] = {}
     for line in lines:
         counts[line.object] = max(counts.get(line.object, 1), (line.instance or 0) + 1)
@@ -47,35 +47,35 @@ def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
 
 
 def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
-    """An estimate in the axes of a sensor, (4, 4): its pose is then T_sensor_object."""
+    """Return an estimate in the axes of a sensor (4, 4), so that its pose is T_sensor_object."""
     turn = np.asarray(np.kron(np.eye(2), T_sensor_world[:3, :3]), dtype=np.float64)
-    return _changed(estimate, lambda T: T_sensor_world @ T, turn)
+    return _mapped(estimate, lambda T: T_sensor_world @ T, turn)
 
 
 def relative_to_body(line: PoseLine, reference: PoseLine | None) -> PoseLine:
-    """A pose in the axes of another body, T_reference_object, as sure as both; lost without it.
+    """Return a pose in the axes of another body, T_reference_object; lost without that body.
 
-    Errors of the two are taken for independent. What else either may be is left out.
+    It is as sure as both together. Their errors count as independent. Hypotheses are left out.
     """
     T = line.T_world_object
     if reference is None or T is None or reference.T_world_object is None:
         return replace(
             line, status="lost", T_world_object=None, covariance=None, hypotheses=(), confidence=0.0
         )
-    T_reference, own, other = reference.T_world_object, line.confidence, reference.confidence
+    T_reference, p, p_reference = reference.T_world_object, line.confidence, reference.confidence
     return replace(
         line,
         status="ok" if line.status == reference.status == "ok" else "ambiguous",
         T_world_object=rigid.inverse(T_reference) @ T,
-        covariance=_of_both(line, reference, T[:3, 3] - T_reference[:3, 3]),
+        covariance=_relative_covariance(line, reference, T[:3, 3] - T_reference[:3, 3]),
         hypotheses=(),
-        confidence=None if own is None or other is None else own * other,
+        confidence=None if p is None or p_reference is None else p * p_reference,
         filled=line.filled or reference.filled,
     )
 
 
-def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
-    """The covariance (6, 6) of a pose that is `arm` (3,) away from another, in the axes of that."""
+def _relative_covariance(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
+    """Return the covariance (6, 6) of a pose `arm` (3,) away from a reference, in its axes."""
     assert reference.T_world_object is not None
     if line.covariance is None or reference.covariance is None:
         return None
@@ -84,8 +84,8 @@ def _of_both(line: PoseLine, reference: PoseLine, arm: Floats) -> Floats | None:
     return np.asarray(turn @ C @ turn.T)
 
 
-def _changed(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:
-    """An estimate of other motions, which change a twist of its pose by a matrix (6, 6)."""
+def _mapped(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: Floats) -> _Posed:
+    """Map the poses of an estimate by `motion_of`, and twists of its pose by a matrix (6, 6)."""
     T, covariance = estimate.T_world_object, estimate.covariance
     return replace(
         estimate,
@@ -99,15 +99,15 @@ def _changed(estimate: _Posed, motion_of: Callable[[Floats], Floats], by_twist: 
 
 
 def first_answers(lines: Iterable[PoseLine]) -> list[PoseLine]:
-    """The first line of each frame and body; in a truth file others may be equally right."""
-    first: dict[tuple[int, str], PoseLine] = {}
+    """Return the first line of each frame and body; a truth file may have several right ones."""
+    first_lines: dict[tuple[int, str], PoseLine] = {}
     for line in lines:
-        first.setdefault((line.frame, line.label), line)
-    return list(first.values())
+        first_lines.setdefault((line.frame, line.label), line)
+    return list(first_lines.values())
 
 
 def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
-    """The same motions with their lengths in another unit, if the file states its own."""
+    """Convert all lengths of a poses file to another unit, if it states its own."""
     if unit is None or file.unit is None or file.unit == unit:
         return file
     ratio = length_ratio(file.unit, unit)
@@ -118,11 +118,11 @@ def in_unit(file: PoseFile, unit: str | None) -> PoseFile:
     by_twist: Floats = np.diag([ratio] * 3 + [1.0] * 3)
     lines = tuple(
         replace(
-            _changed(line, scaled, by_twist),
+            _mapped(line, scaled, by_twist),
             tip_object=None if line.tip_object is None else ratio * line.tip_object,
             points={
-                name: replace(one, at=ratio * one.at, residual=ratio * one.residual)
-                for name, one in line.points.items()
+                name: replace(point, at=ratio * point.at, residual=ratio * point.residual)
+                for name, point in line.points.items()
             },
         )
         for line in file.poses

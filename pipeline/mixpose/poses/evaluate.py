@@ -1,14 +1,14 @@
-"""Poses against the truth, modulo the object's symmetries.
+"""Compare poses with the truth, modulo the object's symmetries.
 
-A frame may have several right answers: several lines in the truth file, and each of them times
-every symmetry S of the object, ``T_truth @ S``.  A pose is held against the one that is nearest in
-rotation: positions of answers are all alike, or differ just because their rotations do, which in a
-symmetry group is by many degrees.  Of answers whose rotations are alike (within `TIE_DEG`: marks in
-a row, taken for their neighbours) the one nearest in position counts.
+A frame may have several right answers: the lines of the truth file, times every symmetry S of the
+object, ``T_truth @ S``.  A pose is compared with the answer nearest in rotation: positions of
+answers are equal, or differ only with their rotations, which in a symmetry group differ by many
+degrees.  Among answers with rotations that tie (within `TIE_DEG`: marks in a row, taken for their
+neighbours) the one nearest in position counts.
 
-Rotation and position errors of a frame belong to the same right answer.  The error is the twist
-that leads from it to the pose, in the order and axes of `mixpose.rigid`; the position error is that
-of the object's origin.
+Rotation and position errors of a frame belong to the same answer.  The error is the twist from the
+answer to the pose, in the order and axes of `mixpose.rigid`; the position error is that of the
+object's origin.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses import consistency
 from mixpose.poses.estimates import in_unit
-from mixpose.poses.foretold import truth_of_then
+from mixpose.poses.foretold import truth_ahead
 from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -38,22 +38,22 @@ FrameKey: TypeAlias = tuple[int, str]
 
 @dataclass(frozen=True)
 class FrameError:
-    """What one frame's pose of one body is worth; `object` numbers identical ones."""
+    """The error of a body's pose in a frame; identical bodies are numbered in `object`."""
 
     frame: int
     object: str
-    status: Status | Literal["missing"]  # "missing" where the poses have no line for it
+    status: Status | Literal["missing"]  # "missing" if the poses have no line for it
     twist: Floats | None = None  # (6,), from the right answer to the pose, lengths and radians
-    # (6,), the same for the best of an ambiguous frame's hypotheses; the pose is one of them
+    # (6,), of the best hypothesis of an ambiguous frame, its pose included
     best_twist: Floats | None = None
     nees: float | None = None  # normalised estimation error squared; None without a covariance
-    dimensions: int = 0  # in which the covariance lets the pose err; what `nees` is expected to be
+    dimensions: int = 0  # rank of the covariance, the expected value of `nees`
     pair: tuple[Floats, Floats] | None = field(default=None, compare=False)  # pose and right answer
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How errors spread over frames; `worst_frame` is the frame of the largest one."""
+    """Statistics of errors over frames; `worst_frame` has the largest one."""
 
     rms: float
     median: float
@@ -66,14 +66,14 @@ class Spread:
 class Evaluation:
     """The outcome of an evaluation."""
 
-    unit: str | None  # unit of lengths; None where neither file says it
-    frames: int  # frames of the truth file: the sum of the four counts that follow
+    unit: str | None  # unit of lengths; None if neither file states it
+    frames: int  # frames of the truth file: the sum of the next four counts
     # by status; "missing" frames have no line in the poses file
     ok: int
     ambiguous: int
     lost: int
     missing: int
-    without_truth: int  # pose lines that the truth file says nothing about; they count nowhere else
+    without_truth: int  # pose lines without truth; they count nowhere else
     # over frames with a pose, "ambiguous" ones included; None without such a frame
     rotation_deg: Spread | None
     translation: Spread | None
@@ -84,9 +84,9 @@ class Evaluation:
     # over ambiguous frames: the error of the best hypothesis
     best_rotation_deg: Spread | None
     best_translation: Spread | None
-    nees: consistency.Consistency | None  # None where no "ok" frame has a covariance
-    bodies: Mapping[str, Evaluation] = field(default_factory=dict)  # each by itself, if several
-    swaps: Swaps | None = None  # None where no bodies are identical
+    nees: consistency.Consistency | None  # None if no "ok" frame has a covariance
+    bodies: Mapping[str, Evaluation] = field(default_factory=dict)  # of single bodies, if several
+    swaps: Swaps | None = None  # None if no bodies are identical
     offset: consistency.ConstantOffset | None = None  # that explains most errors of "ok" frames
     exchanged: bool = False  # whether the truth has covariances and the poses have none
 
@@ -108,23 +108,23 @@ def evaluate(poses: PoseFile, truth: PoseFile, *, numbered: bool = False) -> Eva
         poses, swaps = as_numbered(poses, truth)
     errors = errors_to_truth(poses, truth)
     labels = list(dict.fromkeys(error.object for error in errors))
-    whole = _evaluation(poses, truth, errors)
+    evaluation = _evaluation(poses, truth, errors)
     if len(labels) == 1:
-        return replace(whole, swaps=swaps)
+        return replace(evaluation, swaps=swaps)
     bodies = {}
     for label in labels:
-        own = replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
-        some = [error for error in errors if error.object == label]
-        bodies[label] = _evaluation(own, truth, some)
-    return replace(whole, bodies=bodies, swaps=swaps)
+        subset = replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
+        selected = [error for error in errors if error.object == label]
+        bodies[label] = _evaluation(subset, truth, selected)
+    return replace(evaluation, bodies=bodies, swaps=swaps)
 
 
 def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | None]:
-    """Poses whose identical bodies have the numbers that they have in the truth."""
+    """Give identical bodies of the poses the numbers that they have in the truth."""
     if all(line.instance is None for line in truth.poses):
         return poses, None
     unit = poses.unit or truth.unit
-    truth = in_unit(truth_of_then(truth, poses), unit)
+    truth = in_unit(truth_ahead(truth, poses), unit)
     symmetries = {**poses.symmetries, **truth.symmetries}
     lines, swaps = renumbered(poses.poses, truth.poses, symmetries)
     return replace(poses, poses=lines), swaps
@@ -156,14 +156,14 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
 
 
 def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
-    """Compare poses with the truth, one by one: per frame and body of the truth, in its order.
+    """Return the error of each frame and body of the truth, in its order.
 
-    They are in the unit of the poses; identical bodies are taken by their numbers. Truth lines
-    without a pose are passed over. Symmetries of an object are those of the truth's header; if it
-    names none, those of the poses' header. Raises RecordingError as `evaluate`.
+    Errors are in the unit of the poses; identical bodies are matched by their numbers. Truth lines
+    without a pose are skipped. Symmetries of an object are those of the truth's header, or if it
+    names none, of the poses' header. Raises RecordingError as `evaluate`.
     """
     unit = poses.unit or truth.unit
-    truth = in_unit(truth_of_then(truth, poses), unit)
+    truth = in_unit(truth_ahead(truth, poses), unit)
     symmetries = {**poses.symmetries, **truth.symmetries}
     answers: dict[FrameKey, list[Floats]] = {}
     for line in truth.poses:
@@ -173,8 +173,8 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
     lines = _by_frame(poses)
     _check_comparable(poses, truth, {name for _, name in answers})
     return tuple(
-        _frame_error(key, lines.get(key), _right_answers(found, symmetries.get(names[key[1]])))
-        for key, found in answers.items()
+        _frame_error(key, lines.get(key), _right_answers(truths, symmetries.get(names[key[1]])))
+        for key, truths in answers.items()
     )
 
 
@@ -206,7 +206,7 @@ def _names(objects: set[str]) -> str:
 
 
 def _right_answers(truths: Sequence[Floats], symmetries: Floats | None) -> Floats:
-    """Every right answer (n, 4, 4): each truth times each symmetry, the identity included."""
+    """Return all right answers (n, 4, 4): truths times symmetries, the identity included."""
     motions = np.eye(4)[None]
     if symmetries is not None:
         motions = np.concatenate([motions, symmetries])
@@ -232,7 +232,7 @@ def _frame_error(key: FrameKey, line: PoseLine | None, answers: Floats) -> Frame
 
 
 def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """The smallest error (6,) between answers (n, 4, 4) and poses (k, 4, 4), and its answer."""
+    """Return the least error (6,) between answers (n, 4, 4) and poses (k, 4, 4), its answer too."""
     twists = rigid.twist_between(answers[:, None], poses[None]).reshape(-1, 6)
     angle_deg = np.degrees(np.linalg.norm(twists[:, 3:], axis=1))
     distance = np.linalg.norm(twists[:, :3], axis=1)
@@ -241,13 +241,13 @@ def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
     return twists[nearest], answers[nearest // len(poses)]
 
 
-def _spreads(twists: Sequence[tuple[int, Floats | None]], of: str = "") -> dict[str, Any]:
-    """Spread of the angles in degrees and of the distances of errors, by their field."""
+def _spreads(twists: Sequence[tuple[int, Floats | None]], prefix: str = "") -> dict[str, Any]:
+    """Return the spreads of angles (degrees) and distances, by fields of `Evaluation`."""
     frames = [frame for frame, twist in twists if twist is not None]
     errors = np.array([twist for _, twist in twists if twist is not None]).reshape(-1, 2, 3)
     distance, angle = np.linalg.norm(errors, axis=2).T
-    found = {f"{of}rotation_deg": np.degrees(angle), f"{of}translation": distance}
-    return {name: _spread(frames, values) for name, values in found.items()}
+    fields = {f"{prefix}rotation_deg": np.degrees(angle), f"{prefix}translation": distance}
+    return {name: _spread(frames, values) for name, values in fields.items()}
 
 
 def _spread(frames: Sequence[int], values: Floats) -> Spread | None:

@@ -1,4 +1,4 @@
-"""The formats that poses are written in, by name."""
+"""List the formats of poses files, by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mixpose.poses.ros import RosWriter
 from mixpose.poses.writing import PoseWriter
 
 ONE_TRAJECTORY = ("tum", "ros")  # formats whose files hold one body each
-# each is called with a text stream and a `Header`; BOP and ROS have options of their own
+# called with a text stream and a `Header`; BOP and ROS have further options
 FORMATS: Mapping[str, Callable[..., PoseWriter]] = {
     "jsonl": JsonlWriter,
     "csv": CsvWriter,

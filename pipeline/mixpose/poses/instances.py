@@ -1,7 +1,7 @@
-"""Which of identical bodies in the poses is which in the truth, and how often they change places.
+"""Match identical bodies of the poses with those of the truth, and count their swaps.
 
 Numbers are assigned once for a whole file, so that as many poses as possible are nearest to the
-truth of theirs.  Where a body is followed into another's place, that is a swap.
+truth with their number.  It is a swap if a body is followed into the place of another.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from mixpose import rigid
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 
-_CLEARLY = 0.5  # of the distance to the body before: nearer to another by so much is a swap
+_SWAP_RATIO = 0.5  # largest distance to the new body, in that to the old one, for a swap
 
-_Paired: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
-"""By frame: numbers of the poses, numbers of the truth, and distances between them."""
+_Distances: TypeAlias = Mapping[int, tuple[list[int], list[int], Floats]]
+"""Numbers of the poses, numbers of the truth and distances between them, by frame."""
 
 
 @dataclass(frozen=True)
 class Swaps:
     """How often identical bodies changed places."""
 
-    count: int = 0  # bodies that are followed where another one of the truth is, at each change
-    announced: int = 0  # of these, of bodies not ok then, or since they last were where they belong
+    count: int = 0  # of changes to the place of another body of the truth
+    announced: int = 0  # of these, of bodies not ok then, or since they last were in their place
 
 
 def renumbered(
     poses: Sequence[PoseLine], truth: Sequence[PoseLine], symmetries: Mapping[str, Floats]
 ) -> tuple[tuple[PoseLine, ...], Swaps]:
-    """Poses whose identical bodies have the numbers of the truth, and how often they swap.
+    """Give identical bodies of the poses the numbers of the truth, and count their swaps.
 
-    Poses and truth are in one unit; symmetries (n, 4, 4) are by the name of the object.
+    Poses and truth are in one unit; symmetries (n, 4, 4) are by name of the object.
     """
     swaps, numbers = Swaps(), dict[tuple[str, int | None], int | None]()
     for name in dict.fromkeys(line.object for line in truth if line.instance is not None):
-        right = [line for line in truth if line.object == name]
-        found = [line for line in poses if line.object == name and line.instance is not None]
-        frames = _paired(found, right, symmetries.get(name))
-        for mine, theirs in _assigned(found, right, frames).items():
-            numbers[name, mine] = theirs
-        more = _swaps(found, frames)
-        swaps = Swaps(swaps.count + more.count, swaps.announced + more.announced)
+        true_lines = [line for line in truth if line.object == name]
+        numbered = [line for line in poses if line.object == name and line.instance is not None]
+        frames = _distances_by_frame(numbered, true_lines, symmetries.get(name))
+        for number, true_number in _assigned_numbers(numbered, true_lines, frames).items():
+            numbers[name, number] = true_number
+        of_name = _counted_swaps(numbered, frames)
+        swaps = Swaps(swaps.count + of_name.count, swaps.announced + of_name.announced)
     lines = tuple(
         replace(line, instance=numbers.get((line.object, line.instance), line.instance))
         for line in poses
@@ -56,23 +56,23 @@ def renumbered(
     return lines, swaps
 
 
-def _paired(
-    found: Sequence[PoseLine], right: Sequence[PoseLine], symmetries: Floats | None
-) -> _Paired:
-    truths = _by_frame(right)
+def _distances_by_frame(
+    poses: Sequence[PoseLine], truth: Sequence[PoseLine], symmetries: Floats | None
+) -> _Distances:
+    truths = _by_frame(truth)
     paired = {}
-    for frame, lines in _by_frame(found).items():
+    for frame, lines in _by_frame(poses).items():
         rows = [line for line in lines if line.T_world_object is not None]
-        columns = [one for one in truths.get(frame, []) if one.T_world_object is not None]
+        columns = [b for b in truths.get(frame, []) if b.T_world_object is not None]
         if not rows or not columns:
             continue
-        away = np.array([[_distance(a, b, symmetries) for b in columns] for a in rows])
-        paired[frame] = ([a.instance or 0 for a in rows], [b.instance or 0 for b in columns], away)
+        costs = np.array([[_distance(a, b, symmetries) for b in columns] for a in rows])
+        paired[frame] = ([a.instance or 0 for a in rows], [b.instance or 0 for b in columns], costs)
     return paired
 
 
 def _distance(a: PoseLine, b: PoseLine, symmetries: Floats | None) -> float:
-    """How far apart the origins of two poses are, for the way of turning that is nearest."""
+    """Return the distance of the origins of two poses, at the symmetry nearest in rotation."""
     assert a.T_world_object is not None
     assert b.T_world_object is not None
     alike = b.T_world_object[None] if symmetries is None else b.T_world_object @ symmetries
@@ -83,46 +83,46 @@ def _distance(a: PoseLine, b: PoseLine, symmetries: Floats | None) -> float:
 
 def _by_frame(lines: Sequence[PoseLine]) -> dict[int, list[PoseLine]]:
     frame_of = attrgetter("frame")
-    return {frame: list(some) for frame, some in groupby(sorted(lines, key=frame_of), frame_of)}
+    return {frame: list(group) for frame, group in groupby(sorted(lines, key=frame_of), frame_of)}
 
 
-def _assigned(
-    found: Sequence[PoseLine], right: Sequence[PoseLine], frames: _Paired
+def _assigned_numbers(
+    poses: Sequence[PoseLine], truth: Sequence[PoseLine], frames: _Distances
 ) -> dict[int, int]:
-    """The number of the truth that each number of the poses stands for."""
-    mine = sorted({line.instance or 0 for line in found})
-    theirs = sorted({line.instance or 0 for line in right})
-    nearest = np.zeros((len(mine), len(theirs)))
-    for rows, columns, away in frames.values():
-        for i, j in zip(*linear_sum_assignment(away), strict=True):
-            nearest[mine.index(rows[i]), theirs.index(columns[j])] += 1
-    assigned = linear_sum_assignment(nearest, maximize=True)
-    numbers = {mine[i]: theirs[j] for i, j in zip(*assigned, strict=True)}
-    # more bodies than the truth has keep numbers that it does not know
-    spare = iter(range(max([*theirs, *mine], default=0) + 1, 10**9))
-    return {number: numbers[number] if number in numbers else next(spare) for number in mine}
+    """Return the numbers of the truth by numbers of the poses."""
+    pose_numbers = sorted({line.instance or 0 for line in poses})
+    true_numbers = sorted({line.instance or 0 for line in truth})
+    counts = np.zeros((len(pose_numbers), len(true_numbers)))
+    for rows, columns, distances in frames.values():
+        for i, j in zip(*linear_sum_assignment(distances), strict=True):
+            counts[pose_numbers.index(rows[i]), true_numbers.index(columns[j])] += 1
+    assigned = linear_sum_assignment(counts, maximize=True)
+    numbers = {pose_numbers[i]: true_numbers[j] for i, j in zip(*assigned, strict=True)}
+    # bodies in excess get numbers that the truth does not have
+    unused = iter(range(max([*true_numbers, *pose_numbers], default=0) + 1, 10**9))
+    return {n: numbers[n] if n in numbers else next(unused) for n in pose_numbers}
 
 
-def _swaps(found: Sequence[PoseLine], frames: _Paired) -> Swaps:
-    status = {(line.frame, line.instance or 0): line.status for line in found}
-    holds: dict[int, int] = {}
-    doubted: dict[int, bool] = {}
+def _counted_swaps(poses: Sequence[PoseLine], frames: _Distances) -> Swaps:
+    status = {(line.frame, line.instance or 0): line.status for line in poses}
+    followed: dict[int, int] = {}
+    is_doubted: dict[int, bool] = {}
     count = announced = 0
-    for frame in sorted({line.frame for line in found}):
-        for number in {line.instance or 0 for line in found}:
+    for frame in sorted({line.frame for line in poses}):
+        for number in {line.instance or 0 for line in poses}:
             if status.get((frame, number), "lost") != "ok":
-                doubted[number] = True
+                is_doubted[number] = True
         if frame not in frames:
             continue
-        rows, columns, away = frames[frame]
-        for i, j in zip(*linear_sum_assignment(away), strict=True):
-            number, now = rows[i], columns[j]
-            before = holds.get(number)
-            if before is not None and before != now and before in columns:
-                if away[i, j] > _CLEARLY * away[i, columns.index(before)]:
-                    continue  # near neither: a wrong pose, and no swap
+        rows, columns, distances = frames[frame]
+        for i, j in zip(*linear_sum_assignment(distances), strict=True):
+            number, true_number = rows[i], columns[j]
+            before = followed.get(number)
+            if before is not None and before != true_number and before in columns:
+                if distances[i, j] > _SWAP_RATIO * distances[i, columns.index(before)]:
+                    continue  # near neither body: a wrong pose, and no swap
                 count += 1
-                announced += doubted.get(number, False)
-            holds[number] = now
-            doubted[number] = status[frame, number] != "ok"
+                announced += is_doubted.get(number, False)
+            followed[number] = true_number
+            is_doubted[number] = status[frame, number] != "ok"
     return Swaps(count, announced)

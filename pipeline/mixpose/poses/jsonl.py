@@ -1,4 +1,4 @@
-"""Poses as JSON lines: the writer, the reader, and where an interrupted run goes on."""
+"""Write and read poses as JSON lines, and find where an interrupted run goes on."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum traje
 
 
 class JsonlWriter(PoseWriter):
-    """Writes a header line, unless a run goes on in a file that has it, and a line per frame.
+    """Writes a header line, unless it resumes a file that has one, and a line per frame.
 
-    Lines are ASCII (other characters are escaped), so that the bytes depend on no locale.
+    Lines are ASCII (other characters are escaped), so that the bytes do not depend on the locale.
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
@@ -33,12 +33,12 @@ class JsonlWriter(PoseWriter):
         super().__init__(stream, header, first_line)
 
     def _write(self, estimate: Estimate) -> None:
-        # One call for the whole line: an interruption rarely leaves half of it.
+        # a single call for the whole line, so that an interruption rarely leaves half of it
         self._stream.write(json.dumps(pose_line(estimate), allow_nan=False) + "\n")
 
 
 def header_line(header: Header) -> dict[str, Any]:
-    """The first line of a poses file, as what JSON holds."""
+    """Return the first line of a poses file as a JSON object."""
     return {
         "type": "header",
         "format": FORMAT,
@@ -50,15 +50,15 @@ def header_line(header: Header) -> dict[str, Any]:
         "mixpose": header.mixpose,
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
-        **_sometimes("objects", dict(header.objects) if len(header.labels) > 1 else {}),
-        **_sometimes("sources", dict(header.sources)),
-        **_sometimes("options", dict(header.options)),
-        **_sometimes("smoothed", dict(header.smoothed)),
+        **_if_any("objects", dict(header.objects) if len(header.labels) > 1 else {}),
+        **_if_any("sources", dict(header.sources)),
+        **_if_any("options", dict(header.options)),
+        **_if_any("smoothed", dict(header.smoothed)),
     }
 
 
 def pose_line(estimate: Estimate) -> dict[str, Any]:
-    """The line of an estimate, as what JSON holds."""
+    """Return the line of an estimate as a JSON object."""
     T = pose_of(estimate)
     points = {
         name: {"at": plain(point.at), "residual": _rounded(point.residual)}
@@ -66,12 +66,12 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
     }
     return {
         "type": "pose",
-        "frame": int(estimate.frame),  # NumPy integers are no JSON
+        "frame": int(estimate.frame),  # JSON cannot hold NumPy integers
         "time_s": plain(estimate.time_s),
         "object": estimate.object,
         **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
-        **_sometimes("why", estimate.doubt),
+        **_if_any("why", estimate.doubt),
         "T_world_object": plain(T),
         "quaternion_xyzw": None if T is None else plain(rigid.quaternion_xyzw(T)),
         "covariance": None if T is None else plain(estimate.covariance),
@@ -82,31 +82,31 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
                 "used": bool(report.used),
                 "explained": plain(report.explained),
                 "rms": plain(report.rms),
-                **_sometimes("why", report.why),
-                **_sometimes("residuals", {k: _rounded(r) for k, r in report.residuals.items()}),
-                **_sometimes("labels", {k: _label(met) for k, met in report.labels.items()}),
+                **_if_any("why", report.why),
+                **_if_any("residuals", {k: _rounded(r) for k, r in report.residuals.items()}),
+                **_if_any("labels", {k: _label(label) for k, label in report.labels.items()}),
             }
             for name, report in estimate.sensors.items()
         },
-        **_sometimes("points", points),
+        **_if_any("points", points),
         "hypotheses": [
             {"T_world_object": plain(rival.T_world_object), "weight": plain(rival.weight)}
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms or 0.0),
         **_tip_of(estimate),
-        **_sometimes("filled", estimate.filled),
-        **_sometimes("ahead_s", estimate.ahead_s),
+        **_if_any("filled", estimate.filled),
+        **_if_any("ahead_s", estimate.ahead_s),
     }
 
 
-def _sometimes(key: str, value: Any) -> dict[str, Any]:
-    """A key that is there only where there is something to say."""
+def _if_any(key: str, value: Any) -> dict[str, Any]:
+    """Return a key with its value, or nothing if the value is empty."""
     return {key: value} if value else {}
 
 
 def _tip_of(estimate: Estimate) -> dict[str, Any]:
-    """Where the tip is, of a body that has one."""
+    """Return the tip and its covariance, of a body that has one."""
     if estimate.tip_object is None:
         return {}
     if estimate.status == "lost":
@@ -115,14 +115,14 @@ def _tip_of(estimate: Estimate) -> dict[str, Any]:
 
 
 def _rounded(residual: float | None) -> float | None:
-    """To the digits that anybody looks at."""
+    """Round to four significant digits."""
     return None if residual is None else float(f"{residual:.4g}")
 
 
-def _label(met: Label) -> dict[str, Any]:
-    """What a feature was met by, exactly as it was detected."""
-    place = {"at": plain(met.at)}
-    return place if met.detection is None else {**place, "detection": met.detection}
+def _label(label: Label) -> dict[str, Any]:
+    """Return the detection of a feature, unrounded."""
+    place = {"at": plain(label.at)}
+    return place if label.detection is None else {**place, "detection": label.detection}
 
 
 @dataclass(frozen=True)
@@ -130,19 +130,19 @@ class PoseFile:
     """A poses or truth file."""
 
     path: Path
-    header: Mapping[str, Any]  # the header line as it stands; empty where the file has none
+    header: Mapping[str, Any]  # the header line; empty without one
     poses: tuple[PoseLine, ...]  # in the order of the file
-    unit: str | None = None  # unit of all lengths; None where no header says it
+    unit: str | None = None  # unit of all lengths; None if no header states it
     symmetries: Mapping[str, Floats] = field(default_factory=dict)  # in the unit of the file
 
     @property
     def sources(self) -> Mapping[str, str]:
-        """Recordings that the run read in place of the session's, by sensor name."""
-        found: Mapping[str, str] = self.header.get("sources", {})
-        return found
+        """Recordings that the run read in place of the session's, by name of the sensor."""
+        sources: Mapping[str, str] = self.header.get("sources", {})
+        return sources
 
     def require_unit(self, unit: str, error: type[MixposeError], option: str = "--poses") -> None:
-        """Refuse poses that an option gives, by an error, where they are in another unit."""
+        """Raise an error if poses that an option names are in another unit."""
         if self.unit not in (None, unit):
             raise error(
                 f"{option} {self.path}: found the unit {self.unit}; allowed: that of the session, "
@@ -153,18 +153,18 @@ class PoseFile:
 def read_poses(path: str | Path) -> PoseFile:
     """Read a poses or truth file.
 
-    A line needs `frame`, `object` and `T_world_object`; all else, the header included, may be left
-    out, and unknown keys are passed over. Raises RecordingError with file and line if one is not as
-    the format says, a last line cut off by an interruption included.
+    A line needs `frame`, `object` and `T_world_object`; all else is optional, also the header, and
+    unknown keys are ignored. Raises RecordingError with file and line if a line is not in the
+    format, also if the last one was cut off by an interruption.
     """
     path = Path(path)
     return _parse(path, _read_bytes(path))
 
 
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
-    """Read a poses file that a run may still be writing, and whether its last line was cut off.
+    """Read a poses file that a run may still be writing, and tell whether its last line is cut off.
 
-    Such a line is left out. Raises RecordingError as `read_poses`, for every other line.
+    That line is left out. Raises RecordingError for any other line, as `read_poses`.
     """
     path = Path(path)
     data = _read_bytes(path)
@@ -183,21 +183,21 @@ def _is_json(line: bytes) -> bool:
 
 @dataclass(frozen=True)
 class ResumePoint:
-    """The last whole line of an interrupted run."""
+    """The end of the last whole frame of an interrupted run."""
 
     frame: int  # its frame
-    lines: int  # lines of this frame
-    size: int  # of the file up to its end, bytes
-    checksum: int  # CRC-32 of these
+    lines: int  # number of lines of this frame
+    size: int  # bytes of the file up to its end
+    checksum: int  # CRC-32 of these bytes
     first: int  # frame of the first line
 
 
 def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
-    """Find the frame that an interrupted run wrote last, for a run with this header to go on.
+    """Find the last whole frame of an interrupted run, from which a run with this header goes on.
 
-    What follows it is a half-written line, to be cut off. None where no frame is whole or no file
-    is there. Raises SessionError if the file is of another session, seed, unit, recording, options
-    or version of mixpose, and RecordingError if it is not a poses file.
+    What follows it is incomplete, to be cut off. Returns None without a whole frame or a file.
+    Raises SessionError if the file is of another session, seed, unit, recording, options or version
+    of mixpose, and RecordingError if it is not a poses file.
     """
     path = Path(path)
     if not path.exists():
@@ -220,37 +220,37 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
 
 
 def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | None, int]:
-    """The last frame that has a line for each body, and the length of the file up to there."""
+    """Return the last frame with a line for each body, and the length of the file up to its end."""
     poses, whole = file.poses, len(data)
-    last = [pose for pose in poses if pose.frame == poses[-1].frame]
-    if len(last) >= bodies:
+    last_lines = [pose for pose in poses if pose.frame == poses[-1].frame]
+    if len(last_lines) >= bodies:
         return poses[-1].frame, whole
     lines = data.split(b"\n")
-    before = poses[-len(last) - 1].frame if len(poses) > len(last) else None
-    return before, sum(len(line) + 1 for line in lines[: last[0].line - 1])
+    previous = poses[-len(last_lines) - 1].frame if len(poses) > len(last_lines) else None
+    return previous, sum(len(line) + 1 for line in lines[: last_lines[0].line - 1])
 
 
-def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:
+def _check_same_run(path: Path, earlier: Mapping[str, Any], wanted: Header) -> None:
     line = header_line(wanted)
-    # where it is gone, recording and poses were moved
-    named = Path(str(found.get("session", "")))
-    if named.is_file() and named.resolve() != Path(wanted.session or "").resolve():
+    # a session that is gone was moved with its recording and poses
+    session = Path(str(earlier.get("session", "")))
+    if session.is_file() and session.resolve() != Path(wanted.session or "").resolve():
         raise SessionError(
-            f"--resume: {path} has poses of {named}, this run is of {wanted.session}; name another "
-            "file with -o"
+            f"--resume: {path} has poses of {session}, this run is of {wanted.session}; name "
+            "another file with -o"
         )
-    if found.get("session_sha256") != line["session_sha256"]:
+    if earlier.get("session_sha256") != line["session_sha256"]:
         raise SessionError(
             f"--resume: the session has changed since {path} was written; leave out --resume to "
             "replace these poses, or name another file with -o"
         )
     for key in ("unit", "seed", "mixpose"):
-        if found.get(key) != line[key]:
+        if earlier.get(key) != line[key]:
             raise SessionError(
-                f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
+                f"--resume: {path} was written with {key} = {earlier.get(key)!r}, this run has "
                 f"{line[key]!r}; leave out --resume to start afresh, or name another file with -o"
             )
-    before, now = (_options_text(each) for each in (found, line))
+    before, now = (_options_text(header) for header in (earlier, line))
     if before != now:
         raise SessionError(
             f"--resume: {path} was written with {before}, this run has {now}; give the same, or "
@@ -259,9 +259,9 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
 
 
 def _options_text(header: Mapping[str, Any]) -> str:
-    """What a run was asked for, as it is typed."""
-    found = (header.get(key) for key in ("sources", "options"))
-    sources, options = (sorted(each.items()) if isinstance(each, dict) else [] for each in found)
+    """Return the options of a run as on the command line."""
+    items = (header.get(key) for key in ("sources", "options"))
+    sources, options = (sorted(value.items()) if isinstance(value, dict) else [] for value in items)
     words = [f"--source {name}={path}" for name, path in sources]
     words += [f"--{name}" if value is True else f"--{name} {value}" for name, value in options]
     return " ".join(words) or "no --source, --step or --labels"
@@ -270,7 +270,7 @@ def _options_text(header: Mapping[str, Any]) -> str:
 def _read_bytes(path: Path) -> bytes:
     lines: list[bytes] = []
     with reporting(RecordingError, f"{path}: cannot be read"), path.open("rb") as file:
-        # a device or a hole may be a line without end
+        # lines of a device or a sparse file may be endless
         for line in iter(partial(file.readline, MOST_BYTES + 1), b""):
             lines.append(line)
             if len(line) > MOST_BYTES:
@@ -282,7 +282,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _parse(path: Path, data: bytes) -> PoseFile:
-    """Parse a file; every error names the line."""
+    """Parse a poses file; errors name the line."""
     header: Mapping[str, Any] = {}
     unit: str | None = None
     symmetries: Mapping[str, Floats] = {}
@@ -303,7 +303,7 @@ def _parse(path: Path, data: bytes) -> PoseFile:
 
 
 def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The JSON objects of a file with their line numbers, from 1; empty lines are skipped."""
+    """Yield the JSON objects of a file with line numbers, from 1; empty lines are skipped."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -328,20 +328,20 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _kind_of(line: str) -> str:
-    """What a line is that is no JSON: one of another format that poses are written in."""
+    """Describe a line that is not JSON: it may be of another format of poses files."""
     trajectory = "found a .tum trajectory, which is not read back"
-    others = {
+    kinds = {
         "frame,time_s,": "found a .csv table of poses, which is not read back",
         "scene_id,im_id,": "found a .bop.csv table, which is not read back",
         "# time ": trajectory,
     }
     if _NUMBERS.fullmatch(line.strip()):
         return trajectory
-    return next((each for start, each in others.items() if line.startswith(start)), "not JSON")
+    return next((kind for start, kind in kinds.items() if line.startswith(start)), "not JSON")
 
 
 class _NotFiniteError(ValueError):
-    """A number that JSON does not have."""
+    """A number that JSON cannot hold."""
 
 
 def _refuse_constant(name: str) -> NoReturn:

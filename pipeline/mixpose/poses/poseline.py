@@ -1,4 +1,4 @@
-"""The lines of a poses file, checked on the way in."""
+"""Parse and check the lines of a poses file."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mixpose.poses.header import FORMAT, VERSION
 from mixpose.records import Estimate, Floats, Hypothesis, Label, MeasuredPoint, SensorReport, Status
 from mixpose.units import UNITS_PER_METRE
 
-RIGID_TOLERANCE = 1e-3  # files by other people round their rotations to a few digits
+RIGID_TOLERANCE = 1e-3  # other programs round rotations to a few digits
 _LARGEST = 1e100  # squares of larger lengths would overflow
 
 
 @dataclass(frozen=True)
 class PoseLine(Estimate):
-    """A pose line as read; one without a score, as of a truth file, counts as certain."""
+    """A pose line as read; without a score, as in a truth file, it counts as certain."""
 
-    line: int = 0  # where it stands in the file, from 1
+    line: int = 0  # line number in the file, from 1
 
 
 _Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -95,18 +95,18 @@ _Checked = TypeVar("_Checked", bound=_Line)
 
 
 def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
-    """Check the JSON object of a pose line; a RecordingError begins with `where`, file and line."""
+    """Parse the JSON object of a pose line; a RecordingError begins with `where`, file and line."""
     pose = _checked(_Pose, values, where)
     matrix = pose.T_world_object
     T = None if matrix is None else _motion(matrix, f"{where}: T_world_object")
     if (T is None) != (pose.status == "lost"):
-        found = "null or missing" if T is None else "given"
+        given = "null or missing" if T is None else "given"
         raise RecordingError(
-            f"{where}: T_world_object is {found} while status is {pose.status!r}; it is null "
+            f"{where}: T_world_object is {given} while status is {pose.status!r}; it is null "
             "where the status is 'lost' and a 4x4 matrix otherwise"
         )
-    told = dict(pose)
-    told |= {
+    fields = dict(pose)
+    fields |= {
         "line": line,
         "T_world_object": T,
         "covariance": _covariance(pose.covariance, where),
@@ -119,26 +119,26 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             name: MeasuredPoint(np.array(point.at), point.residual)
             for name, point in pose.points.items()
         },
-        "tip_object": _in_object(T, told.pop("tip"), has_tip="tip" in values),
-        "doubt": told.pop("why"),
+        "tip_object": _in_object(T, fields.pop("tip"), has_tip="tip" in values),
+        "doubt": fields.pop("why"),
     }
-    return PoseLine(**told)
+    return PoseLine(**fields)
 
 
 def _in_object(T: Floats | None, tip: list[float] | None, *, has_tip: bool) -> Floats | None:
-    """The tip in the coordinates of the body, (3,); NaN of one that a lost line does not place."""
+    """Return the tip in object coordinates (3,); NaN if the line is lost."""
     if T is None:
         return np.full(3, np.nan) if has_tip else None
     return None if tip is None else np.asarray(T[:3, :3].T @ (tip - T[:3, 3]))
 
 
 def _report(sensor: _Sensor) -> SensorReport:
-    labels = {name: Label(np.array(one.at), one.detection) for name, one in sensor.labels.items()}
+    labels = {name: Label(np.array(raw.at), raw.detection) for name, raw in sensor.labels.items()}
     return SensorReport(**{**dict(sensor), "labels": labels})
 
 
 def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:
-    """The unit and the symmetries of the JSON object of a header line, or a RecordingError."""
+    """Return the unit and symmetries of a header line, or raise a RecordingError."""
     header = _checked(_Header, values, where)
     if header.format != FORMAT:
         raise RecordingError(f"{where}: format is {header.format!r}; allowed is {FORMAT!r}")
@@ -164,16 +164,16 @@ def _checked(model: type[_Checked], values: Mapping[str, Any], where: str) -> _C
         key = ".".join(repr(str(part))[1:-1] for part in first["loc"])  # names of any characters
         if first["type"] == "missing":
             raise RecordingError(f"{where}: {key} is missing") from error
-        found = repr(first["input"])
-        found = found if len(found) <= 60 else found[:57] + "..."
-        raise RecordingError(f"{where}: {key} is {found}; {first['msg'].lower()}") from error
+        text = repr(first["input"])
+        text = text if len(text) <= 60 else text[:57] + "..."
+        raise RecordingError(f"{where}: {key} is {text}; {first['msg'].lower()}") from error
     except OverflowError as error:
         raise RecordingError(f"{where}: a number is too large") from error
 
 
 def _motion(matrix: list[list[float]], what: str) -> Floats:
     T = np.array(matrix, dtype=np.float64)
-    with np.errstate(all="ignore"):  # a rotation of huge numbers overflows, then is refused
+    with np.errstate(all="ignore"):  # huge numbers overflow, and are refused then
         is_motion = rigid.is_rigid(T, RIGID_TOLERANCE)
     if not is_motion:
         raise RecordingError(f"{what} is not a rotation and a translation within {RIGID_TOLERANCE}")
@@ -188,7 +188,7 @@ def _covariance(matrix: list[list[float]] | None, where: str) -> Floats | None:
     covariance = np.array(matrix, dtype=np.float64)
     variances = np.diag(covariance)
     if np.all(variances >= 0):
-        # Lengths and angles stand side by side, so judge the entries against their own scales.
+        # lengths and angles have different scales, so check the correlations
         scale = np.sqrt(np.where(variances > 0, variances, 1.0))
         correlation = covariance / scale[:, None] / scale
         if (

@@ -1,4 +1,4 @@
-"""An evaluation as a table for people and as a dict for programs."""
+"""Report an evaluation as a table for people and as a dict for programs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _STATISTICS = ("rms", "median", "p95", "max")
 
 
 def as_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """The evaluation as plain values for JSON; what could not be measured is None.
+    """Return the evaluation as plain values for JSON; None for what could not be measured.
 
     ``per_axis`` is the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees) the
     world's axes; ``best_hypothesis`` the errors of the best hypothesis of ambiguous frames.
@@ -27,28 +27,28 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "ok_frames": _errors(evaluation, "ok_") if evaluation.ok_rotation_deg else None,
         "best_hypothesis": best if evaluation.best_rotation_deg else None,
         "nees": None if nees is None else asdict(nees),
-        **_sometimes(evaluation),
+        **_rare_entries(evaluation),
     }
 
 
-def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
-    """What an evaluation says only where there are several bodies, or something is odd."""
+def _rare_entries(evaluation: Evaluation) -> dict[str, Any]:
+    """Return the entries that only several bodies, or odd findings, have."""
     offset, swaps = evaluation.offset, evaluation.swaps
-    told = {
+    values = {
         "constant_offset": offset and asdict(offset) | {"T": offset.T.tolist()},
         "exchanged": evaluation.exchanged,
-        "bodies": {label: as_dict(one) for label, one in evaluation.bodies.items()},
+        "bodies": {label: as_dict(body) for label, body in evaluation.bodies.items()},
         "swaps": swaps and asdict(swaps),
     }
-    return {key: value for key, value in told.items() if value}
+    return {key: value for key, value in values.items() if value}
 
 
 def as_table(evaluation: Evaluation) -> str:
-    """The evaluation as aligned plain text, several lines without a final newline."""
+    """Return the evaluation as aligned plain text, without a final newline."""
     if not evaluation.bodies:
         return "\n".join([*_one_body(evaluation), *_swap_lines(evaluation)])
     parts = [
-        f"{label}: " + "\n".join(_one_body(one)) + "\n" for label, one in evaluation.bodies.items()
+        f"{name}: " + "\n".join(_one_body(body)) + "\n" for name, body in evaluation.bodies.items()
     ]
     everything = [f"all bodies: {_counts(evaluation, 'poses')}", *_swap_lines(evaluation)]
     return "\n".join([*parts, *everything])
@@ -150,8 +150,8 @@ def _row(name: str, cells: list[str]) -> str:
     return name.ljust(24) + "".join(cell.rjust(11) for cell in cells)
 
 
-def _errors(evaluation: Evaluation, of: str = "") -> dict[str, Any]:
-    turn, shift = (getattr(evaluation, f"{of}{kind}") for kind in ("rotation_deg", "translation"))
+def _errors(evaluation: Evaluation, prefix: str = "") -> dict[str, Any]:
+    turn, shift = (getattr(evaluation, f"{prefix}{key}") for key in ("rotation_deg", "translation"))
     unit = {"unit": evaluation.unit}
     return {
         "rotation_deg": None if turn is None else asdict(turn),

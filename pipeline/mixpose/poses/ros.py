@@ -1,6 +1,6 @@
-"""ROS 2 messages as YAML: geometry_msgs/msg/PoseWithCovarianceStamped, as ``ros2 topic echo``.
+"""Write ROS 2 messages as YAML: geometry_msgs/msg/PoseWithCovarianceStamped.
 
-``ros2 topic pub --yaml-file`` publishes them; the fields are those of
+They look as by ``ros2 topic echo``, and ``ros2 topic pub --yaml-file`` publishes them:
 https://docs.ros.org/en/rolling/p/geometry_msgs/msg/PoseWithCovarianceStamped.html
 """
 
@@ -19,19 +19,19 @@ from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
 from mixpose.records import Estimate
 from mixpose.units import UNITS_PER_METRE
 
-_LARGEST_SECOND = 2**31 - 1  # builtin_interfaces/Time counts them in an int32
+_LARGEST_SECOND = 2**31 - 1  # builtin_interfaces/Time holds seconds in an int32
 
 
 class RosWriter(PoseWriter):
     """Writes a YAML document per frame that has a pose; lost frames are left out.
 
-    Metres and radians, relative to `frame_id`. The covariance is that of mixpose, which has the
-    order and the axes of the message, row by row in m², m·rad and rad²; 36 zeros, which say
-    "unknown", where there is none. A comment in front of each message names its frame and status.
+    Metres and radians, relative to `frame_id`. The covariance of mixpose has the order and axes of
+    the message already; it is written row by row in m², m·rad and rad², or as 36 zeros, which mean
+    "unknown". A comment in front of each message names its frame and status.
     """
 
     def __init__(self, stream: TextIO, header: Header, *, frame_id: str = "world") -> None:
-        import yaml  # noqa: PLC0415 - only where such messages are written
+        import yaml  # noqa: PLC0415 - only this format needs it
 
         super().__init__(stream, header)
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the former is four times as fast
@@ -59,10 +59,10 @@ class RosWriter(PoseWriter):
 def pose_message(
     estimate: Estimate, unit: str, seconds: float, frame_id: str = "world"
 ) -> dict[str, Any]:
-    """A geometry_msgs/msg/PoseWithCovarianceStamped, its fields by name, in metres and radians.
+    """Return a geometry_msgs/msg/PoseWithCovarianceStamped as a dict, in metres and radians.
 
-    The estimate has a pose, in `unit`, relative to `frame_id`. Raises RecordingError if the stamp
-    is beyond what a message can say.
+    The estimate must have a pose, in `unit`, relative to `frame_id`. Raises RecordingError if the
+    message cannot hold the time.
     """
     T, per_metre = estimate.T_world_object, UNITS_PER_METRE[unit]
     assert T is not None, "lost frames have no message"

@@ -1,8 +1,8 @@
-"""Trajectories of labelled markers, as files for programs that study movement have them.
+"""Write trajectories of labelled markers as files for programs that study movement.
 
-TRC: tables, as OpenSim and Cortex read them,
+TRC: tables, read by OpenSim and Cortex,
 https://opensimconfluence.atlassian.net/wiki/spaces/OpenSim/pages/53089972
-C3D: in binary, as most programs for movement read them (c3d.org); needs the package `ezc3d`.
+C3D: binary, read by most programs for movement (c3d.org); needs the package `ezc3d`.
 """
 
 from __future__ import annotations
@@ -28,72 +28,72 @@ from mixpose.units import length_ratio
 
 TRC_MARK = "by mixpose"  # in the first line of files that mixpose wrote
 MARKS = {"trc": ("PathFileType\t", TRC_MARK), "c3d": ("\x02P", "mixpose")}
-"""How files of a format begin, and what stands further on in those that mixpose wrote."""
+"""Beginning of files by format, and a later mark of those that mixpose wrote."""
 
 LAST_FRAME = 2**16 - 2  # numbers from 1, in 16 bits; some readers count one beyond the last
-_STAMPED = 1000  # from frame to frame, as a rule: these are stamps, in us or ns
-_FARTHEST = 10**15  # frames that a gap counts as, more than fit in any file
-_SENSORS = 7  # that a bit each says of whether they measured a point
-_STEPS = 127  # of a residual, which is a signed byte for some readers
-_SCALE_AT = 12  # byte of the header where the scale stands
+_STAMP_STEP = 1000  # median step of frame numbers from which these are stamps, in us or ns
+_LONGEST_GAP = 10**15  # most frames of a gap, more than fit in any file
+_MOST_SENSORS = 7  # sensors with a bit that says whether they measured a point
+_RESIDUAL_STEPS = 127  # values of a residual, which is a signed byte for some readers
+_SCALE_AT = 12  # byte of the header where the scale begins
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """N markers over F frames of successive numbers."""
+    """Trajectories of N markers over F frames of successive numbers."""
 
     names: tuple[str, ...]  # N, all different
-    places: Floats  # (F, N, 3), in the world; NaN where a marker is not known
-    residuals: Floats  # (F, N), a length; NaN of places that sensors did not measure
-    by_sensor: Mask  # (F, N, L), which sensors measured it
+    places: Floats  # (F, N, 3), in the world; NaN of unknown ones
+    residuals: Floats  # (F, N), lengths; NaN of places that no sensor measured
+    by_sensor: Mask  # (F, N, L), whether a sensor measured it
     first: int  # number of the first frame
     rate: float  # frames per second
     unit: str  # of lengths
 
     @property
     def is_known(self) -> Mask:
-        """Where there is a place (F, N)."""
+        """Mask (F, N) of known places."""
         return np.asarray(np.isfinite(self.places[..., 0]))
 
     @property
     def is_measured(self) -> Mask:
-        """Where sensors measured it (F, N)."""
+        """Mask (F, N) of places that sensors measured."""
         return np.asarray(np.isfinite(self.residuals))
 
 
 def numbers_of(lines: Sequence[PoseLine]) -> dict[int, int]:
-    """Numbers that frames of pose lines have in such a file, by their own.
+    """Return the numbers in such a file by frame numbers of pose lines.
 
-    The same, but where frames are numbered by stamps: these count from 0, at the usual step of
-    their times, else of the stamps. Gaps stay gaps.
+    They are the same, unless frames are numbered by stamps: these count from 0, in usual steps of
+    their times, or else of the stamps. Gaps stay gaps.
     """
     stamps = sorted({line.frame for line in lines})
     steps = [after - before for before, after in pairwise(stamps)]
-    if not steps or median_low(steps) < _STAMPED:
+    if not steps or median_low(steps) < _STAMP_STEP:
         return {number: number for number in stamps}
     times = {line.frame: line.time_s for line in lines}
     seconds = [time for number in stamps if (time := times[number]) is not None]
     elapsed = [after - before for before, after in pairwise(seconds)]
     if len(seconds) == len(stamps) and min(elapsed) > 0 and math.isfinite(sum(elapsed)):
         usual = median_low(elapsed)
-        passed = [round(min(each / usual, float(_FARTHEST))) for each in elapsed]
+        counts = [round(min(gap / usual, float(_LONGEST_GAP))) for gap in elapsed]
     else:
         step = median_low(steps)
-        passed = [(2 * each + step) // (2 * step) for each in steps]
-    return dict(zip(stamps, accumulate((max(each, 1) for each in passed), initial=0), strict=True))
+        counts = [(2 * gap + step) // (2 * step) for gap in steps]
+    return dict(zip(stamps, accumulate((max(n, 1) for n in counts), initial=0), strict=True))
 
 
 def rate_of(lines: Sequence[PoseLine], numbers: Mapping[int, int]) -> tuple[float, float] | None:
-    """Frames per second by the times of pose lines, and how far off the times are, in frames.
+    """Return frames per second by times of pose lines, and the largest error of a time, in frames.
 
-    `numbers` are those of `numbers_of`. None where lines have no times, or all are of one frame.
+    `numbers` are those of `numbers_of`. None if lines have no times, or all are of a single frame.
     Raises RecordingError if times do not ascend with the frames.
     """
     times = {line.frame: line.time_s for line in lines if line.time_s is not None}
     if len(times) < 2:
         return None
     known = sorted(times)
-    frames = np.array([numbers[each] - numbers[known[0]] for each in known], dtype=np.float64)
+    frames = np.array([numbers[frame] - numbers[known[0]] for frame in known], dtype=np.float64)
     seconds = np.array([times[number] for number in known])
     if (np.diff(seconds) <= 0).any():
         k = int(np.argmax(np.diff(seconds) <= 0))
@@ -108,13 +108,13 @@ def rate_of(lines: Sequence[PoseLine], numbers: Mapping[int, int]) -> tuple[floa
 
 
 def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
-    """Write trajectories in mm; the format cannot say which places sensors measured.
+    """Write trajectories in mm; the format cannot hold which places sensors measured.
 
-    Unknown is NaN: an empty cell would shift the row where readers split at any space. The file's
-    name `called` stands in its first line.
+    Unknown coordinates are NaN, as an empty cell would shift the row for readers that split at any
+    space. The first line contains the name of the file, `called`.
     """
     frames, markers = trajectories.places.shape[:2]
-    # columns are told apart by tabs, and by some readers at any white space
+    # tabs part columns, but some readers split at any white space
     names = distinct(trajectories.names, partial(re.sub, r"\s", "_"))
     rate, first = repr(trajectories.rate), trajectories.first
     axes = [f"{axis}{k + 1}" for k in range(markers) for axis in "XYZ"]
@@ -139,14 +139,14 @@ def write_trc(stream: TextIO, trajectories: Trajectories, called: str) -> None:
 
 
 def write_c3d(path: Path, trajectories: Trajectories) -> bool:
-    """Write trajectories in mm, and tell whether frame n of mixpose is frame n + 1 there.
+    """Write trajectories in mm, and return whether frame n of mixpose is frame n + 1 there.
 
-    Else numbers are too large, and frames begin at 1. A measured point has its residual, and the
-    bits of the first seven sensors that measured it; one by the pose has the residual 0 and no bit,
-    as C3D has it for points that are computed; one that is not known the residual -1. Raises
+    If not, numbers are too large, and frames begin at 1. A measured point has its residual, and the
+    bits of those of the first seven sensors that measured it; a point by the pose has the residual
+    0 and no bit, as computed points of C3D do; an unknown one has the residual -1. Raises
     RecordingError if there are more frames than a file can number.
     """
-    import ezc3d  # noqa: PLC0415 - not everybody has it
+    import ezc3d  # noqa: PLC0415 - an optional package
 
     ratio = length_ratio(trajectories.unit, "mm")
     frames = len(trajectories.places)
@@ -157,8 +157,8 @@ def write_c3d(path: Path, trajectories: Trajectories) -> bool:
         )
     measured = trajectories.is_measured
     residuals = np.where(measured, trajectories.residuals * ratio, 0.0)
-    scale = np.float32(max(float(residuals.max()), 1e-3) / _STEPS)
-    # no measured one may be rounded to 0, which means computed
+    scale = np.float32(max(float(residuals.max()), 1e-3) / _RESIDUAL_STEPS)
+    # a measured residual must not be rounded to 0, which means computed
     residuals = np.where(measured, np.maximum(residuals, 1.5 * scale), 0.0)
     residuals[~trajectories.is_known] = -1.0
     is_numbered = 0 <= trajectories.first <= LAST_FRAME - frames
@@ -173,13 +173,13 @@ def write_c3d(path: Path, trajectories: Trajectories) -> bool:
     points = np.ones((4, *trajectories.places.shape[1::-1]))
     points[:3] = ratio * trajectories.places.transpose(2, 1, 0)
     file["data"]["points"] = points
-    sensors = trajectories.by_sensor[..., :_SENSORS].transpose(2, 1, 0)
-    masks = np.zeros((_SENSORS, *points.shape[1:]), dtype=np.bool_)
+    sensors = trajectories.by_sensor[..., :_MOST_SENSORS].transpose(2, 1, 0)
+    masks = np.zeros((_MOST_SENSORS, *points.shape[1:]), dtype=np.bool_)
     masks[: len(sensors)] = sensors
     file["data"]["meta_points"]["residuals"] = residuals.T[None]
     file["data"]["meta_points"]["camera_masks"] = masks
     file.write(str(path))
-    # ezc3d keeps -1 in the header whatever the scale, and readers refuse files of two scales
+    # ezc3d writes -1 to the header whatever the scale, and readers refuse files with two scales
     with path.open("r+b") as stream:
         stream.seek(_SCALE_AT)
         stream.write(struct.pack("<f", -scale))

@@ -1,4 +1,4 @@
-"""What writers of poses share: plain, finite numbers, and times for formats that need one."""
+"""Provide the base of pose writers: plain, finite numbers, and times for formats with times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mixpose.records import Estimate, Floats
 
 
 class PoseWriter(ABC):
-    """Writes estimates to a text stream, each as soon as it is given; the stream stays open."""
+    """Writes estimates to a text stream as they come; the stream stays open."""
 
     def __init__(self, stream: TextIO, header: Header, first_line: str = "") -> None:
         self._stream, self._header = stream, header
@@ -24,37 +24,37 @@ class PoseWriter(ABC):
             self._stream.flush()
 
     def write(self, estimate: Estimate) -> None:
-        """Write one frame and flush it. Raises ValueError if it holds what is not finite."""
+        """Write a frame and flush it; raises ValueError if a number is not finite."""
         require_finite(estimate)
         self._write(estimate)
         self._stream.flush()
 
     def close(self) -> None:
-        """Write what is still due and flush."""
+        """Write what is pending and flush."""
         self._stream.flush()
 
     @abstractmethod
     def _write(self, estimate: Estimate) -> None:
-        """Write one frame."""
+        """Write a frame."""
 
 
 def plain(values: ArrayLike | None) -> Any:
-    """Nested lists of floats (or one float) of any shape without negative zeros; None of None."""
+    """Convert to nested lists of floats, or a float, without negative zeros; None stays None."""
     if values is None:
         return None
-    # -0.0 + 0.0 is 0.0: equal poses are equal bytes.
+    # -0.0 + 0.0 is 0.0, so that equal poses are equal bytes
     return (np.asarray(values, dtype=np.float64) + 0.0).tolist()
 
 
 def pose_of(estimate: Estimate) -> Floats | None:
-    """T_world_object (4, 4) of an estimate; None for a lost frame."""
+    """Return T_world_object (4, 4) of an estimate; None for a lost frame."""
     return None if estimate.status == "lost" else estimate.T_world_object
 
 
 def require_finite(estimate: Estimate) -> None:
     """Raise a ValueError, naming frame and field, if an estimate holds a NaN or an infinity.
 
-    No format has a place for these: such an estimate is a fault of the program.
+    No format can hold these; such an estimate is a fault of the program.
     """
     values: dict[str, Floats | float | None] = {
         "time_s": estimate.time_s,
@@ -77,7 +77,7 @@ def require_finite(estimate: Estimate) -> None:
 
 def _is_finite(value: Floats | float) -> bool:
     if not isinstance(value, np.ndarray):
-        return math.isfinite(value)  # ten times as fast as NumPy on one number
+        return math.isfinite(value)  # ten times as fast as NumPy for a single number
     return bool(np.isfinite(value).all())
 
 
@@ -85,23 +85,23 @@ NO_TIMES = "# time is the frame number: the recording has no times"
 
 
 class Stamps:
-    """The time of each pose; where the recording has none the frame number, as a comment says."""
+    """Times of poses; frame numbers if the recording has no times, as a comment then states."""
 
     def __init__(self, stream: TextIO, format_name: str) -> None:
         self._stream, self._format = stream, format_name
         self._has_times: bool | None = None  # the first frame decides
 
     def time_of(self, estimate: Estimate) -> float:
-        """Time in s, or the frame number; RecordingError if frames before it differ in that."""
+        """Return the time in s, or the frame number; RecordingError if earlier frames differ."""
         has_time = estimate.time_s is not None
         if self._has_times is None:
             self._has_times = has_time
             if not has_time:
                 self._stream.write(f"{NO_TIMES}\n")
         if has_time != self._has_times:
-            found = "a time" if has_time else "no time"
+            text = "a time" if has_time else "no time"
             raise RecordingError(
-                f"frame {estimate.frame} has {found}, unlike the frames before it: format "
+                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
                 f"{self._format!r} needs times for all frames or for none; give the sensors "
                 "times, or write jsonl"
             )

@@ -1,5 +1,5 @@
-"""What a whole recording of poses tells: smoothed poses, the tip of a tool, where the floor is.
+"""Evaluate a whole recording of poses: smooth them, find the tip of a tool, find the floor.
 
-`smoothing` smooths the poses of a body (`motion` says how it moves, `intensity` how much, `choices`
-what ambiguous frames show); `pivot` finds a tip, `floor` the frame of the world.
+`smoothing` smooths the poses of a body (`motion` models its motion, `intensity` fits the model,
+`choices` resolves ambiguous frames); `pivot` finds a tip, `floor` a frame for the world.
 """

@@ -1,9 +1,9 @@
-"""Poses of a body, each with what all frames say: fixed-interval smoothing.
+"""Smooth the poses of a body, each by all frames: fixed-interval smoothing.
 
-What is assumed of the covariances of a file: errors of different frames are independent, as far as
-the poses scatter about a smooth path as they say.  Where they scatter surely less, the share that
-is not seen is taken for an error that lasts, of a calibration or a marker, which no smoothing makes
-smaller: it stays in the covariance as it was.  Where they scatter more, covariances are enlarged.
+Errors of different frames are taken for independent if poses scatter about a smooth path as much as
+their covariances say.  If they surely scatter less, the share that does not show is taken for an
+error that persists, of a calibration or a marker: smoothing cannot reduce it, and it stays in the
+covariance.  If they scatter more, covariances are enlarged.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, Hypothesis
 from mixpose.trajectories import track as tracks
-from mixpose.trajectories.choices import Alternatives, Choice, choices, unfolded
+from mixpose.trajectories.choices import Alternatives, Choice, choices, unwrapped
 from mixpose.trajectories.intensity import (
     SmoothingRules,
     fitted_model,
-    logs_of_wrong,
+    outlier_logs,
     smooth_with_sudden_motion,
 )
 
-_ROUNDED_S = 1e-6  # of differences of times, which are since 1970 at worst
-_ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
+_ROUNDED_S = 1e-6  # rounding of differences of times, which may be since 1970
+_ROUNDS = 3  # rounds that leave out poses: a wrong pose may hide another
 
 
 @dataclass(frozen=True)
 class SmoothedBody:
-    """The poses of a body, smoothed."""
+    """Smoothed poses of a body."""
 
-    estimates: tuple[Estimate, ...]  # of each line and each frame that was filled, by number
-    model: tracks.MotionModel | None  # None where there were too few poses
-    smoothed: int  # poses
-    filled: int  # frames in which no pose was
-    decided: int  # ambiguous frames that are ok now
-    refused: tuple[int, ...]  # frames whose poses were ok and lie far off those around them
-    timed: bool  # whether the model goes by seconds; else by numbers of frames
+    estimates: tuple[Estimate, ...]  # of all lines and filled frames, by frame
+    model: tracks.MotionModel | None  # None if there were too few poses
+    smoothed: int  # number of poses
+    filled: int  # number of frames that had no pose
+    decided: int  # number of ambiguous frames that are ok now
+    refused: tuple[int, ...]  # frames whose poses were ok, but lie far off their neighbours
+    timed: bool  # whether times of the model are seconds; else numbers of frames
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """Lines without a long gap, those that are filled in being None, and their times."""
+    """Lines without a long gap, None for frames to be filled, and their track."""
 
     lines: tuple[PoseLine | None, ...]
     frames: tuple[int, ...]
@@ -65,10 +65,10 @@ def smooth_body(
 ) -> SmoothedBody:
     """Smooth the poses of one body, a line per frame.
 
-    Poses that look the same by the body's symmetries (n, 4, 4) are one. Gaps of at most `fill_s`
-    seconds from pose to pose are filled. `motion` says what takes white noise, of
-    `mixpose.trajectories.motion.ORDERS`; else the likeliest. Raises RecordingError if a frame
-    stands twice, a pose has no covariance, or gaps are to be filled and there are no times.
+    Poses that look the same by the body's symmetries (n, 4, 4) are exchangeable. Gaps of at most
+    `fill_s` seconds from pose to pose are filled. `motion` is a key of `motion.ORDERS`; else the
+    likeliest is taken. Raises RecordingError if a frame stands twice, a pose has no covariance, or
+    gaps are to be filled and there are no times.
     """
     ordered = sorted(lines, key=lambda line: line.frame)
     times = _times(ordered)
@@ -77,29 +77,29 @@ def smooth_body(
             "--fill: found poses without times, or whose times do not ascend; allowed: poses of a "
             "recording with times: add fps or times to the sensors of its session"
         )
-    at = np.array([line.frame for line in ordered], float) if times is None else times
-    ordered = unfolded(ordered, symmetries)
+    t = np.array([line.frame for line in ordered], float) if times is None else times
+    ordered = unwrapped(ordered, symmetries)
     posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
     tracks.require_covariances([ordered[k] for k in posed])
     sure = [k for k in posed if ordered[k].status == "ok"]
-    told = sure if len(sure) >= rules.fewest else posed
-    if len(told) < rules.fewest:
+    used = sure if len(sure) >= rules.fewest else posed
+    if len(used) < rules.fewest:
         return SmoothedBody(tuple(ordered), None, 0, 0, 0, (), times is not None)
-    longest = rules.restarts * float(np.median(np.diff(at[posed])))
-    with _possible(lines[0].label) as found:
-        model = fitted_model(_track([ordered[k] for k in told], at[told]), longest, rules, motion)
-        for segment in _segments(ordered, at, posed, max(longest, fill_s), fill_s):
+    longest = rules.restarts * float(np.median(np.diff(t[posed])))
+    with _checked_numbers(lines[0].label) as smoothed:
+        model = fitted_model(_track([ordered[k] for k in used], t[used]), longest, rules, motion)
+        for segment in _segments(ordered, t, posed, max(longest, fill_s), fill_s):
             if model is not None:
-                found.update(_smoothed(segment, model, rules))
-    met = [ordered[k] for k in posed if ordered[k].frame in found]
-    changed = [line for line in met if found[line.frame].status != line.status]
+                smoothed.update(_smoothed(segment, model, rules))
+    replaced = [ordered[k] for k in posed if ordered[k].frame in smoothed]
+    changed = [line for line in replaced if smoothed[line.frame].status != line.status]
     refused = tuple(line.frame for line in changed if line.status == "ok")
-    done = {line.frame: line for line in ordered} | found
+    results = {line.frame: line for line in ordered} | smoothed
     return SmoothedBody(
-        estimates=tuple(done[frame] for frame in sorted(done)),
+        estimates=tuple(results[frame] for frame in sorted(results)),
         model=model,
-        smoothed=len(met),
-        filled=len(found) - len(met),
+        smoothed=len(replaced),
+        filled=len(smoothed) - len(replaced),
         decided=len(changed) - len(refused),
         refused=refused,
         timed=times is not None,
@@ -107,21 +107,21 @@ def smooth_body(
 
 
 @contextmanager
-def _possible(label: str) -> Iterator[dict[int, Estimate]]:
-    """Estimates by frame, to be worked out within; a RecordingError if numbers do not allow it."""
-    found: dict[int, Estimate] = {}
+def _checked_numbers(label: str) -> Iterator[dict[int, Estimate]]:
+    """Collect estimates by frame within; raise RecordingError if numbers are out of range."""
+    estimates: dict[int, Estimate] = {}
     try:
         with np.errstate(all="ignore"):
-            yield found
-        is_possible = all(
+            yield estimates
+        are_finite = all(
             np.isfinite(values).all()
-            for one in found.values()
-            for values in (one.T_world_object, one.covariance)
+            for estimate in estimates.values()
+            for values in (estimate.T_world_object, estimate.covariance)
             if values is not None
         )
     except (np.linalg.LinAlgError, OverflowError, ZeroDivisionError):
-        is_possible = False
-    if not is_possible:
+        are_finite = False
+    if not are_finite:
         raise RecordingError(
             f"poses of {label!r} cannot be smoothed: covariances or times are too large or too "
             "small beside each other; allowed: poses as mixpose run writes them"
@@ -129,11 +129,11 @@ def _possible(label: str) -> Iterator[dict[int, Estimate]]:
 
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
-    """Of all lines; None where one has none, or they do not ascend."""
+    """Return the times of all lines; None if any is missing, or they do not ascend."""
     tracks.require_frames_once(lines)
-    found = [line.time_s for line in lines if line.time_s is not None]
-    times = np.array(found, dtype=np.float64)
-    return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
+    seconds = [line.time_s for line in lines if line.time_s is not None]
+    times = np.array(seconds, dtype=np.float64)
+    return times if len(seconds) == len(lines) and (np.diff(times) > 0).all() else None
 
 
 def _track(lines: Sequence[PoseLine], times: Floats) -> tracks.Track:
@@ -145,71 +145,71 @@ def _track(lines: Sequence[PoseLine], times: Floats) -> tracks.Track:
 def _segments(
     lines: Sequence[PoseLine], times: Floats, posed: Sequence[int], longest: float, fill_s: float
 ) -> list[_Segment]:
-    """Lines with poses, cut at the longest gaps, with the frames between that are to be filled."""
+    """Cut lines with poses at long gaps, and add the frames to be filled in between."""
     step = int(np.median(np.diff([lines[k].frame for k in posed])))
     cuts = np.flatnonzero(np.diff(times[posed]) > longest + _ROUNDED_S) + 1
     segments = []
     for part in np.split(np.array(posed), cuts):
-        # line, or none where one is filled in; the last line that is there; frame and time
+        # line, or None of a filled frame; the line before; frame and time
         rows: list[tuple[PoseLine | None, PoseLine, int, float]] = []
-        for last, k in pairwise([0, *part.tolist()]):  # the first has none before it
+        for last, k in pairwise([0, *part.tolist()]):  # the first has no line before it
             line = lines[k]
             if rows and times[k] - times[last] <= fill_s + _ROUNDED_S:
-                told, first = lines[last : k + 1], lines[last].frame
-                between = _between(first, line.frame, step, [each.frame for each in told[1:-1]])
-                # frame numbers may be beyond what numbers of NumPy hold
-                since = np.array([each.frame - first for each in told], dtype=np.float64)
+                gap, first = lines[last : k + 1], lines[last].frame
+                between = _between(first, line.frame, step, [other.frame for other in gap[1:-1]])
+                # frame numbers may be too large for integers of NumPy
+                since = np.array([other.frame - first for other in gap], dtype=np.float64)
                 moments = np.interp([n - first for n in between], since, times[last : k + 1])
                 rows += [(None, lines[last], n, t) for n, t in zip(between, moments.tolist())]
             rows.append((line, line, line.frame, float(times[k])))
-        own, known, frames, at = zip(*rows, strict=True)
-        measured = np.array([each is not None for each in own])
-        track = replace(_track(known, np.array(at)), measured=measured)
-        segments.append(_Segment(own, frames, track))
+        segment_lines, posed_lines, frames, seconds = zip(*rows, strict=True)
+        measured = np.array([other is not None for other in segment_lines])
+        track = replace(_track(posed_lines, np.array(seconds)), measured=measured)
+        segments.append(_Segment(segment_lines, frames, track))
     return segments
 
 
 def _between(before: int, after: int, step: int, lost: Sequence[int]) -> list[int]:
-    """Frames between two, evenly at about the usual step; those without a pose are some of them."""
+    """Return frames between two: those without a pose, and others evenly at the usual step."""
     span = after - before
     count = max(round(span / max(step, 1)) - 1, 0)
     even = [before + span * k // (count + 1) for k in range(1, count + 1)]
-    return sorted([*lost, *(n for n in even if all(2 * abs(n - one) >= step for one in lost))])
+    return sorted([*lost, *(n for n in even if all(2 * abs(n - other) >= step for other in lost))])
 
 
 def _smoothed(
     segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
 ) -> dict[int, Estimate]:
-    """Estimates by frame."""
+    """Return the smoothed estimates of a segment by frame."""
     chosen = _chosen(segment, model, rules)
     poses = segment.track.poses.copy()
     measured = segment.track.measured.copy()
-    for k, made in chosen.items():
-        measured[k] = made.pose is not None
-        if made.pose is not None:
-            poses[k] = made.pose
+    for k, decision in chosen.items():
+        measured[k] = decision.pose is not None
+        if decision.pose is not None:
+            poses[k] = decision.pose
     track = replace(segment.track, poses=poses, measured=measured)
-    inside = np.flatnonzero(measured)
-    if len(inside) < 2:
+    with_pose = np.flatnonzero(measured)
+    if len(with_pose) < 2:
         return {}
-    first, last = int(inside[0]), int(inside[-1]) + 1
+    first, last = int(with_pose[0]), int(with_pose[-1]) + 1
     lines, frames = segment.lines[first:last], segment.frames[first:last]
-    track, result = _without_foreign(track.part(slice(first, last)), model, rules)
-    spare = max(0.0, 1.0 - model.white) * tracks.of_free(track.covariances, track.free)
-    found = {}
+    track, result = _without_outliers(track.part(slice(first, last)), model, rules)
+    persistent = max(0.0, 1.0 - model.white) * tracks.without_held(track.covariances, track.free)
+    estimates = {}
     for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
-        T, covariance = result.poses[k], result.covariances[k] + spare[k]
+        T, covariance = result.poses[k], result.covariances[k] + persistent[k]
         choice = chosen.get(first + k)
         if line is None:
-            found[frame] = _filled(frame, float(track.times[k]), lines, T, covariance)
+            estimates[frame] = _filled(frame, float(track.times[k]), lines, T, covariance)
         elif choice is None or choice.pose is not None:
-            is_met = bool(track.measured[k])
-            found[frame] = _estimate(line, T, covariance, choice, is_met, rules)
-    return found
+            is_inlier = bool(track.measured[k])
+            estimates[frame] = _estimate(line, T, covariance, choice, is_inlier, rules)
+    return estimates
 
 
 def _alternatives(line: PoseLine) -> Alternatives:
-    """What a frame may show: of an ambiguous one its hypotheses."""
+    """Return the poses that a frame may show: its hypotheses if it is ambiguous."""
     T = line.T_world_object
     assert T is not None
     if line.status == "ok" or not line.hypotheses:
@@ -222,60 +222,60 @@ def _alternatives(line: PoseLine) -> Alternatives:
 def _chosen(
     segment: _Segment, model: tracks.MotionModel, rules: SmoothingRules
 ) -> dict[int, Choice]:
-    """What each ambiguous frame of a segment shows, by its place."""
+    """Choose among the alternatives of the ambiguous frames of a segment, by index."""
     lines = [(k, line) for k, line in enumerate(segment.lines) if line is not None]
     if all(line.status == "ok" for _, line in lines):
         return {}
     track = segment.track.part(segment.track.measured)
-    found = choices(track, [_alternatives(line) for _, line in lines], model, rules)
-    both = zip(lines, found, strict=True)
+    decisions = choices(track, [_alternatives(line) for _, line in lines], model, rules)
+    both = zip(lines, decisions, strict=True)
     return {k: choice for (k, line), choice in both if line.status != "ok"}
 
 
-def _without_foreign(
+def _without_outliers(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """A track without poses that lie where those around them forbid, and that smoothed."""
-    if _off(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
-        # is the first wrong? as the last of the way back it is told where it should be
+    """Return a track without poses that contradict their neighbours, and the smoothed track."""
+    if _misfits(track, tracks.smooth_track(track, model), model, -1)[0] > _limit(track, rules):
+        # test the first pose as the last of the reversed track, which then also predicts it
         reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
-        left, back = _without_foreign_after_first(reversed_track, model, rules)
-        if not left.measured[-1]:
-            left, rest = _without_foreign_after_first(track.part(slice(1, None)), model, rules)
-            poses = np.concatenate([back.poses[-1:], rest.poses])
-            covariances = np.concatenate([back.covariances[-1:], rest.covariances])
-            measured = np.append(False, left.measured)
-            result = replace(rest, poses=poses, covariances=covariances)
+        kept, reversed_result = _without_outliers_after_first(reversed_track, model, rules)
+        if not kept.measured[-1]:
+            kept, later = _without_outliers_after_first(track.part(slice(1, None)), model, rules)
+            poses = np.concatenate([reversed_result.poses[-1:], later.poses])
+            covariances = np.concatenate([reversed_result.covariances[-1:], later.covariances])
+            measured = np.append(False, kept.measured)
+            result = replace(later, poses=poses, covariances=covariances)
             return replace(track, measured=measured), result
-    return _without_foreign_after_first(track, model, rules)
+    return _without_outliers_after_first(track, model, rules)
 
 
 def _limit(track: tracks.Track, rules: SmoothingRules) -> float:
-    """Squared distance of a pose from what all others say, beyond which it may be a wrong one."""
+    """Return the squared deviation from all other poses beyond which a pose may be wrong."""
     return float(chdtri(int(track.free.sum()), rules.foreign))
 
 
-def _without_foreign_after_first(
+def _without_outliers_after_first(
     track: tracks.Track, model: tracks.MotionModel, rules: SmoothingRules
 ) -> tuple[tracks.Track, tracks.SmoothedTrack]:
-    """The same, where the first pose is right."""
+    """Return the same as `_without_outliers`, given that the first pose is right."""
     limit = _limit(track, rules)
-    wrong = logs_of_wrong(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
+    if_wrong = outlier_logs(track, tracks.white_parts(track, np.array([model.white])), rules)[:, 0]
     result, logs, _ = smooth_with_sudden_motion(track, model, rules)
     for _ in range(_ROUNDS):
-        # among motion that is steady a corner of the path looks foreign, too
-        off = _off(track, tracks.smooth_track(track, model), model, -1)
-        padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
-        bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
+        # with steady motion, corners of the path look like outliers, too
+        misfits = _misfits(track, tracks.smooth_track(track, model), model, -1)
+        padded = np.pad(misfits, 1)  # outliers pull their neighbours off: only local maxima count
+        bad = (misfits > limit) & (misfits >= padded[:-2]) & (misfits >= padded[2:])
         bad[0] = False
         if not bad.any():
             break
-        # but at a corner the others tell of sudden motion as well
-        among, others, _ = smooth_with_sudden_motion(tracks.without(track, bad), model, rules)
-        places = np.flatnonzero(bad)
-        parts = np.append(0, (places[1:] + places[:-1] + 1) // 2)  # what is next to each of them
-        likelier = np.add.reduceat(others - logs, parts) + wrong[places] > 0
-        bad[places] = likelier & (_off(track, among, model, 1)[places] > limit)
+        # but at a corner the other poses show the sudden motion as well
+        trial, trial_logs, _ = smooth_with_sudden_motion(tracks.without(track, bad), model, rules)
+        outliers = np.flatnonzero(bad)
+        starts = np.append(0, (outliers[1:] + outliers[:-1] + 1) // 2)  # of their nearest poses
+        are_likelier = np.add.reduceat(trial_logs - logs, starts) + if_wrong[outliers] > 0
+        bad[outliers] = are_likelier & (_misfits(track, trial, model, 1)[outliers] > limit)
         if not bad.any():
             break
         track = tracks.without(track, bad)
@@ -283,21 +283,21 @@ def _without_foreign_after_first(
     return track, result
 
 
-def _off(
+def _misfits(
     track: tracks.Track, result: tracks.SmoothedTrack, model: tracks.MotionModel, sign: int
 ) -> Floats:
-    """rᵀ(R ± P)⁻¹r (N,), of poses and what others say; the sign is -1 where they took part in P."""
+    """Return rᵀ(R ± P)⁻¹r (N,) of poses from smoothed ones; `sign` is -1 if these used them."""
     free = np.flatnonzero(track.free)
     inner = np.ix_(np.arange(len(track)), free, free)
-    rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]
-    own = (model.white * track.covariances + sign * result.covariances)[inner]
+    twists = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]
+    variances = (model.white * track.covariances + sign * result.covariances)[inner]
     scale = np.sqrt(np.diagonal(track.covariances[inner], axis1=1, axis2=2))
-    own = own / scale[:, :, None] / scale[:, None]
-    values, vectors = np.linalg.eigh(own)
-    along = np.einsum("kij,ki->kj", vectors, rest / scale)
-    # where nothing but the pose itself tells of it, it is off by nothing
-    told = values > 1e-6 * model.white
-    squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
+    variances = variances / scale[:, :, None] / scale[:, None]
+    values, vectors = np.linalg.eigh(variances)
+    along = np.einsum("kij,ki->kj", vectors, twists / scale)
+    # a direction known by the pose itself alone has no deviation
+    is_known = values > 1e-6 * model.white
+    squared = np.where(is_known, along**2 / np.where(is_known, values, 1.0), 0.0).sum(axis=1)
     return np.where(track.measured, squared, 0.0)
 
 
@@ -306,40 +306,40 @@ def _estimate(
     T: Floats,
     covariance: Floats,
     choice: Choice | None,
-    is_met: bool,
+    is_inlier: bool,
     rules: SmoothingRules,
 ) -> Estimate:
-    """The estimate of a line at its smoothed pose."""
-    one = replace(line, T_world_object=T, covariance=covariance)
+    """Return the estimate of a line at its smoothed pose."""
+    smoothed = replace(line, T_world_object=T, covariance=covariance)
     if choice is None:
-        if is_met:
-            return one
+        if is_inlier:
+            return smoothed
         assert line.T_world_object is not None
         rivals = (Hypothesis(T, 0.5), Hypothesis(line.T_world_object, 0.5))
-        return replace(one, status="ambiguous", confidence=0.0, hypotheses=rivals)
-    if not line.hypotheses or not is_met:
-        return one
-    shares, first = choice.probabilities, line.hypotheses[0].weight
-    # a track tells a pose from its rivals, and from clutter, and nothing of a wrong session
+        return replace(smoothed, status="ambiguous", confidence=0.0, hypotheses=rivals)
+    if not line.hypotheses or not is_inlier:
+        return smoothed
+    probabilities, first_weight = choice.probabilities, line.hypotheses[0].weight
+    # a track decides between poses and clutter, but not whether the session is wrong
     if line.doubt and line.confidence is not None:
-        shares = shares * min(line.confidence / max(first, 1e-6), 1.0)
-    sure = float(shares[choice.which])
-    if sure >= rules.sure:
-        return replace(one, status="ok", confidence=sure, hypotheses=())
-    order = np.argsort(-shares, kind="stable").tolist()
-    order.remove(choice.which)
+        probabilities = probabilities * min(line.confidence / max(first_weight, 1e-6), 1.0)
+    weight = float(probabilities[choice.index])
+    if weight >= rules.sure:
+        return replace(smoothed, status="ok", confidence=weight, hypotheses=())
+    order = np.argsort(-probabilities, kind="stable").tolist()
+    order.remove(choice.index)
     others = [
-        Hypothesis(line.hypotheses[k].T_world_object, float(shares[k]))
+        Hypothesis(line.hypotheses[k].T_world_object, float(probabilities[k]))
         for k in order
-        if shares[k] > 0
+        if probabilities[k] > 0
     ]
-    return replace(one, confidence=sure, hypotheses=(Hypothesis(T, sure), *others))
+    return replace(smoothed, confidence=weight, hypotheses=(Hypothesis(T, weight), *others))
 
 
 def _filled(
     frame: int, time_s: float, lines: Sequence[PoseLine | None], T: Floats, covariance: Floats
 ) -> Estimate:
-    """A frame in which nothing was measured."""
+    """Return the estimate of a frame in which nothing was measured."""
     like = next(line for line in lines if line is not None)
     return Estimate(
         frame=frame,

@@ -12,10 +12,10 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats, Indices, Mask
-from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
+from mixpose.trajectories.motion import States, StepNoise, predicted, smoothed, updated
 
-_DIFFUSE = 10.0  # times the motion from frame to frame: nothing is known of rates at first
-_FLOOR = 1e-9  # of a pose's largest variance: what float64 can tell apart
+_DIFFUSE = 10.0  # times the motion from frame to frame: initial deviation of unknown rates
+_FLOOR = 1e-9  # of a pose's largest variance: least variance that float64 resolves
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,17 @@ class Track:
 
     times: Floats  # (N,): s, or numbers of frames
     poses: Floats  # (N, 4, 4)
-    covariances: Floats  # (N, 6, 6): as `mixpose.rigid` has them; of directions that are held, any
-    measured: Mask  # (N,): whether there is a pose; what stands in `poses` counts there only
-    free: Mask  # (6,): directions of the world in which the body is estimated
+    covariances: Floats  # (N, 6, 6): as in `mixpose.rigid`; any values in held directions
+    measured: Mask  # (N,): whether there is a pose; elsewhere `poses` is ignored
+    free: Mask  # (6,): world directions that are estimated
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def part(self, some: slice | Mask | Indices) -> Track:
-        """A part of the track."""
-        poses, covariances = self.poses[some], self.covariances[some]
-        return Track(self.times[some], poses, covariances, self.measured[some], self.free)
+    def part(self, selected: slice | Mask | Indices) -> Track:
+        """Return a part of the track."""
+        poses, covariances = self.poses[selected], self.covariances[selected]
+        return Track(self.times[selected], poses, covariances, self.measured[selected], self.free)
 
     @property
     def interval(self) -> float:
@@ -43,64 +43,64 @@ class Track:
         return float(np.median(steps)) if len(steps) else 1.0
 
     @property
-    def moved(self) -> Floats:
-        """Root mean square motion (6,) from pose to pose, one number for lengths, one for turns."""
+    def rms_motion(self) -> Floats:
+        """Root mean square motion (6,) from pose to pose: one value of lengths, one of turns."""
         poses = self.poses[self.measured]
         twists = rigid.twist_between(poses[:-1], poses[1:]).reshape(-1, 2, 3)
         return np.asarray(np.sqrt((twists**2).mean(axis=(0, 2))).repeat(3))
 
 
-def of_free(covariances: Floats, free: Mask) -> Floats:
-    """Covariances (N, 6, 6) with zero for directions that are held."""
+def without_held(covariances: Floats, free: Mask) -> Floats:
+    """Return covariances (N, 6, 6) with zeros in held directions."""
     return np.where(free[:, None] & free, covariances, 0.0)
 
 
 def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
-    """A track whose covariances can be inverted; directions without variance are held.
+    """Return a track with invertible covariances; directions without variance are held.
 
-    Such a one gets the median variance of the others of its kind: its poses agree, so that any will
-    do.
+    A held direction gets the median variance of the free ones of its kind; any value does, as its
+    poses agree.
     """
-    seen = covariances[measured]
-    variances = np.median(np.diagonal(seen, axis1=1, axis2=2), axis=0)
-    kinds = variances.reshape(2, 3).max(axis=1).repeat(3)
-    free = variances > 1e-12 * np.where(kinds > 0, kinds, np.inf)
-    covariances = of_free(covariances, free)
-    own = np.diagonal(covariances, axis1=1, axis2=2)
+    known = covariances[measured]
+    medians = np.median(np.diagonal(known, axis1=1, axis2=2), axis=0)
+    kinds = medians.reshape(2, 3).max(axis=1).repeat(3)
+    free = medians > 1e-12 * np.where(kinds > 0, kinds, np.inf)
+    covariances = without_held(covariances, free)
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
     for kind in (slice(0, 3), slice(3, 6)):
-        each, some = own[:, kind].max(axis=1), free[kind]
-        # where poses say hardly anything theirs are larger than all others by any factor
-        typical = float(np.median(own[measured][:, kind][:, some])) if some.any() else 1.0
-        floor = np.where(some, _FLOOR * each[:, None], typical)
+        largest, is_free = variances[:, kind].max(axis=1), free[kind]
+        # a median, as very uncertain poses may have variances larger by any factor
+        usual = float(np.median(variances[measured][:, kind][:, is_free])) if is_free.any() else 1.0
+        floor = np.where(is_free, _FLOOR * largest[:, None], usual)
         covariances[:, range(kind.start, kind.stop), range(kind.start, kind.stop)] += floor
     return Track(times, poses, covariances, measured, free)
 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """How a body moves, and how far its poses are off."""
+    """Motion of a body, and white share of the errors of its poses."""
 
-    order: int  # p, of the derivative that takes white noise
+    order: int  # p, of the derivative that has white noise
     intensities: Floats  # (2,): q, of lengths and of turns
-    white: float = 1.0  # share of covariances that is independent from frame to frame
+    white: float = 1.0  # share of the covariances that is independent from frame to frame
 
 
 def noise_of(track: Track, intensities: Floats) -> Floats:
-    """Intensities (G, 6) of each coordinate, from those (G, 2) of lengths and turns."""
+    """Return intensities (G, 6) by coordinate, from those (G, 2) of lengths and turns."""
     held = np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** 3
     return np.where(track.free, intensities.repeat(3, axis=1), held)
 
 
 def white_parts(track: Track, white: Floats) -> Floats:
-    """Covariances (N, G, 6, 6) of poses without what they have in common with others."""
+    """Return covariances (N, G, 6, 6) of the errors that are independent between frames."""
     scale = np.where(track.free, np.sqrt(white)[:, None], 1.0)
     return np.asarray(track.covariances[:, None] * (scale[:, :, None] * scale[:, None]))
 
 
-def begun(track: Track, order: int, covariances: Floats) -> States:
-    """G states at the first pose, of these covariances (G, 6, 6); of rates nothing is known."""
+def initial_states(track: Track, order: int, covariances: Floats) -> States:
+    """Return G states at the first pose, with its covariances (G, 6, 6) and unknown rates."""
     deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    widths = _DIFFUSE * (track.moved + deviation)
+    widths = _DIFFUSE * (track.rms_motion + deviation)
     rates = [widths / track.interval**j for j in range(1, order)]
     G = len(covariances)
     P = np.zeros((G, 6 * order, 6 * order))
@@ -112,48 +112,48 @@ def begun(track: Track, order: int, covariances: Floats) -> States:
 
 @dataclass(frozen=True)
 class SmoothedTrack:
-    """A track with all that all its poses say."""
+    """A track smoothed by all its poses."""
 
     poses: Floats  # (N, 4, 4)
     covariances: Floats  # (N, 6, 6)
-    passages: tuple[Passage, ...]  # what happened between each two times
-    logs: Floats  # (N,): log-likelihoods by those before; 0 where nothing is measured, or before
+    step_noises: tuple[StepNoise, ...]  # N - 1, between successive times
+    logs: Floats  # (N,): log-likelihoods by the poses before; 0 of the first and without a pose
 
 
 def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
     """Smooth a track whose first time has a pose.
 
-    `scales` (N - 1, 2) is how much more noise there is between each two times than the model says.
+    `scales` (N - 1, 2) multiply the noise of the model between successive times.
     """
-    own = white_parts(track, np.array([model.white]))
+    white = white_parts(track, np.array([model.white]))
     scales = np.ones((len(track) - 1, 2)) if scales is None else scales
     steps = np.diff(track.times)
     noises = noise_of(track, model.intensities * scales)[:, None]
-    states = [begun(track, model.order, own[0])]
+    states = [initial_states(track, model.order, white[0])]
     ahead: list[tuple[States, Floats]] = []
     logs = np.zeros(len(track))
     for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
-        ahead.append(foretold(states[-1], elapsed, noise))
+        ahead.append(predicted(states[-1], elapsed, noise))
         state = ahead[-1][0]
         if track.measured[k]:
-            state, _, logs[k : k + 1] = updated(state, track.poses[k], own[k])
+            state, _, logs[k : k + 1] = updated(state, track.poses[k], white[k])
         states.append(state)
-    passages: list[Passage] = []
+    step_noises: list[StepNoise] = []
     for k in range(len(steps) - 1, -1, -1):
-        foreseen, F = ahead[k]
-        states[k], passage = smoothed(states[k], foreseen, states[k + 1], F, steps[k], noises[k])
-        passages.append(passage)
-    covariances = np.stack([one.covariances[0][:6, :6] for one in states])
+        prediction, F = ahead[k]
+        states[k], step = smoothed(states[k], prediction, states[k + 1], F, steps[k], noises[k])
+        step_noises.append(step)
+    covariances = np.stack([state.covariances[0][:6, :6] for state in states])
     return SmoothedTrack(
-        np.concatenate([one.poses for one in states]),
-        of_free(covariances, track.free),
-        tuple(reversed(passages)),
+        np.concatenate([state.poses for state in states]),
+        without_held(covariances, track.free),
+        tuple(reversed(step_noises)),
         logs,
     )
 
 
 def without(track: Track, bad: Mask) -> Track:
-    """A track in which some poses (N,) do not count."""
+    """Return a track that ignores the poses in a mask (N,)."""
     return replace(track, measured=track.measured & ~bad)
 
 
