@@ -44,7 +44,7 @@ def align_session(request: AlignRequest) -> None:
     floor = floor_of(estimates, request.up, _places(session))
     write_text(request.output, _aligned_text(session, floor, request.output), "-o")
     _report_floor(session, floor, request.up)
-    say(f"{session.path.name} in the frame of {floor.by} -> {shown(request.output)}")
+    say(f"{session.path.name} in the frame of {floor.defined_by} -> {shown(request.output)}")
 
 
 def _floor_poses(text: str, session: Session, sources: Sequence[str]) -> list[Estimate]:
@@ -97,8 +97,8 @@ def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
 
 
 def _report_floor(session: Session, floor: Floor, up: Axis) -> None:
-    if floor.off is not None:
-        say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
+    if floor.rms_distance is not None:
+        say(f"the points are {floor.rms_distance:.3g} {session.unit} RMS off the floor")
     if floor.tilt_deg:
         say(f"the floor is level to {floor.tilt_deg:.2g} deg, one standard deviation")
     heights = rigid.transform(rigid.inverse(floor.T_old_new), _places(session))

@@ -120,7 +120,7 @@ def _of_geometry(session: Session) -> _Report:
     report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
     for setup in session.objects:
         report.prefix = f"{setup.body.name}: " if len(session.objects) > 1 else ""
-        _say_accuracy(report, session.alone(setup.body.name))
+        _say_accuracy(report, session.with_only(setup.body.name))
     report.prefix = ""
     report.warnings += keys.shared_part_warnings(session)
     return report
@@ -204,7 +204,7 @@ def _say_features(
     report: _Report, session: Session, setup: SensorSetup, source: Source, survey: recordings.Survey
 ) -> None:
     sensor = f"sensor {setup.name!r}"
-    singles = [(session.alone(table.body.name), table.count) for table in session.objects]
+    singles = [(session.with_only(table.body.name), table.count) for table in session.objects]
     expected = sum(count * placement.expected_count(setup, single) for single, count in singles)
     if not (survey.numbers or survey.damage):
         report.warn(f"{sensor}: its recording has no frame")

@@ -163,7 +163,7 @@ class Findings:
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
             return
-        rms_by_sensor = estimate.whole_rms
+        rms_by_sensor = estimate.weighted_rms
         for name, report in estimate.sensors.items():
             usual, rms = self._usual[name], rms_by_sensor[name]
             if rms is None or not report.used:

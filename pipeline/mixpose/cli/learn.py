@@ -50,12 +50,14 @@ def _older(path: Path, session: Session) -> Markers:
         raise SessionError(f"--like {path}: {problem.text}") from problem
 
 
-def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> list[Learnt]:
+def _in_frames(
+    lesson: LearningResult, request: LearnRequest, older: Markers | None
+) -> list[LearntBody]:
     """Return the bodies in the requested axes, first the one that is like the older table."""
     bodies = list(lesson.bodies)
     if older is not None:
-        fits = [(like(body, older.points, older.names), k) for k, body in enumerate(bodies)]
-        alike = [(-fit.shared, fit.off, k, fit) for fit, k in fits if fit is not None]
+        fits = [(in_axes_of(body, older.points, older.names), k) for k, body in enumerate(bodies)]
+        alike = [(-fit.shared, fit.max_distance, k, fit) for fit, k in fits if fit is not None]
         if not alike:
             raise RecordingError(
                 f"--like {request.like}: found bodies of "
@@ -69,14 +71,14 @@ def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> 
                 f"--like {request.like}: the markers can be laid on it in {best.other_ways} other "
                 f"way{'s' * (best.other_ways > 1)} with as many of them; the closest is taken"
             )
-        bodies = [best.learnt, *(body for n, body in enumerate(bodies) if n != k)]
+        bodies = [best.body, *(body for n, body in enumerate(bodies) if n != k)]
     if request.axes is not None:
         bodies[0] = in_marker_axes(bodies[0], request.axes)
     return bodies
 
 
 def _report(
-    lesson: Lesson, bodies: Sequence[Learnt], files: Sequence[Path], session: Session
+    lesson: LearningResult, bodies: Sequence[LearntBody], files: Sequence[Path], session: Session
 ) -> None:
     lines = list[str]()
     shown_files = [Path("body.csv") if output.is_stdout(file) else file for file in files]
@@ -97,7 +99,9 @@ def _report(
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
 
 
-def _late_warnings(session: Session, bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+def _late_warnings(
+    session: Session, bodies: Sequence[LearntBody], names: Sequence[str]
+) -> list[str]:
     """Return warnings of identical bodies, whose motion is unknown although sensors are late."""
     late = [setup.name for setup in session.sensors if setup.delay or setup.readout]
     return [

@@ -123,7 +123,7 @@ class Summary:
         self.left_out: Counter[tuple[str, str]] = Counter()  # sensors with reasons
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
         self.stated_delays = {setup.name: setup.delay for setup in session.sensors}
-        self.delays: Mapping[str, DelaySeen] = {}
+        self.delays: Mapping[str, DelayEstimate] = {}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
@@ -153,7 +153,7 @@ class Summary:
             self.split_frames += 1
             self.split.update(idle)
         if estimate.status == "ok":
-            rms_by_sensor = estimate.whole_rms
+            rms_by_sensor = estimate.weighted_rms
             for name, residuals in self.residuals.items():
                 if (rms := rms_by_sensor[name]) is not None:
                     residuals.append(rms)

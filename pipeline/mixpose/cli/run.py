@@ -98,7 +98,7 @@ def _watches(
         from mixpose.publishing import Publishing  # noqa: PLC0415 - only where it is published
 
         bodies = [(label, setup.body) for setup in session.objects for label in setup.labels]
-        foresee = {label: _foresee(Foreseen(body), ahead_s) for label, body in bodies}
+        foresee = {label: _foresee(PosePredictor(body), ahead_s) for label, body in bodies}
         publishing = Publishing(request.publish, header, say, foresee if ahead_s else None, ahead_s)
         yield stack.enter_context(publishing).watch
     if request.overlay is not None:
@@ -110,7 +110,7 @@ def _watches(
         yield stack.enter_context(overlay).watch
 
 
-def _foresee(predictor: Foreseen, seconds: float) -> Callable[[Estimate], Estimate]:
+def _foresee(predictor: PosePredictor, seconds: float) -> Callable[[Estimate], Estimate]:
     """Return a function that predicts a body's pose `seconds` ahead from successive estimates."""
 
     def foresee(estimate: Estimate) -> Estimate:
