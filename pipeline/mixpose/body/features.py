@@ -67,8 +67,7 @@ class SegmentFeature:
 
     start: Floats  # (3,)
     end: Floats  # (3,)
-    # (3, 3) about the line; zero for a sharp line
-    covariance: Floats = field(default_factory=no_spread)
+    covariance: Floats = field(default_factory=no_spread)  # (3, 3) about the line; zero if sharp
     spread: Spread = "gaussian"
 
     def __post_init__(self) -> None:

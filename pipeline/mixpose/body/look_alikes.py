@@ -88,7 +88,7 @@ def like_features(
 
     Of the features, such as those met in a frame, all but one or 15 % need a partner within the
     tolerance, and at least `fewest`: by default one more than fix a motion.  Symmetries of the body
-    are excluded, and partners whose normals point elsewhere.
+    are excluded; normals of partners have to agree within 8°.
     """
     chosen = np.array(sorted(features), dtype=np.intp)
     points, targets = body.means[chosen], other.means
@@ -97,13 +97,13 @@ def like_features(
     for base in _bases(points, tolerance, fewest):
         triples = congruent_triples(points[base], targets, 2 * tolerance)
         T = motions(points[base], targets[triples])
-        for part in _kept(body, chosen, other, T, tolerance, least):
+        for part in _confirmed(body, chosen, other, T, tolerance, least):
             pairs = _modulo_symmetry(other, part)
             known = parts.get(pairs)
             if known is None or part.turn_deg < known.turn_deg:
                 parts[pairs] = part
     if body is other:
-        for part in _a_step_aside(body, chosen, tolerance):
+        for part in _grid_steps(body, chosen, tolerance):
             parts.setdefault(_modulo_symmetry(body, part), part)
         parts = {pairs: part for pairs, part in parts.items() if not _is_symmetry(part)}
     return tuple(parts.values())
@@ -130,7 +130,7 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
             images = images[(images != base).any(axis=1)]
         images = images[~_are_among(images, partners[:, base])]
         while len(images):
-            part = _grown(body, other, base, images[0], tolerance)
+            part = _extended(body, other, base, images[0], tolerance)
             images = images[1:]
             if part is None:
                 continue
@@ -219,7 +219,7 @@ def _tree(body: Body) -> cKDTree:
 def _bases(points: Floats, tolerance: float, fewest: int) -> list[list[int]]:
     """Select wide triples of points (n, 3) such that no point is part of all, if there are enough.
 
-    Triples on a line are left out; without any other there are none.
+    Triples on a line are left out; if the widest is on a line, there are none.
     """
     if len(points) < FEWEST:
         return []
@@ -241,7 +241,7 @@ def _is_narrow(points: Floats, tolerance: float) -> bool:
     return bool(extents[1] <= 2 * tolerance)
 
 
-def _kept(
+def _confirmed(
     body: Body, chosen: Indices, other: Body, T_other_body: Floats, tolerance: float, least: int
 ) -> Iterable[LookAlike]:
     """Yield the look-alikes by motions (K, 4, 4) that give enough chosen features a partner."""
@@ -258,7 +258,7 @@ def _kept(
         tried = [(partners[alive], near[alive]) for partners, near in tried]
     order = chosen.argsort()
     chosen = chosen[order]
-    partners, near = (np.concatenate(b, axis=1)[:, order] for b in zip(*tried, strict=True))
+    partners, near = (np.concatenate(sets, axis=1)[:, order] for sets in zip(*tried, strict=True))
     for nearest, keep in zip(partners, near, strict=True):
         # tested again after a fit to all pairs, which is more accurate than one to three
         part = _fitted(body, other, chosen[keep], nearest[keep])
@@ -266,8 +266,8 @@ def _kept(
             yield part
 
 
-def _a_step_aside(body: Body, chosen: Indices, tolerance: float) -> Iterable[LookAlike]:
-    """Yield grid steps with partners for over half of the features; small grids allow few more."""
+def _grid_steps(body: Body, chosen: Indices, tolerance: float) -> Iterable[LookAlike]:
+    """Yield grid steps that keep over half of the features; few steps of small grids keep more."""
     steps = np.tile(np.eye(4), (len(body.grid_steps), 1, 1))
     steps[:, :3, 3] = body.grid_steps
     for nearest, near in zip(*_partners(body, chosen, body, steps, 2 * tolerance), strict=True):
@@ -299,7 +299,7 @@ def _fitted(body: Body, other: Body, features: Indices, partners: Indices) -> Lo
     return LookAlike(body, other, T, tuple(features.tolist()), tuple(partners.tolist()), off)
 
 
-def _grown(
+def _extended(
     body: Body, other: Body, base: Sequence[int], image: Indices, tolerance: float
 ) -> LookAlike | None:
     """Extend a triple to all pairs that fit its motion; None if the triple itself does not fit."""

@@ -65,9 +65,8 @@ class Body:
     features: tuple[Feature, ...]  # the densities q_i in the object's frame
     normals: Floats | None = None  # (N, 3) outward: only sensors that a feature faces see it
     gravity: Gravity | None = None  # spread along an axis of the world
-    # of the markers: the centre of the image of a sphere or disk is not the image of its centre;
-    # disks are perpendicular to their normals
-    shape: Shape = "point"
+    # of the markers: the centre of the image of a sphere or disk is not the image of its centre
+    shape: Shape = "point"  # disks are perpendicular to their normals
     radii: Floats | None = None  # (N,) of spheres or disks, length units; 0 for a point
     names: tuple[str, ...] = ()  # of the first features; the others have none
     tip: Floats | None = None  # (3,) that pose lines report, too; it is no feature
@@ -164,7 +163,7 @@ class Body:
         maps = symmetry.symmetries(points, tolerance)
         if self.node_normals is None:
             return maps
-        return maps[[symmetry.keeps_normals(T, points, self.node_normals) for T in maps]]
+        return maps[[symmetry.are_normals_kept(T, points, self.node_normals) for T in maps]]
 
     @cached_property
     def asymmetry(self) -> float:
@@ -181,7 +180,8 @@ class Body:
     def centred(self) -> Body:
         """The same body with its origin in the middle of its features, and no tip."""
         centre = self.means.mean(axis=0)
-        return replace(self, features=tuple(f.shifted(-centre) for f in self.features), tip=None)
+        features = tuple(feature.shifted(-centre) for feature in self.features)
+        return replace(self, features=features, tip=None)
 
     @cached_property
     def grid_steps(self) -> Floats:
@@ -209,7 +209,8 @@ class Body:
         sets = [drawn(seed=seed)] * len(self)
         if not common:
             sets = [drawn(seed=seed + 7919 * i) for i in range(len(self))]
-        return np.array([f.sample(numbers) for f, numbers in zip(self.features, sets, strict=True)])
+        pairs = zip(self.features, sets, strict=True)
+        return np.array([feature.sample(numbers) for feature, numbers in pairs])
 
     def world_offsets(self, count: int, *, seed: int = 0) -> Floats:
         """Draw displacements (R, 3) along gravity in the world for the samples of a feature.

@@ -46,7 +46,7 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
             R = motions(centred, centred[mapped][None])[0, :3, :3]
         distance, index = tree.query(centred @ R.T)
         one_to_one = len(set(index.tolist())) == len(points)
-        if one_to_one and distance.max() <= tolerance and not _known(R, rotations):
+        if one_to_one and distance.max() <= tolerance and not _is_known(R, rotations):
             rotations.append(R)
     closed = _closed(np.array(rotations), centred, tree, 2 * tolerance)
     return from_parts(closed, centre - closed @ centre)
@@ -63,7 +63,7 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
     A product may be off by twice the tolerance, so that the search for rotations misses some.
     """
     for R in (rotations[:, None] @ rotations[None]).reshape(-1, 3, 3):
-        if _known(R, rotations):
+        if _is_known(R, rotations):
             continue
         _, mapped = tree.query(centred @ R.T)
         if len(set(mapped.tolist())) == len(centred):
@@ -80,7 +80,7 @@ def farthest_apart(motions: Floats, points: Floats) -> float:
     return off if off > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
 
 
-def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
+def are_normals_kept(T: Floats, points: Floats, normals: Floats) -> bool:
     """Test whether a symmetry of points (N, 3) maps their normals (N, 3) onto each other, to 8°."""
     _, image = cKDTree(points).query(transform(T, points))
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -171,6 +171,6 @@ def motions(source: Floats, targets: Floats) -> Floats:
     return from_parts(R, b - R @ a)
 
 
-def _known(R: Floats, rotations: list[Floats] | Floats) -> bool:
+def _is_known(R: Floats, rotations: list[Floats] | Floats) -> bool:
     """Test whether a rotation is within a degree of one of others."""
     return bool(np.einsum("ij,kij->k", R, np.array(rotations)).max() > 1 + 2 * np.cos(_SAME_TURN))
