@@ -205,9 +205,9 @@ def of_points(body: Body, points: Floats, normals: Floats | None) -> Body:
 @lru_cache(maxsize=256)
 def _spacing(body: Body) -> float:
     """Return the smallest distance between two features."""
-    apart = cdist(body.means, body.means)
-    np.fill_diagonal(apart, np.inf)
-    return float(apart.min())
+    distances = cdist(body.means, body.means)
+    np.fill_diagonal(distances, np.inf)
+    return float(distances.min())
 
 
 @lru_cache(maxsize=256)
@@ -228,8 +228,8 @@ def _bases(points: Floats, tolerance: float, fewest: int) -> list[list[int]]:
         return []
     parts = [np.delete(np.arange(len(points)), k) for k in first if len(points) > fewest]
     # after a step of a grid, points at an edge have no partners, those in the middle do
-    away = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    middle = away.argsort(kind="stable")[: len(points) // 2]
+    distances = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    middle = distances.argsort(kind="stable")[: len(points) // 2]
     parts += [middle] if len(middle) > FEWEST else []
     others = [part[list(widest_triple(points[part]))].tolist() for part in parts]
     return [first, *(base for base in others if not _is_narrow(points[base], tolerance))]
@@ -282,8 +282,8 @@ def _partners(
 ) -> tuple[Indices, Mask]:
     """Return nearest partners (K, n) of features moved by (K, 4, 4), and a mask of valid ones."""
     moved = transform(T_other_body, body.means[chosen])
-    away, partners = _tree(other).query(moved, distance_upper_bound=reach)
-    near = np.isfinite(away)
+    distances, partners = _tree(other).query(moved, distance_upper_bound=reach)
+    near = np.isfinite(distances)
     partners[~near] = 0
     if body.normals is not None and other.normals is not None:
         turned = _unit(body.normals[chosen]) @ np.swapaxes(T_other_body[:, :3, :3], 1, 2)
@@ -307,10 +307,10 @@ def _extended(
     part = _fitted(body, other, np.array(base), image)
     if part.off > tolerance:
         return None
-    away = cdist(points, transform(part.T_body_other, targets))
-    partners = away.argmin(axis=1)
-    mutual = away.argmin(axis=0)[partners] == np.arange(len(points))
-    near = mutual & (away.min(axis=1) <= tolerance)
+    distances = cdist(points, transform(part.T_body_other, targets))
+    partners = distances.argmin(axis=1)
+    mutual = distances.argmin(axis=0)[partners] == np.arange(len(points))
+    near = mutual & (distances.min(axis=1) <= tolerance)
     if near.sum() < FEWEST:
         return None
     return _fitted(body, other, np.flatnonzero(near), partners[near])

@@ -167,7 +167,7 @@ class Body:
 
     @cached_property
     def asymmetry(self) -> float:
-        """Largest distance of a node, moved by a symmetry, from the nearest; 0 if by rounding."""
+        """Largest distance of a node, moved by a symmetry, to the nearest; 0 if it is rounding."""
         return symmetry.farthest_apart(self.symmetries, self.nodes.points)
 
     @cached_property

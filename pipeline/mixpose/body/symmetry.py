@@ -76,8 +76,8 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
 
 def farthest_apart(motions: Floats, points: Floats) -> float:
     """Return the largest distance of moved points to the nearest of (N, 3); 0 if it is rounding."""
-    off = float(cKDTree(points).query(transform(motions, points).reshape(-1, 3))[0].max())
-    return off if off > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
+    distance = float(cKDTree(points).query(transform(motions, points).reshape(-1, 3))[0].max())
+    return distance if distance > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
 
 
 def are_normals_kept(T: Floats, points: Floats, normals: Floats) -> bool:
@@ -137,23 +137,23 @@ def widest_triple(points: Floats) -> tuple[int, int, int]:
 
 def congruent_triples(base: Floats, points: Floats, slack: float) -> Indices:
     """Find ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
-    apart = cdist(points, points)
-    np.fill_diagonal(apart, np.inf)
-    return congruent_triples_of_each(base, apart[None], np.array([slack]))[1]
+    distances = cdist(points, points)
+    np.fill_diagonal(distances, np.inf)
+    return congruent_triples_of_each(base, distances[None], np.array([slack]))[1]
 
 
 def congruent_triples_of_each(
-    base: Floats, apart: Floats, slack: Floats
+    base: Floats, distances: Floats, slack: Floats
 ) -> tuple[Indices, Indices]:
     """Find such triples by the distances (C, N, N) of clouds; return clouds (K,) and triples.
 
     Sides may differ by the slack (C,) of the cloud.
     """
     sides = np.linalg.norm(base[[1, 2, 2]] - base[[0, 0, 1]], axis=1)
-    cloud, i, j = np.nonzero(np.abs(apart - sides[0]) <= slack[:, None, None])
-    most = slack[cloud, None]
-    fits = np.abs(apart[cloud, i] - sides[1]) <= most
-    fits &= np.abs(apart[cloud, j] - sides[2]) <= most
+    cloud, i, j = np.nonzero(np.abs(distances - sides[0]) <= slack[:, None, None])
+    allowed = slack[cloud, None]
+    fits = np.abs(distances[cloud, i] - sides[1]) <= allowed
+    fits &= np.abs(distances[cloud, j] - sides[2]) <= allowed
     pair, k = np.nonzero(fits)
     return cloud[pair], np.column_stack([i[pair], j[pair], k])
 

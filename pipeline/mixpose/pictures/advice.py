@@ -7,7 +7,7 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.pictures import levels
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.pictures.levels import FLOODED, Light, around, direction, names_of, threshold_for_more
+from mixpose.pictures.levels import FLOODED, Light, around, change_of, names_of, threshold_for_more
 from mixpose.records import GridPattern, PointPattern
 
 _NOTHING_NOISES = 4.0  # noises above the background, below which a place is empty
@@ -98,7 +98,7 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
     options = light.options
     lines = []
     if light.share > FLOODED and finding.points is not None and finding.count > 3 * len(body):
-        stricter = direction(options, lower=False, level=light.written(light.level))
+        stricter = change_of(options, lower=False, level=light.formatted(light.level))
         if options.method == "blobs":
             stricter += f", raise min_area = {options.min_area:g} or set max_area"
         lines.append(
@@ -130,7 +130,7 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
         lower = levels.lower_level(light, level)
         lines.append(f"not met, fainter than the threshold: {names_of(features, body)}; {lower}")
     if features := missing["small"]:
-        lower = direction(options, lower=True, level=light.written(light.level))
+        lower = change_of(options, lower=True, level=light.formatted(light.level))
         lines.append(
             f"not met, too small: {names_of(features, body)}; lower min_area = "
             f"{options.min_area:g} to {min(features.values()):g}, or {lower}"
@@ -187,10 +187,10 @@ def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[
     ]
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
-    unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
+    unsure = not expected.is_sure or expected.met.sum() < _MOST * expected.seen.sum()
     if unsure or extra.all():
         # unexplained detections may be the markers
-        where = "shows more of the body" if expected.sure else "is ok"
+        where = "shows more of the body" if expected.is_sure else "is ok"
         return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
     labels, areas = light.pieces
     size = np.array([areas[labels[region]].max() for region in regions], dtype=np.float64)
@@ -256,13 +256,13 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
         few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
-        lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
-        few, many = bool(lost), bool(expected.unexplained.any())
-        missing = f"not met: {names_of(lost, body)}" if lost else ""
+        missed = np.flatnonzero(expected.seen & ~expected.met).tolist()
+        few, many = bool(missed), bool(expected.unexplained.any())
+        missing = f"not met: {names_of(missed, body)}" if missed else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
-        lower, raised = (direction(options, lower=way) for way in (True, False))
+        lower, raised = (change_of(options, lower=way) for way in (True, False))
     lines = []
     if few:
         lines.append(f"{missing}; hidden, or {lower}")
@@ -284,8 +284,8 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
     if expected is None:
         return []
     lines = []
-    if lost := np.flatnonzero(expected.seen & ~expected.met).tolist():
-        names = names_of(lost, body)
+    if missed := np.flatnonzero(expected.seen & ~expected.met).tolist():
+        names = names_of(missed, body)
         lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
     if extra := int(expected.unexplained.sum()):
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")

@@ -27,7 +27,7 @@ class Expectation:
     unexplained: Mask  # (M,) detections, if there are points, that belong to no feature
     explained: float  # share of the sensor's density that the pose explains
     rms: float | None  # residual of the met features, in units of the sensor
-    sure: bool  # whether the pose is "ok", so that met detections are markers and not clutter
+    is_sure: bool  # whether the pose is "ok", so that met detections are markers and not clutter
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def find(
 ) -> list[Finding]:
     """Compare the detections of all sensors with the expectation of an estimate."""
     by_name = {view.name: view for view in views}
-    T, sure = estimate.T_world_object, estimate.status == "ok"
+    T, is_sure = estimate.T_world_object, estimate.status == "ok"
     findings = []
     for setup in setups:
         frame, view = frames.get(setup.name), by_name.get(setup.name)
@@ -80,7 +80,7 @@ def find(
             top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
             energy = view.observation.energy(sigma)
             points, count = None, float(top / energy) if energy > 0 else 0.0
-        expectation = None if T is None else _expect(view, body, T, points, sure=sure)
+        expectation = None if T is None else _expect(view, body, T, points, sure=is_sure)
         findings.append(Finding(setup, frame, view, points, count, expectation))
     return findings
 

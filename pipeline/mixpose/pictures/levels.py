@@ -63,7 +63,7 @@ class Light:
             return float(self.image.max()) - level
         return (255.0 if self.image.dtype == np.uint8 else 65535.0) - level
 
-    def written(self, level: float) -> str:
+    def formatted(self, level: float) -> str:
         """Format a grey level for a session file; for floats to three digits of their range."""
         digits, span = 0, float(np.ptp(self.image))
         if self.image.dtype == np.float32 and span > 0:
@@ -86,7 +86,7 @@ class Light:
         return np.asarray(labels, dtype=np.int32), areas
 
 
-def direction(options: ExtractOptions, *, lower: bool, level: str = "") -> str:
+def change_of(options: ExtractOptions, *, lower: bool, level: str = "") -> str:
     """Advise how to change a threshold; `level` is the one that a rule chose, if known."""
     down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
@@ -103,22 +103,22 @@ def lower_level(light: Light, level: float) -> str:
     if float(np.mean(light.raw > level)) > FLOODED:
         return 'set threshold = "local", as the background is as bright elsewhere'
     direction = "lower" if light.options.polarity == "bright" else "raise"
-    return f"{direction} it: threshold = {light.written(light.in_image(level))}"
+    return f"{direction} it: threshold = {light.formatted(light.in_image(level))}"
 
 
 def threshold_for_more(light: Light, expected: int) -> str:
     """Advise a lower threshold that gives about as many blobs as expected, if there is one."""
     options, base = light.options, float(np.median(light.raw))
     if not isinstance(options.threshold, str):
-        return direction(options, lower=light.share < _REVERSED)
-    over = float(light.scene.level)
+        return change_of(options, lower=light.share < _REVERSED)
+    height = float(light.scene.level)
     counts = {}
-    for level in (base + share * over for share in _LOWER):
+    for level in (base + share * height for share in _LOWER):
         statistics = cv2.connectedComponentsWithStats((light.raw > level).astype(np.uint8))[2]
         counts[level] = int(np.count_nonzero(statistics[1:, cv2.CC_STAT_AREA] >= options.min_area))
     likely = [level for level, n in counts.items() if 0.8 * expected <= n <= 3 * expected]
     for level in sorted(likely, reverse=True):
-        number = light.written(light.in_image(level))
+        number = light.formatted(light.in_image(level))
         count = len(_blobs_at(light, float(number)))
         if 0.8 * expected <= count <= 3 * expected:
             return f"threshold = {number} finds {count} in this frame"
@@ -131,7 +131,7 @@ def threshold_apart(
     """Advise a threshold that parts features from their surroundings, if there is one."""
     options, met = light.options, np.flatnonzero(expected.seen & expected.met)
     if not isinstance(options.threshold, str):
-        return direction(options, lower=False)
+        return change_of(options, lower=False)
     labels, areas = light.pieces
     boxes = {
         i: around(expected.y[i], NEAR_SIGMAS * finding.sigma, light.raw.shape)
@@ -148,7 +148,7 @@ def threshold_apart(
     parted = [i for i in features if options.min_area <= parted_sizes[i] <= _AS_LARGE * usual]
     if not parted:
         return "no threshold parts them"
-    number = light.written(light.in_image(level))
+    number = light.formatted(light.in_image(level))
     reach, y = NEAR_SIGMAS * finding.sigma, expected.y[expected.seen]
     before, after = _blobs_at(light, options.threshold), _blobs_at(light, float(number))
     parted = [i for i in parted if _near(expected.y[[i]], after, reach).all()]
@@ -165,7 +165,7 @@ def threshold_without(finding: Finding, extra: Floats, light: Light, level: floa
 
     Returns "" if the level does not achieve that, as in uneven light.
     """
-    number, reach = light.written(light.in_image(level)), max(finding.sigma, 1.0)
+    number, reach = light.formatted(light.in_image(level)), max(finding.sigma, 1.0)
     before, after = _blobs_at(light, light.options.threshold), _blobs_at(light, float(number))
     remaining = before[~_near(before, extra, reach)]
     fits = len(after) == len(remaining) and _near(remaining, after, reach).all()

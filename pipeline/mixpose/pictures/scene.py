@@ -140,8 +140,8 @@ def resized(image: Image, room: Size | None) -> tuple[Image, float]:
     if zoom == 1:
         return image, 1.0
     size = max(round(image.shape[1] * zoom), 1), max(round(image.shape[0] * zoom), 1)
-    way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
-    return cast(Image, cv2.resize(image, size, interpolation=way)), zoom
+    interpolation = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
+    return cast(Image, cv2.resize(image, size, interpolation=interpolation)), zoom
 
 
 def _zoom(size: Size, room: Size | None) -> float:
@@ -232,12 +232,12 @@ def small_box(picture: Picture, part: Part, posed: Posed, sensor: Sensor) -> Box
     return ((lower + upper - side) / 2, side) if is_small else None
 
 
-def cut_out(whole: Picture, part: Part, size: Size, way: int) -> Picture:
+def cut_out(whole: Picture, part: Part, size: Size, interpolation: int) -> Picture:
     """Cut a part out of a picture of a whole sensor; resize it to a size, by an interpolation."""
     # place on the sensor of the first pixel, and distance to the next
     first, step = np.array(part.corner) + 0.5 / part.zoom - 0.5, 1 / part.zoom
     to_sensor = np.array([[step, 0.0, first[0]], [0.0, step, first[1]]])
-    cut = cv2.warpAffine(whole, to_sensor, size, flags=way | cv2.WARP_INVERSE_MAP)
+    cut = cv2.warpAffine(whole, to_sensor, size, flags=interpolation | cv2.WARP_INVERSE_MAP)
     return np.asarray(cut, dtype=np.uint8)
 
 

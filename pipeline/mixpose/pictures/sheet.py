@@ -46,11 +46,11 @@ def inspection_pictures(
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        about = session, finding, body, estimate, sigmas
-        made = _camera_pictures(*about, on_sheet=False)
-        pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        made = _camera_pictures(*about, on_sheet=True)
-        rows.append(in_grid([made[stage] for stage in STAGES if stage in made], 4, _SMALL))
+        arguments = session, finding, body, estimate, sigmas
+        by_stage = _camera_pictures(*arguments, on_sheet=False)
+        pictures |= {f"{name}_{stage}.png": picture for stage, picture in by_stage.items()}
+        by_stage = _camera_pictures(*arguments, on_sheet=True)
+        rows.append(in_grid([by_stage[stage] for stage in STAGES if stage in by_stage], 4, _SMALL))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
         ends = [_spaced_blurs(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
@@ -113,8 +113,8 @@ def _camera_pictures(
         few = _spaced_blurs(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
         panel = (_SMALL[0] // len(few) - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
-        about = finding.view, body, estimate.T_world_object, few, session.estimator
-        pictures["density"] = stages.densities_picture(*about, panel)
+        arguments = finding.view, body, estimate.T_world_object, few, session.estimator
+        pictures["density"] = stages.densities_picture(*arguments, panel)
     return pictures
 
 

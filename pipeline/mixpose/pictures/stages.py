@@ -238,7 +238,7 @@ def panels_of(
     Sampled objectives climb g alone; the only C is then that at σ_ε, by which the pose is judged.
     """
     is_matched = options.objective == "matched"
-    judged = list(sigmas) if is_matched else [view.observation.sigma]
+    matched_sigmas = list(sigmas) if is_matched else [view.observation.sigma]
     lower = np.array(part.corner) - 1.0
     shown = lower, lower + np.array(size) / part.zoom + 2.0
     pattern = view.observation.pattern
@@ -256,7 +256,7 @@ def panels_of(
             word, density_at = "g sampled", partial(_sampled, terms)
         values = _largest(density_at, sigma, points, part, size)
         g_panels.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
-    for sigma in judged:
+    for sigma in matched_sigmas:
         density_at = partial(_looked_up, matched_objective([view], body, [sigma]).atlas)
         title = f"C = g ∗ ε, σ = {sigma:.3g} px"
         matched_panels.append(Panel(title, _largest(density_at, sigma, points, part, size)))

@@ -177,18 +177,18 @@ def trajectory(series: Series, errors: Errors | None) -> list[Chart]:
 
 def motion(series: Series, errors: Errors | None) -> list[Chart]:
     """Draw position and turn over time with 95 % bands, a chart per axis."""
-    right = (None, None) if errors is None else (errors.position, errors.turn_deg)
+    truths = (None, None) if errors is None else (errors.position, errors.turn_deg)
     kinds = (
-        ("position", series.unit, series.position, right[0]),
-        ("turn about", "deg", series.turn_deg, right[1]),
+        ("position", series.unit, series.position, truths[0]),
+        ("turn about", "deg", series.turn_deg, truths[1]),
     )
     charts = []
-    for kind, (word, unit, values, right_values) in enumerate(kinds):
+    for kind, (word, unit, values, true_values) in enumerate(kinds):
         jumps = np.zeros(len(series.x), dtype=bool)
-        for turns in (values, right_values) if kind else ():
+        for turns in (values, true_values) if kind else ():
             jumps |= False if turns is None else jumps_of_turns(turns)
         for k, axis in enumerate(AXES):
-            truth = None if right_values is None else right_values[:, k]
+            truth = None if true_values is None else true_values[:, k]
             half_width = series.half_width[:, 3 * kind + k]
             title = f"{word.capitalize()} {axis}, {unit}"
             svg = _curve_with_band(series, values[:, k], half_width, truth, jumps)

@@ -155,9 +155,9 @@ def _shot(
     is_part = (right - left, bottom - top) != (width, height)
     zoom = min(_WIDEST / (right - left), _LARGEST_ZOOM if is_part else 1.0)
     size = round((right - left) * zoom), max(round((bottom - top) * zoom), 1)
-    kind = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
+    interpolation = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
     part, scaled = Part(zoom, (left, top)), picture[top:bottom, left:right]
-    scaled = np.asarray(cv2.resize(scaled, size, interpolation=kind), dtype=np.uint8)
+    scaled = np.asarray(cv2.resize(scaled, size, interpolation=interpolation), dtype=np.uint8)
     detections = None  # extracted as in the run
     with suppress(MixposeError):  # the pose can be drawn without them
         pattern = observation_of(session, setup, frame).pattern

@@ -256,7 +256,7 @@ def _median(values: Floats) -> str:
 
 
 def _short(value: float) -> str:
-    """Format a number with three significant digits, without exponents below a million."""
+    """Format a number with three significant digits, or as an integer from 1000 to a million."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 

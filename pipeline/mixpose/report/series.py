@@ -111,8 +111,8 @@ def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
     turned = np.full_like(position, np.nan)
     known = np.isfinite(twists[:, 0])
     pose = Rotation.from_rotvec(np.radians(series.turn_deg[known]))
-    right = Rotation.from_rotvec(twists[known, 3:]).inv() * pose
-    turned[known] = np.degrees(right.as_rotvec())
+    true_turn = Rotation.from_rotvec(twists[known, 3:]).inv() * pose
+    turned[known] = np.degrees(true_turn.as_rotvec())
     return Errors(
         rotation_deg=np.degrees(np.linalg.norm(twists[:, 3:], axis=1)),
         distance=np.linalg.norm(twists[:, :3], axis=1),
