@@ -50,8 +50,8 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
     """State the numbers of detections and of expected features."""
     unit = "px" if finding.setup.sensor.unit == "px" else unit
     if finding.points is None:
-        what = "echoes" if finding.setup.sensor.dimension == 1 else "light"
-        counted = f"{what} as of {finding.count:.1f} points"
+        kind = "echoes" if finding.setup.sensor.dimension == 1 else "light"
+        counted = f"{kind} as of {finding.count:.1f} points"
     else:
         counted = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
         counted += ", which are too many to use any" * (finding.passed_over > 0)
@@ -253,20 +253,20 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
     if expected is None or finding.passed_over:
         if not _is_countable(finding, body):
             return []
-        few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
+        has_missed, has_extra = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
         missed = np.flatnonzero(expected.seen & ~expected.met).tolist()
-        few, many = bool(missed), bool(expected.unexplained.any())
+        has_missed, has_extra = bool(missed), bool(expected.unexplained.any())
         missing = f"not met: {names_of(missed, body)}" if missed else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
         lower, raised = (change_of(options, lower=way) for way in (True, False))
     lines = []
-    if few:
+    if has_missed:
         lines.append(f"{missing}; hidden, or {lower}")
-    if many:
+    if has_extra:
         lines.append(f"{extra}; clutter is allowed for, or {raised}")
     return lines
 

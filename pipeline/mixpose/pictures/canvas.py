@@ -162,10 +162,10 @@ def displayable(image: NDArray[Any]) -> Picture:
     # grey values that become black and white, and the exponent in between
     step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
     middle = float(np.median(np.asarray(image[::step, ::step], dtype=np.float64)))
-    few = int(_BEYOND * image.size)
-    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]].tolist()
-    whole = np.issubdtype(image.dtype, np.integer)
-    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
+    cut = int(_BEYOND * image.size)
+    low, high = np.partition(image.ravel(), [cut, image.size - 1 - cut])[[cut, -1 - cut]].tolist()
+    is_integer = np.issubdtype(image.dtype, np.integer)
+    high = max(high, low + (_LEAST_SPAN if is_integer else 1e-6 * max(abs(low), 1e-30)))
     share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
     exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
 

@@ -135,9 +135,9 @@ def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
     """Plot a range sensor; curves are divided by their maxima, which the legend states."""
-    what = f"echoes as of {finding.count:.1f} points"
-    what = what if finding.points is None else f"{len(finding.points)} ranges"
-    axes.set_title(f"{finding.name}: {what}", fontsize=9, loc="left", parse_math=False)
+    measured = f"echoes as of {finding.count:.1f} points"
+    measured = measured if finding.points is None else f"{len(finding.points)} ranges"
+    axes.set_title(f"{finding.name}: {measured}", fontsize=9, loc="left", parse_math=False)
     axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")

@@ -99,9 +99,9 @@ class TimeAxes:
             for first, last in edges.reshape(-1, 2)
         ]
         if stretches:
-            whole = axes.get_xaxis_transform()
+            full_height = axes.get_xaxis_transform()
             style: dict[str, Any] = {"color": _RED, "alpha": 0.3, **self._filled}
-            axes.broken_barh(stretches, (0.0, 1.0), transform=whole, **style)
+            axes.broken_barh(stretches, (0.0, 1.0), transform=full_height, **style)
         if x.size:
             margin = max(0.01 * float(x[-1] - x[0]), half_step)
             axes.set_xlim(float(x.min()) - margin, float(x.max()) + margin)
@@ -118,10 +118,10 @@ class TimeAxes:
 
 def line(axes: Axes, x: Floats, y: Floats, breaks: Mask, style: dict[str, Any] = POSE) -> None:
     """Draw a line, interrupted at breaks and missing values, with dots where it would not show."""
-    many, dotted = len(x) > _MANY, len(x) <= _DOTS
+    is_raster, has_dots = len(x) > _MANY, len(x) <= _DOTS
     x, y = _broken(x, breaks), _broken(y, breaks)
-    style = {"linewidth": 1.3, "marker": "o", "markersize": 2.5, "rasterized": many, **style}
-    if not dotted:
+    style = {"linewidth": 1.3, "marker": "o", "markersize": 2.5, "rasterized": is_raster, **style}
+    if not has_dots:
         known = np.isfinite(x + y)
         has_neighbour = np.r_[False, known[:-1]] | np.r_[known[1:], False]
         style["markevery"] = np.flatnonzero(known & ~has_neighbour).tolist()
@@ -146,19 +146,19 @@ def svg_of(figure: Figure) -> str:
     from matplotlib import rc_context  # noqa: PLC0415
 
     buffer = io.StringIO()
-    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with rc_context(_STYLE):
-        figure.savefig(buffer, format="svg", transparent=True, dpi=200, metadata=nothing)
+        figure.savefig(buffer, format="svg", transparent=True, dpi=200, metadata=no_metadata)
     text = buffer.getvalue()
     width, height = 72 * figure.get_size_inches()
-    inside = text[text.index(">", text.index("<svg")) + 1 :]
-    inside = re.sub(r"<style.*?</style>|<!--.*?-->", "", inside, flags=re.DOTALL)
-    inside = re.sub(r'<g id="[^"]*"', "<g", inside)
+    content = text[text.index(">", text.index("<svg")) + 1 :]
+    content = re.sub(r"<style.*?</style>|<!--.*?-->", "", content, flags=re.DOTALL)
+    content = re.sub(r'<g id="[^"]*"', "<g", content)
     # the ids of all figures on a page must differ
-    prefix = hashlib.sha256(inside.encode()).hexdigest()[:12]
-    inside = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", inside)
-    inside = inside.replace(_INK, "var(--ink)").replace(_RULE, "var(--rule)")
-    return f'<svg viewBox="0 0 {width:g} {height:g}" aria-hidden="true">{inside.strip()}'
+    prefix = hashlib.sha256(content.encode()).hexdigest()[:12]
+    content = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", content)
+    content = content.replace(_INK, "var(--ink)").replace(_RULE, "var(--rule)")
+    return f'<svg viewBox="0 0 {width:g} {height:g}" aria-hidden="true">{content.strip()}'
 
 
 @dataclass(frozen=True)
