@@ -89,4 +89,4 @@ def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = np.zeros((4, 4, 3), np.uint8)
     monkeypatch.setattr("mixpose.pictures.sheet.objective_around", lambda *_: ((), ()))
     monkeypatch.setattr("mixpose.pictures.sheet.objective_picture", lambda *_: plain)
-    monkeypatch.setattr("mixpose.report.figures.drawn", lambda _: "<svg></svg>")
+    monkeypatch.setattr("mixpose.report.figures.svg_of", lambda _: "<svg></svg>")

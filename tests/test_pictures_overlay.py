@@ -25,7 +25,7 @@ from mixpose.pictures.movie import Overlay, VideoSink
 from mixpose.pictures.overlay import (
     AXES,
     CHI2_95,
-    FOUND,
+    MEASURED,
     STATUS_COLOURS,
     ellipse_95,
     projected_covariances,
@@ -336,7 +336,7 @@ def test_ranges_of_a_body_far_away_are_drawn_apart() -> None:
     ranges = PointPattern(np.array([[63.67], [63.98], [64.06]]), np.ones(3))
     lost = Estimate(0, None, "trolley", "lost", None, None, 0.0, {})
     strip = draw_ranges("anchor", ranges, RangeSensor(np.zeros(3)), body, lost)
-    bars = np.flatnonzero((strip[70] == FOUND).all(axis=-1))
+    bars = np.flatnonzero((strip[70] == MEASURED).all(axis=-1))
     places = [group.mean() for group in np.split(bars, np.flatnonzero(np.diff(bars) > 1) + 1)]
     # the body is 0.45 across, so that the scale goes by whole units: 63 to 65 on 928 px
     assert np.diff(places) == pytest.approx([0.31 * 464, 0.08 * 464], abs=2)

@@ -98,8 +98,8 @@ HARMLESS: tuple[Harmless, ...] = (
     ),
     Harmless(
         "pictures/advice.py",
-        "if size[extra].min() > 1.25 * size[own].max():",
-        "if size[extra].min() >= 1.25 * size[own].max():",
+        "if size[extra].min() > 1.25 * size[claimed].max():",
+        "if size[extra].min() >= 1.25 * size[claimed].max():",
         "sizes that are equal to the last bit",
     ),
     Harmless(

@@ -1,4 +1,4 @@
-"""The object model q: features, their samples, and the body's symmetries."""
+"""Object model q: features, their samples, and the symmetries of the body."""
 
 from mixpose.body.features import (
     Feature as Feature,

@@ -1,9 +1,9 @@
-"""Kinds of feature, the densities q_i of where a feature of the object may be, and their samples.
+"""Define kinds of features: densities q_i of the position of a feature in the object's frame.
 
-A kind has a mean, a covariance about its nodes (the few weighted points that stand for it where the
-body is not sampled), and a way from uniform numbers to samples of it.
+A kind has a mean, nodes (a few weighted points that represent it where the body is not sampled), a
+covariance about these, and a map from uniform numbers to samples.
 
-Every feature takes the *same* set of uniform numbers: sampling errors then shift all features alike
+All features take the *same* set of uniform numbers: sampling errors then shift all features alike
 instead of deforming the body, which makes the angles of an estimate several times more accurate at
 the same number of samples.  Antithetic sets (u and 1 − u) cancel the mean error of symmetric
 densities.
@@ -27,7 +27,7 @@ _DIMENSIONS = 5  # three for a feature's spread, one along a line, one along gra
 
 
 def no_spread() -> Floats:
-    """The covariance of an exactly known feature."""
+    """Return the covariance of an exactly known feature."""
     return np.zeros((3, 3))
 
 
@@ -37,7 +37,7 @@ class PointFeature:
 
     position: Floats  # (3,)
     covariance: Floats = field(default_factory=no_spread)  # (3, 3) Σ_i; zero for a delta
-    spread: Spread = "gaussian"  # with that covariance; a box is along its principal axes
+    spread: Spread = "gaussian"  # or a box along the principal axes of the covariance
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))
@@ -49,15 +49,15 @@ class PointFeature:
         return self.position
 
     def nodes(self) -> tuple[Floats, Floats]:
-        """The position itself."""
+        """Return the position, with weight 1."""
         return self.position[None], np.ones(1)
 
     def shifted(self, by: Floats) -> PointFeature:
-        """The same elsewhere."""
+        """Return the feature shifted by a vector (3,)."""
         return replace(self, position=self.position + by)
 
     def sample(self, uniforms: Floats) -> Floats:
-        """Samples (R, 3) of the density from uniform numbers (R, 5)."""
+        """Map uniform numbers (R, 5) to samples (R, 3) of the density."""
         return self.position + offsets(uniforms, self.covariance, self.spread)
 
 
@@ -67,8 +67,7 @@ class SegmentFeature:
 
     start: Floats  # (3,)
     end: Floats  # (3,)
-    # (3, 3) about the line; zero for a sharp one
-    covariance: Floats = field(default_factory=no_spread)
+    covariance: Floats = field(default_factory=no_spread)  # (3, 3) about the line; zero if sharp
     spread: Spread = "gaussian"
 
     def __post_init__(self) -> None:
@@ -81,17 +80,17 @@ class SegmentFeature:
         return np.asarray((self.start + self.end) / 2)
 
     def nodes(self) -> tuple[Floats, Floats]:
-        """Midpoints of equal pieces of the line."""
+        """Return the midpoints of equal pieces of the line, and their weights."""
         along = (np.arange(SEGMENT_NODES) + 0.5)[:, None] / SEGMENT_NODES
         weights = np.full(SEGMENT_NODES, 1.0 / SEGMENT_NODES)
         return self.start + along * (self.end - self.start), weights
 
     def shifted(self, by: Floats) -> SegmentFeature:
-        """The same elsewhere."""
+        """Return the feature shifted by a vector (3,)."""
         return replace(self, start=self.start + by, end=self.end + by)
 
     def sample(self, uniforms: Floats) -> Floats:
-        """Samples (R, 3) from uniform numbers (R, 5); the fourth runs along the line."""
+        """Map uniform numbers (R, 5) to samples (R, 3); the fourth number runs along the line."""
         on_line = self.start + uniforms[:, 3:4] * (self.end - self.start)
         return on_line + offsets(uniforms, self.covariance, self.spread)
 
@@ -100,7 +99,7 @@ Feature: TypeAlias = PointFeature | SegmentFeature
 
 
 def offsets(uniforms: Floats, covariance: Floats, spread: Spread) -> Floats:
-    """Zero-mean offsets (R, 3) of a covariance from the first three of uniform numbers (R, 5)."""
+    """Map the first three of uniform numbers (R, 5) to zero-mean offsets (R, 3) of a covariance."""
     if not covariance.any():
         return np.zeros((len(uniforms), 3))
     values, vectors = np.linalg.eigh(covariance)
@@ -117,9 +116,9 @@ def uniforms(
 ) -> Floats:
     """Draw R = `count` points (R, 5) of the open unit cube, strictly between 0 and 1.
 
-    Latin hypercube is the paper's `lhsnorm`, the other a scrambled Sobol sequence.  Of antithetic
-    points the second half mirrors the first, and the odd one of an odd count is left out.  Raises
-    `ValueError` if the count is below 2 or the sampler is unknown.
+    Latin hypercube is the paper's `lhsnorm`, low-discrepancy a scrambled Sobol sequence.  Of
+    antithetic points, one less if odd, the second half mirrors the first.  Raises `ValueError` if
+    the count is below 2 or the sampler is unknown.
     """
     if count < 2:
         raise ValueError(f"{count} samples, at least 2 are needed")

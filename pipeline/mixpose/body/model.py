@@ -17,25 +17,25 @@ from mixpose.records import Floats, Indices
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
 
 RECURRENT = 0.6
-"""Share of the features that a shift must map onto others for the body to be followed there by
-mistake: the steps of a chessboard of 6 × 9 corners have 0.8, markers at random 1/N."""
+"""Least share of features that a grid step maps onto features, so that tracking may slip by it: the
+steps of a chessboard of 6 × 9 corners have 0.8, those of markers at random 1/N."""
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """The weighted points that stand for the body where it is not sampled."""
+    """Weighted points that represent the body where it is not sampled."""
 
     points: Floats  # (Q, 3)
-    weights: Floats  # (Q,) of each feature 1 together, so that all sum to N
-    feature: Indices  # (Q,) that a node belongs to
+    weights: Floats  # (Q,) that sum to 1 per feature, and to N in all
+    feature: Indices  # (Q,) number of the feature that a node belongs to
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Displacements of features along a direction of the world, however the body is turned."""
+    """Displacements of features along a direction of the world, in any orientation of the body."""
 
     direction: Floats  # (3,) in the world, of any length
-    sigma: float  # standard deviation of a feature along it, length units
+    sigma: float  # standard deviation of a displacement, length units
 
     @property
     def unit(self) -> Floats:
@@ -45,15 +45,15 @@ class Gravity:
 
     @property
     def covariance(self) -> Floats:
-        """Of the displacement of a feature in the world (3, 3)."""
+        """Covariance (3, 3) of the displacement of a feature in the world."""
         return np.asarray(self.sigma**2 * np.outer(self.unit, self.unit))
 
 
 EDGE_ON = math.cos(math.radians(80.0))
-"""Cosine of the angle to its normal from which a flat feature is not found.
+"""Cosine of the angle between normal and line of sight beyond which no flat feature is detected.
 
-Of corners of printed tags in four real recordings 46 % are found between 75 and 80 degrees, 4 % of
-2,700 between 80 and 85 degrees, and none of 2,100 beyond.
+In four real recordings 46 % of the corners of printed tags are detected between 75 and 80 degrees,
+4 % of 2,700 between 80 and 85 degrees, and none of 2,100 beyond.
 """
 
 
@@ -63,21 +63,20 @@ class Body:
 
     name: str
     features: tuple[Feature, ...]  # the densities q_i in the object's frame
-    normals: Floats | None = None  # (N, 3) outward: a feature is seen only by sensors it faces
-    gravity: Gravity | None = None  # spread that stays with the world while the body turns
-    # Of the markers, whose images have their centres elsewhere than the marker's own. Disks lie
-    # across their normals.
-    shape: Shape = "point"
+    normals: Floats | None = None  # (N, 3) outward: only sensors that a feature faces see it
+    gravity: Gravity | None = None  # spread along an axis of the world
+    # of the markers: the centre of the image of a sphere or disk is not the image of its centre
+    shape: Shape = "point"  # disks are perpendicular to their normals
     radii: Floats | None = None  # (N,) of spheres or disks, length units; 0 for a point
-    names: tuple[str, ...] = ()  # what people call the features that have a name; they come first
-    tip: Floats | None = None  # (3,) that is told with each pose; it is no feature
+    names: tuple[str, ...] = ()  # of the first features; the others have none
+    tip: Floats | None = None  # (3,) that pose lines report, too; it is no feature
 
     def __len__(self) -> int:
         return len(self.features)
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """What each feature (N) is called in messages: its name, else its number from 1."""
+        """Labels (N) of the features in messages: names, else numbers from 1."""
         return self.names + tuple(str(i + 1) for i in range(len(self.names), len(self)))
 
     @cached_property
@@ -92,7 +91,7 @@ class Body:
 
     @cached_property
     def nodes(self) -> Nodes:
-        """Weighted points that stand for the features."""
+        """Weighted points that represent the features."""
         parts = [feature.nodes() for feature in self.features]
         counts = [len(weights) for _, weights in parts]
         return Nodes(
@@ -103,35 +102,35 @@ class Body:
 
     @property
     def edge_on(self) -> float:
-        """Cosine of the angle to its normal from which a feature is not seen."""
+        """Cosine of the angle to its normal beyond which a feature is not seen."""
         return 0.0 if self.shape == "sphere" else EDGE_ON
 
     @cached_property
     def node_normals(self) -> Floats | None:
-        """Normals of the nodes (Q, 3), None where the body has none."""
+        """Normals of the nodes (Q, 3); None if the body has none."""
         return None if self.normals is None else self.normals[self.nodes.feature]
 
     @cached_property
     def surfaces(self) -> Indices | None:
-        """Numbers (Q,) of the nodes' surfaces, each of one normal; None where the body has none."""
+        """Numbers (Q,) of surfaces, shared by nodes of one normal; None without normals."""
         if self.node_normals is None:
             return None
         return np.unique(self.node_normals, axis=0, return_inverse=True)[1].reshape(-1)
 
     @cached_property
     def node_radii(self) -> Floats | None:
-        """Radii of the nodes (Q,), None of a body of points."""
+        """Radii of the nodes (Q,); None for a body of points."""
         return None if self.radii is None else self.radii[self.nodes.feature]
 
     @cached_property
     def is_exact(self) -> bool:
-        """Whether every feature is a delta: then no sampling is needed."""
+        """Whether all features are deltas, so that no sampling is needed."""
         sharp = len(self.nodes.points) == len(self) and not self.covariances.any()
         return sharp and self.gravity is None
 
     @cached_property
     def radius(self) -> float:
-        """Largest distance of a feature node from the centre of the means."""
+        """Largest distance of a node from the centre of the means."""
         away = self.nodes.points - self.means.mean(axis=0)
         return float(np.linalg.norm(away, axis=1).max())
 
@@ -143,17 +142,17 @@ class Body:
 
     @cached_property
     def _widest(self) -> float:
-        """The same of what turns with the body."""
+        """Largest standard deviation of spreads that turn with the body."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariances).max(), 0.0)))
 
     def feature_spreads(self, T_world_object: Floats) -> Floats:
-        """Spreads Σ_i of the features (..., N, 3, 3) in the world, at poses (..., 4, 4)."""
+        """Return spreads Σ_i (..., N, 3, 3) of features in the world at poses (..., 4, 4)."""
         R = T_world_object[..., None, :3, :3]
         spreads = R @ self.covariances @ R.swapaxes(-1, -2)
         return np.asarray(spreads if self.gravity is None else spreads + self.gravity.covariance)
 
     def node_spreads(self, T_world_object: Floats) -> Floats:
-        """The same of the nodes (Q, 3, 3), at a pose (4, 4)."""
+        """Return spreads (Q, 3, 3) of the nodes in the world at a pose (4, 4)."""
         return np.asarray(self.feature_spreads(T_world_object)[self.nodes.feature])
 
     @cached_property
@@ -161,31 +160,32 @@ class Body:
         """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""
         points = self.nodes.points
         tolerance = max(symmetry.default_tolerance(points), self._widest)
-        found = symmetry.symmetries(points, tolerance)
+        maps = symmetry.symmetries(points, tolerance)
         if self.node_normals is None:
-            return found
-        return found[[symmetry.keeps_normals(T, points, self.node_normals) for T in found]]
+            return maps
+        return maps[[symmetry.are_normals_kept(T, points, self.node_normals) for T in maps]]
 
     @cached_property
     def asymmetry(self) -> float:
-        """How far symmetries put features from each other, at most; 0 but for rounding errors."""
+        """Largest distance of a node, moved by a symmetry, to the nearest; 0 if it is rounding."""
         return symmetry.farthest_apart(self.symmetries, self.nodes.points)
 
     @cached_property
     def identity(self) -> int:
-        """Which of the symmetries leaves the body as it is."""
+        """Number of the symmetry that is the identity."""
         away = np.abs(self.symmetries - np.eye(4)).max(axis=(1, 2))
         return int(away.argmin())
 
     @cached_property
     def centred(self) -> Body:
         """The same body with its origin in the middle of its features, and no tip."""
-        by = -self.means.mean(axis=0)
-        return replace(self, features=tuple(one.shifted(by) for one in self.features), tip=None)
+        centre = self.means.mean(axis=0)
+        features = tuple(feature.shifted(-centre) for feature in self.features)
+        return replace(self, features=features, tip=None)
 
     @cached_property
     def grid_steps(self) -> Floats:
-        """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
+        """Shifts (S, 3) that map most features onto others, such as the steps of a chessboard."""
         tolerance = max(symmetry.default_tolerance(self.means), self._widest)
         return symmetry.grid_steps(self.means, tolerance, RECURRENT)
 
@@ -198,10 +198,10 @@ class Body:
         common: bool = True,
         seed: int = 0,
     ) -> Floats:
-        """Draw R = `count` samples (N, R, 3) of every feature density; of an exact body, one.
+        """Draw R = `count` samples (N, R, 3) of every feature density, or one if it is exact.
 
-        Antithetic samples come in mirrored pairs.  Features have the point set in common; fresh
-        sets per feature are for comparison only.
+        Antithetic samples come in mirrored pairs.  Features share one set of uniform numbers if
+        `common`; separate sets are for comparison only.
         """
         if self.is_exact:
             return self.means[:, None, :].copy()
@@ -209,12 +209,13 @@ class Body:
         sets = [drawn(seed=seed)] * len(self)
         if not common:
             sets = [drawn(seed=seed + 7919 * i) for i in range(len(self))]
-        return np.array([one.sample(own) for one, own in zip(self.features, sets, strict=True)])
+        pairs = zip(self.features, sets, strict=True)
+        return np.array([feature.sample(numbers) for feature, numbers in pairs])
 
     def world_offsets(self, count: int, *, seed: int = 0) -> Floats:
-        """Displacements along gravity (R, 3) in the world, one for each sample of a feature.
+        """Draw displacements (R, 3) along gravity in the world for the samples of a feature.
 
-        Zero for a body that states none.  They belong to the samples of the same count and seed.
+        They are zero without gravity, and belong to the samples of the same count and seed.
         """
         if self.gravity is None:
             return np.zeros((1 if self.is_exact else 2 * (count // 2), 3))

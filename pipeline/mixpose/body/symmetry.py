@@ -1,11 +1,11 @@
-"""Motions that map a body onto itself, wholly or but for its rim.
+"""Find motions that map a body onto itself, or all of a grid but its rim.
 
-Poses that differ by a rotation which maps the body onto itself can't be told apart by any sensor;
-a grid shifted by a step still meets most of itself.
+No sensor can distinguish poses that differ by a rotation which maps the body onto itself; after a
+step, most points of a grid still lie on points of it.
 
-A rotation of the body is fixed by where it sends three features that are not on a line.  All
-images of such a triple with the same distances are tried, and those that map every feature onto
-a feature within the tolerance are kept.
+A rotation of the body is fixed by the images of three features that are not on a line.  All
+congruent triples are tried as images; rotations that map every feature onto a feature within the
+tolerance are kept.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mixpose.rigid import from_parts, transform
 
 SAME_NORMAL = 0.99  # cosine
 _SAME_TURN = np.radians(1.0)
-_ROUNDING = 1e-6  # of the size of a body: coordinates of so many digits
-_NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
+_ROUNDING = 1e-6  # of the size of a body: coordinates are rounded to as many digits
+_NEIGHBOURS = 24  # nearest points that are tried for steps of a grid
 
 
 def symmetries(points: Floats, tolerance: float) -> Floats:
@@ -31,14 +31,14 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
     """
     points = np.asarray(points, dtype=np.float64)
     distinct = np.unique(points, axis=0)
-    points = points if len(distinct) == len(points) else distinct  # seen as one
+    points = points if len(distinct) == len(points) else distinct  # points at one place count once
     centre = points.mean(axis=0)
     centred = points - centre
     if is_on_a_line(points, tolerance):
         return from_parts(*_line_symmetries(centred, centre, tolerance))
     base = centred[list(widest_triple(centred))]
     tree = cKDTree(centred)
-    found = [np.eye(3)]
+    rotations = [np.eye(3)]
     for turn in motions(base, centred[congruent_triples(base, centred, 2 * tolerance)])[:, :3, :3]:
         _, mapped = tree.query(centred @ turn.T)
         R = turn
@@ -46,24 +46,24 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
             R = motions(centred, centred[mapped][None])[0, :3, :3]
         distance, index = tree.query(centred @ R.T)
         one_to_one = len(set(index.tolist())) == len(points)
-        if one_to_one and distance.max() <= tolerance and not _known(R, found):
-            found.append(R)
-    rotations = _closed(np.array(found), centred, tree, 2 * tolerance)
-    return from_parts(rotations, centre - rotations @ centre)
+        if one_to_one and distance.max() <= tolerance and not _is_known(R, rotations):
+            rotations.append(R)
+    closed = _closed(np.array(rotations), centred, tree, 2 * tolerance)
+    return from_parts(closed, centre - closed @ centre)
 
 
 def is_on_a_line(points: Floats, tolerance: float) -> bool:
-    """Whether points (N, 3) lie on one line, about which any turn leaves them as they are."""
+    """Test whether points (N, 3) lie on a line; any rotation about it leaves them in place."""
     return bool(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] <= tolerance)
 
 
 def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float) -> Floats:
-    """Rotations (G, 3, 3) and their products, which map the body onto itself, too.
+    """Add the products of rotations (G, 3, 3), which map the body onto itself, too.
 
-    A product errs by as much as both together, so that some are not found by themselves.
+    A product may be off by twice the tolerance, so that the search for rotations misses some.
     """
     for R in (rotations[:, None] @ rotations[None]).reshape(-1, 3, 3):
-        if _known(R, rotations):
+        if _is_known(R, rotations):
             continue
         _, mapped = tree.query(centred @ R.T)
         if len(set(mapped.tolist())) == len(centred):
@@ -75,47 +75,47 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
 
 
 def farthest_apart(motions: Floats, points: Floats) -> float:
-    """How far motions (G, 4, 4) put points (N, 3) from the nearest, at most; 0 but for rounding."""
-    off = float(cKDTree(points).query(transform(motions, points).reshape(-1, 3))[0].max())
-    return off if off > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
+    """Return the largest distance of moved points to the nearest of (N, 3); 0 if it is rounding."""
+    distance = float(cKDTree(points).query(transform(motions, points).reshape(-1, 3))[0].max())
+    return distance if distance > _ROUNDING * float(np.ptp(points, axis=0).max()) else 0.0
 
 
-def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
-    """Whether a symmetry of points (N, 3) maps their normals (N, 3) onto each other, within 8°."""
+def are_normals_kept(T: Floats, points: Floats, normals: Floats) -> bool:
+    """Test whether a symmetry of points (N, 3) maps their normals (N, 3) onto each other, to 8°."""
     _, image = cKDTree(points).query(transform(T, points))
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > SAME_NORMAL)
 
 
 def grid_steps(points: Floats, tolerance: float, share: float) -> Floats:
-    """Shifts (S, 3) from one point to a neighbour that map a share of points (N, 3) onto points.
+    """Find shifts (S, 3) between neighbours that map a share of points (N, 3) onto points.
 
-    There are none for points at random, for which that share is 1/N; for a grid it is near 1.
+    Points at random have none, as their share is 1/N; that of a grid is near 1.
     """
     if len(points) < 2:
         return np.zeros((0, 3))
     _, near = cKDTree(points).query(points, k=min(len(points), 1 + _NEIGHBOURS))
     steps = (points[near[:, 1:]] - points[:, None]).reshape(-1, 3)
-    steps = steps[np.linalg.norm(steps, axis=1) > tolerance]  # of points at one place
+    steps = steps[np.linalg.norm(steps, axis=1) > tolerance]  # not between points at one place
     if not len(steps):
         return np.zeros((0, 3))
-    # their numbers only: where points repeat, each step is alike to most others
+    # only their numbers: in a grid a step equals many others
     alike = cKDTree(steps).query_ball_point(steps, tolerance, return_length=True)
-    found: list[Floats] = []
+    selected: list[Floats] = []
     for step in steps[alike >= share * len(points)]:
-        if all(np.linalg.norm(step - other) > 2 * tolerance for other in found):
-            found.append(step)
-    return np.array(found).reshape(-1, 3)
+        if all(np.linalg.norm(step - other) > 2 * tolerance for other in selected):
+            selected.append(step)
+    return np.array(selected).reshape(-1, 3)
 
 
 def default_tolerance(points: Floats) -> float:
-    """A hundredth of the mean distance from the centre: below it a body is called symmetric."""
+    """Return a hundredth of the mean distance from the centre: symmetries may be off by as much."""
     centred = points - points.mean(axis=0)
     return float(0.01 * np.linalg.norm(centred, axis=1).mean())
 
 
 def _line_symmetries(centred: Floats, centre: Floats, tolerance: float) -> tuple[Floats, Floats]:
-    """Rotations and translations of points on a line: identity and, if any, the half-turn."""
+    """Return rotations and translations of points on a line: the identity and any half-turn."""
     axis = np.linalg.svd(centred)[2][0]
     places = np.sort(centred @ axis)
     rotations = np.eye(3)[None]
@@ -126,7 +126,7 @@ def _line_symmetries(centred: Floats, centre: Floats, tolerance: float) -> tuple
 
 
 def widest_triple(points: Floats) -> tuple[int, int, int]:
-    """Three of points (N, 3) that span a large triangle, the first farthest from the middle."""
+    """Select three points (N, 3) that span a large triangle, the first farthest from the middle."""
     first = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
     second = int(np.linalg.norm(points - points[first], axis=1).argmax())
     edge = points[second] - points[first]
@@ -136,30 +136,30 @@ def widest_triple(points: Floats) -> tuple[int, int, int]:
 
 
 def congruent_triples(base: Floats, points: Floats, slack: float) -> Indices:
-    """Ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
-    apart = cdist(points, points)
-    np.fill_diagonal(apart, np.inf)
-    return congruent_triples_of_each(base, apart[None], np.array([slack]))[1]
+    """Find ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
+    distances = cdist(points, points)
+    np.fill_diagonal(distances, np.inf)
+    return congruent_triples_of_each(base, distances[None], np.array([slack]))[1]
 
 
 def congruent_triples_of_each(
-    base: Floats, apart: Floats, slack: Floats
+    base: Floats, distances: Floats, slack: Floats
 ) -> tuple[Indices, Indices]:
-    """Such triples of several clouds of points, by distances (C, N, N); and the cloud (K,) of each.
+    """Find such triples by the distances (C, N, N) of clouds; return clouds (K,) and triples.
 
-    Sides may be off by the slack (C,) of the cloud.
+    Sides may differ by the slack (C,) of the cloud.
     """
     sides = np.linalg.norm(base[[1, 2, 2]] - base[[0, 0, 1]], axis=1)
-    cloud, i, j = np.nonzero(np.abs(apart - sides[0]) <= slack[:, None, None])
-    most = slack[cloud, None]
-    fits = np.abs(apart[cloud, i] - sides[1]) <= most
-    fits &= np.abs(apart[cloud, j] - sides[2]) <= most
+    cloud, i, j = np.nonzero(np.abs(distances - sides[0]) <= slack[:, None, None])
+    allowed = slack[cloud, None]
+    fits = np.abs(distances[cloud, i] - sides[1]) <= allowed
+    fits &= np.abs(distances[cloud, j] - sides[2]) <= allowed
     pair, k = np.nonzero(fits)
     return cloud[pair], np.column_stack([i[pair], j[pair], k])
 
 
 def motions(source: Floats, targets: Floats) -> Floats:
-    """Least-squares motions (K, 4, 4) of points (n, 3) onto points (K, n, 3), without mirrors.
+    """Fit proper rigid motions (K, 4, 4) of points (n, 3) onto points (K, n, 3) by least squares.
 
     Kabsch, Acta Cryst. A32 (1976) 922.
     """
@@ -171,6 +171,6 @@ def motions(source: Floats, targets: Floats) -> Floats:
     return from_parts(R, b - R @ a)
 
 
-def _known(R: Floats, found: list[Floats] | Floats) -> bool:
-    # of the same turn the trace of the difference is 3
-    return bool(np.einsum("ij,kij->k", R, np.array(found)).max() > 1 + 2 * np.cos(_SAME_TURN))
+def _is_known(R: Floats, rotations: list[Floats] | Floats) -> bool:
+    """Test whether a rotation is within a degree of one of others."""
+    return bool(np.einsum("ij,kij->k", R, np.array(rotations)).max() > 1 + 2 * np.cos(_SAME_TURN))

@@ -1,4 +1,4 @@
-"""In words: what a sensor found, what was expected, and what to change in the session file."""
+"""Describe detections and expectation of a sensor in words, and advise changes of the session."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.pictures import levels
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.pictures.levels import FLOODED, Light, around, direction, more, some
+from mixpose.pictures.levels import FLOODED, Light, around, change_of, names_of, threshold_for_more
 from mixpose.records import GridPattern, PointPattern
 
-_NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
-_LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
-_SPECK_PX = 2  # pieces up to this area are noise
-_MOST = 0.8  # of the features in view that must be met to tell what markers look like
+_NOTHING_NOISES = 4.0  # noises above the background, below which a place is empty
+_LOOSE_RMS = 1.2  # of σ: residuals from which on the session states too small a σ
+_SPECK_PX = 2  # pieces up to this area, px, are noise
+_MOST = 0.8  # share of features in view that must be met to know what markers look like
 
 
 def describe(finding: Finding, body: Body, unit: str) -> list[str]:
-    """Lines for people about one sensor: counts first, then advice; `unit` is of lengths."""
+    """Describe a sensor in lines of text: counts first, then advice; `unit` is of lengths."""
     if finding.frame is None:
         return [f"{finding.name}: no frame of this number"]
     lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
     data, expected = finding.frame.data, finding.expectation
-    if expected is not None and _sees_something_else(expected):
+    if expected is not None and _is_without_match(expected):
         lines.append(
             "  it takes no part in this pose, as it meets nothing of it: are its T_sensor_world, "
             "calibration and source right? mixpose check tries others"
@@ -40,25 +40,26 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
     return lines + [f"  {line}" for line in [*advice, *_about_sigma(finding)]]
 
 
-def _sees_something_else(expected: Expectation) -> bool:
-    """Whether a sensor meets nothing of the pose, where it found half as much as is in view."""
+def _is_without_match(expected: Expectation) -> bool:
+    """Test whether a sensor meets no feature, with half as many unexplained detections or more."""
     in_view = int(expected.seen.sum())
     return bool(0 < in_view <= 2 * int(expected.unexplained.sum()) and not expected.met.any())
 
 
 def _counts(finding: Finding, body: Body, unit: str) -> str:
+    """State the numbers of detections and of expected features."""
     unit = "px" if finding.setup.sensor.unit == "px" else unit
     if finding.points is None:
-        what = "echoes" if finding.setup.sensor.dimension == 1 else "light"
-        found = f"{what} as of {finding.count:.1f} points"
+        kind = "echoes" if finding.setup.sensor.dimension == 1 else "light"
+        counted = f"{kind} as of {finding.count:.1f} points"
     else:
-        found = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
-        found += ", which are too many to use any" * (finding.passed_over > 0)
+        counted = f"{finding.count:.0f} feature{'s' * (finding.count != 1)} found"
+        counted += ", which are too many to use any" * (finding.passed_over > 0)
     expected = finding.expectation
     if expected is None:
         expects = f"without a pose up to {len(body)} are expected"
-        return f"{found}; {expects if _can_be_counted(finding, body) else 'there is no pose'}"
-    text = f"{found}; the pose has {int(expected.seen.sum())} of {len(body)} in view"
+        return f"{counted}; {expects if _is_countable(finding, body) else 'there is no pose'}"
+    text = f"{counted}; the pose has {int(expected.seen.sum())} of {len(body)} in view"
     text += f", {int(expected.met.sum())} of them met"
     if expected.rms is not None:
         text += f" within {expected.rms:.3g} {unit} RMS"
@@ -66,7 +67,7 @@ def _counts(finding: Finding, body: Body, unit: str) -> str:
 
 
 def _threshold(light: Light) -> str:
-    """The threshold that was used, in the grey levels of the image."""
+    """State the threshold that was used, in grey levels of the image."""
     options = light.options
     if options.method in ("corners", "log"):
         thing, step = "corner", "bright to dark fields"
@@ -82,7 +83,7 @@ def _threshold(light: Light) -> str:
     if scene.is_selective:
         heights = scene.level, scene.noise, scene.least_peak
         digits = ".3g" if light.image.dtype == np.float32 else ".1f"
-        level, noise, peak = (f"{each:{digits}}" for each in heights)
+        level, noise, peak = (f"{value:{digits}}" for value in heights)
         text = (
             f'  threshold "{options.threshold}": {level} grey levels {side} the background, whose '
             f"noise is {noise}; peaks of at least {peak}"
@@ -93,11 +94,11 @@ def _threshold(light: Light) -> str:
 
 
 def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
-    """Advice for blobs and intensity."""
+    """Advise on blobs and intensity."""
     options = light.options
     lines = []
     if light.share > FLOODED and finding.points is not None and finding.count > 3 * len(body):
-        stricter = direction(options, lower=False, level=light.written(light.level))
+        stricter = change_of(options, lower=False, level=light.formatted(light.level))
         if options.method == "blobs":
             stricter += f", raise min_area = {options.min_area:g} or set max_area"
         lines.append(
@@ -114,36 +115,36 @@ def _about_spots(finding: Finding, light: Light, body: Body) -> list[str]:
 
 
 def _about_missing(finding: Finding, expected: Expectation, light: Light, body: Body) -> list[str]:
-    """Why expected features were not met, and what would find them."""
+    """State why expected features were not met, and which change would find them."""
     options = light.options
     missing = _sorted_out(finding, expected, light)
     lines = []
     ground, shine = ("dark", "bright") if options.polarity == "bright" else ("bright", "dark")
-    if found := missing["nothing"]:
+    if features := missing["nothing"]:
         lines.append(
-            f"not met and {ground} there: {some(found, body)}; hidden, out of light, or the pose "
-            "is wrong"
+            f"not met and {ground} there: {names_of(features, body)}; hidden, out of light, or the "
+            "pose is wrong"
         )
-    if found := missing["faint"]:
-        level = (min(found.values()) + float(np.median(light.raw))) / 2  # and the background
-        lower = levels.looser(light, level)
-        lines.append(f"not met, fainter than the threshold: {some(found, body)}; {lower}")
-    if found := missing["small"]:
-        lower = direction(options, lower=True, level=light.written(light.level))
+    if features := missing["faint"]:
+        level = (min(features.values()) + float(np.median(light.raw))) / 2  # and the background
+        lower = levels.lower_level(light, level)
+        lines.append(f"not met, fainter than the threshold: {names_of(features, body)}; {lower}")
+    if features := missing["small"]:
+        lower = change_of(options, lower=True, level=light.formatted(light.level))
         lines.append(
-            f"not met, too small: {some(found, body)}; lower min_area = {options.min_area:g} to "
-            f"{min(found.values()):g}, or {lower}"
+            f"not met, too small: {names_of(features, body)}; lower min_area = "
+            f"{options.min_area:g} to {min(features.values()):g}, or {lower}"
         )
-    if found := missing["large"]:
+    if features := missing["large"]:
         lines.append(
-            f"not met, too large: {some(found, body)}; raise max_area = {options.max_area:g} to "
-            f"{max(found.values()):g}"
+            f"not met, too large: {names_of(features, body)}; raise max_area = "
+            f"{options.max_area:g} to {max(features.values()):g}"
         )
-    if found := missing["other"]:
+    if features := missing["other"]:
         lines.append(
-            f"not met though {shine} there: {some(found, body)}; they run into something else, are "
-            "partly hidden, have no clear shape, or are not where the object says; "
-            f"{levels.apart(finding, expected, light, body, list(found))}"
+            f"not met though {shine} there: {names_of(features, body)}; they run into something "
+            "else, are partly hidden, have no clear shape, or are not where the object says; "
+            f"{levels.threshold_apart(finding, expected, light, body, list(features))}"
         )
     return lines
 
@@ -151,7 +152,7 @@ def _about_missing(finding: Finding, expected: Expectation, light: Light, body: 
 def _sorted_out(
     finding: Finding, expected: Expectation, light: Light
 ) -> dict[str, dict[int, float]]:
-    """Features that were not met, by why: nothing there, faint (with its peak), or by its area."""
+    """Sort missed features by cause, each with its signal, its peak (if faint) or its area."""
     options, scene = light.options, light.scene
     labels, areas = light.pieces
     kinds: dict[str, dict[int, float]] = {
@@ -175,50 +176,50 @@ def _sorted_out(
 
 
 def _about_extra(finding: Finding, expected: Expectation, light: Light) -> list[str]:
-    """What tells found things that belong to no feature from those that do."""
+    """Advise how to exclude detections that belong to no feature, by size or brightness."""
     pattern = None if finding.view is None else finding.view.observation.pattern
     if not isinstance(pattern, PointPattern) or not expected.unexplained.any():
         return []
-    # of several bodies these are what the others leave, and not all blobs of the image
+    # for one of several bodies only its unclaimed detections, not all blobs of the image
     regions = [
         around(place, radius, light.raw.shape)
         for place, radius in zip(pattern.points, pattern.radii.tolist(), strict=True)
     ]
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
-    unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
+    unsure = not expected.is_sure or expected.met.sum() < _MOST * expected.seen.sum()
     if unsure or extra.all():
-        # what looks like clutter may be the markers
-        where = "shows more of the body" if expected.sure else "is ok"
+        # unexplained detections may be the markers
+        where = "shows more of the body" if expected.is_sure else "is ok"
         return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
     labels, areas = light.pieces
-    size = np.array([areas[labels[one]].max() for one in regions], dtype=np.float64)
-    peak, own = np.array([light.raw[one].max() for one in regions]), ~extra
-    if size[extra].max() < 0.8 * size[own].min():
-        middle = np.sqrt(size[extra].max() * size[own].min())
+    size = np.array([areas[labels[region]].max() for region in regions], dtype=np.float64)
+    peak, claimed = np.array([light.raw[region].max() for region in regions]), ~extra
+    if size[extra].max() < 0.8 * size[claimed].min():
+        middle = np.sqrt(size[extra].max() * size[claimed].min())
         return [f"{text}, all smaller than those that do: raise min_area to {middle:.0f}"]
-    if size[extra].min() > 1.25 * size[own].max():
-        middle = np.sqrt(size[extra].min() * size[own].max())
+    if size[extra].min() > 1.25 * size[claimed].max():
+        middle = np.sqrt(size[extra].min() * size[claimed].max())
         return [f"{text}, all larger than those that do: set max_area = {middle:.0f}"]
-    if peak[extra].max() < peak[own].min():
-        level = (peak[extra].max() + peak[own].min()) / 2
+    if peak[extra].max() < peak[claimed].min():
+        level = (peak[extra].max() + peak[claimed].min()) / 2
         word = "fainter" if light.options.polarity == "bright" else "less dark"
         text += f", all {word} than those that do; they do no harm"
-        number = levels.leaving_out(finding, pattern.points[extra], light, level)
+        number = levels.threshold_without(finding, pattern.points[extra], light, level)
         return [f"{text}, and in this frame {number} would leave them out" if number else text]
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 
 
-def _can_be_counted(finding: Finding, body: Body) -> bool:
-    """Whether what was found is to be as much as the body has features: lines make more light."""
+def _is_countable(finding: Finding, body: Body) -> bool:
+    """Test whether counts compare with the number of features: not if lines make more light."""
     are_points = all(isinstance(feature, PointFeature) for feature in body.features)
     return finding.points is not None or are_points
 
 
 def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
-    """Advice without a pose: only the number of features is known."""
+    """Advise without a pose, by the number of features alone."""
     options = light.options
-    if not _can_be_counted(finding, body):
+    if not _is_countable(finding, body):
         return []
     if finding.count < 0.8 * len(body):
         lines = []
@@ -236,7 +237,7 @@ def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
                 f"{large.min()} px: raise max_area = {options.max_area:g}"
             )
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
-        return lines or [f"too few: {more(light, len(body))}{polarity}"]
+        return lines or [f"too few: {threshold_for_more(light, len(body))}{polarity}"]
     if finding.count > 3 * len(body):
         return [
             "too many: look which are markers, and whether they differ from the rest in brightness "
@@ -246,35 +247,35 @@ def _about_number(finding: Finding, body: Body, light: Light) -> list[str]:
 
 
 def _about_others(finding: Finding, body: Body) -> list[str]:
-    """Advice for corners, unsharp spots and the user's own method."""
+    """Advise on corners, unsharp spots and user-defined methods."""
     options = finding.setup.extract
     expected = finding.expectation
     if expected is None or finding.passed_over:
-        if not _can_be_counted(finding, body):
+        if not _is_countable(finding, body):
             return []
-        few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
+        has_missed, has_extra = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
         missing, extra = "fewer than the object has", "far more than the object has"
     else:
-        lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
-        few, many = bool(lost), bool(expected.unexplained.any())
-        missing = f"not met: {some(lost, body)}" if lost else ""
+        missed = np.flatnonzero(expected.seen & ~expected.met).tolist()
+        has_missed, has_extra = bool(missed), bool(expected.unexplained.any())
+        missing = f"not met: {names_of(missed, body)}" if missed else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
-        lower, raised = (direction(options, lower=way) for way in (True, False))
+        lower, raised = (change_of(options, lower=way) for way in (True, False))
     lines = []
-    if few:
+    if has_missed:
         lines.append(f"{missing}; hidden, or {lower}")
-    if many:
+    if has_extra:
         lines.append(f"{extra}; clutter is allowed for, or {raised}")
     return lines
 
 
 def _about_measurements(finding: Finding, body: Body) -> list[str]:
-    """Advice for tables of detections and range profiles, which have no threshold."""
+    """Advise on tables of detections and range profiles, which have no threshold."""
     expected = finding.expectation
     if finding.points is None:
-        if finding.count <= 2 * len(body) or not _can_be_counted(finding, body):
+        if finding.count <= 2 * len(body) or not _is_countable(finding, body):
             return []
         return [
             "far more echoes than features: noise fills the profile; take its floor off, or raise "
@@ -283,8 +284,8 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
     if expected is None:
         return []
     lines = []
-    if lost := np.flatnonzero(expected.seen & ~expected.met).tolist():
-        names = some(lost, body)
+    if missed := np.flatnonzero(expected.seen & ~expected.met).tolist():
+        names = names_of(missed, body)
         lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
     if extra := int(expected.unexplained.sum()):
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
@@ -292,6 +293,7 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
 
 
 def _about_sigma(finding: Finding) -> list[str]:
+    """Advise to raise sigma if residuals are larger than it."""
     expected = finding.expectation
     if expected is None or expected.rms is None or expected.rms < _LOOSE_RMS * finding.sigma:
         return []

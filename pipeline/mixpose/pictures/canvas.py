@@ -1,8 +1,8 @@
-"""Pictures: frames made visible, marks, lines and words on them, and several of them in one.
+"""Make frames visible, draw marks, lines and words on them, and arrange pictures in grids.
 
-A picture is (H, W, 3) uint8, blue-green-red as OpenCV has it.  Marks, lines and words have a dark
-rim, so that they are legible on bright and dark frames; they are drawn in place, at places (u, v)
-in pixels of the picture, pixel centres at integers.
+A picture is (H, W, 3) uint8, blue-green-red as in OpenCV.  Marks, lines and words have a dark rim,
+so that they are legible on bright and dark frames; they are drawn in place, at places (u, v) in
+pixels of the picture, pixel centres at integers.
 """
 
 from __future__ import annotations
@@ -25,24 +25,22 @@ BLACK: Colour = (0, 0, 0)
 WHITE: Colour = (255, 255, 255)
 GREY: Colour = (160, 160, 160)
 
-_SHIFT = 4  # binary digits of a pixel's parts in OpenCV's drawing functions
-_FAR = 1e5  # px; beyond it those functions overflow
+_SHIFT = 4  # fractional bits of coordinates in OpenCV's drawing functions
+_FAR = 1e5  # px; larger coordinates overflow in these functions
 _REFERENCE_SIDE = 600  # px of a picture on which strokes are one pixel wide
 _TEXT_PX = 15
-_WEIGHT = 600  # of letters; regular is 400
+_WEIGHT = 600  # of the font; regular is 400
 _GAP_PX = 4
 _GAP_GREY = 70
-# This share of the pixels may be darker than black or brighter than white: a hot pixel or two do
-# not count, a few small spots do.
-_BEYOND = 2e-5
+_BEYOND = 2e-5  # share of pixels clipped to black and to white: hot pixels, not small spots
 _LEAST_SPAN = 16.0  # grey levels of an integer image, lest noise fill the picture
-_MIDDLE = 0.2  # where the median grey value of a dark frame is brought to
-_STRONGEST = 0.45  # exponent, lest noise is all one sees
+_MIDDLE = 0.2  # brightness to which the median of a dark frame is raised
+_STRONGEST = 0.45  # least exponent, lest noise dominate the picture
 _SAMPLES = 200_000
 
 
 def stroke(picture: Picture) -> float:
-    """Width of a thin line in px that is as visible on large pictures as on small ones."""
+    """Return the width in px of a thin line, in proportion to the size of a picture, at least 1."""
     return max(float(min(picture.shape[:2])) / _REFERENCE_SIDE, 1.0)
 
 
@@ -55,8 +53,8 @@ def polyline(
         return
     thin = stroke(picture) * width
     fixed = [np.round(places * 2**_SHIFT).astype(np.int32)]
-    for each, pixels in ((BLACK, thin + 2 * stroke(picture)), (colour, thin)):
-        cv2.polylines(picture, fixed, closed, each, max(round(pixels), 1), cv2.LINE_AA, _SHIFT)
+    for ink, pixels in ((BLACK, thin + 2 * stroke(picture)), (colour, thin)):
+        cv2.polylines(picture, fixed, closed, ink, max(round(pixels), 1), cv2.LINE_AA, _SHIFT)
 
 
 def ring(picture: Picture, place: Floats, radius: float, colour: Colour) -> None:
@@ -76,7 +74,7 @@ def cross(picture: Picture, place: Floats, inner: float, outer: float, colour: C
 def words(
     picture: Picture, text: str, place: tuple[float, float], colour: Colour, *, size: float = 1.0
 ) -> float:
-    """Write text from a place on its baseline on; returns where it ends, u in px."""
+    """Write text from a place on its baseline; return the u of its end in px."""
     pixels = _letters(picture, size)
     rim = max(round(pixels / 14), 1)
     u, v = round(place[0]), round(place[1])
@@ -88,24 +86,24 @@ def words(
 
 
 def width_of(picture: Picture, text: str, *, size: float = 1.0) -> float:
-    """How far text reaches on a picture, in px."""
+    """Return the width of text on a picture, in px."""
     shape, pixels = (picture.shape[1], picture.shape[0]), _letters(picture, size)
-    left, _, width, _ = cv2.getTextSize(shape, text, (0, 0), _face(), pixels, _WEIGHT)
-    return float(left + width)
+    offset, _, width, _ = cv2.getTextSize(shape, text, (0, 0), _face(), pixels, _WEIGHT)
+    return float(offset + width)
 
 
 def _letters(picture: Picture, size: float) -> int:
-    """Height of letters in px."""
+    """Return the height of letters in px."""
     return max(round(_TEXT_PX * stroke(picture) * size), 9)
 
 
 def caption_place(picture: Picture, line: int = 0) -> tuple[float, float]:
-    """Where a line of captions in the upper left corner begins."""
+    """Return the start of a line of captions in the upper left corner."""
     return 0.5 * line_height(picture), (line + 1.1) * line_height(picture)
 
 
 def line_height(picture: Picture) -> float:
-    """Distance of two lines of captions in px."""
+    """Return the distance of two lines of captions in px."""
     return 1.5 * _TEXT_PX * stroke(picture)
 
 
@@ -115,12 +113,12 @@ def _face() -> cv2.FontFace:
 
 
 def columns_for(count: int) -> int:
-    """In how many columns so many pictures are laid out."""
+    """Return the number of columns for a number of pictures."""
     return count if count <= 3 else int(np.ceil(np.sqrt(count)))
 
 
 def fit_into(picture: Picture, size: Size) -> Picture:
-    """A picture amid black of exactly that width and height, shrunk where it is larger."""
+    """Centre a picture on black of a width and height; shrink it if it is larger."""
     width, height = size
     zoom = min(width / picture.shape[1], height / picture.shape[0], 1.0)
     if zoom < 1.0:
@@ -133,7 +131,7 @@ def fit_into(picture: Picture, size: Size) -> Picture:
 
 
 def in_grid(pictures: Sequence[Picture], columns: int, cell: Size | None = None) -> Picture:
-    """Pictures row by row with gaps between them, in cells of (width, height) if given."""
+    """Arrange pictures in rows with gaps, in cells of (width, height) if given."""
     width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
     rows = []
     for k in range(0, len(pictures), columns):
@@ -146,11 +144,12 @@ def in_grid(pictures: Sequence[Picture], columns: int, cell: Size | None = None)
 
 
 def stacked(pictures: Sequence[Picture]) -> Picture:
-    """Pictures one below the other; narrower ones have black beside them."""
+    """Arrange pictures one below the other; pad narrower ones with black."""
     return in_grid(pictures, 1)
 
 
 def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
+    """Concatenate pictures along an axis, with gaps between them."""
     shape = [*pictures[0].shape]
     shape[axis] = _GAP_PX
     gap = np.full(shape, _GAP_GREY, np.uint8)
@@ -159,14 +158,14 @@ def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
 
 
 def displayable(image: NDArray[Any]) -> Picture:
-    """A grey image (H, W) of any type with its contrast stretched, brightened where it is dark."""
+    """Convert a grey image (H, W) of any type: stretch its contrast, and brighten it if dark."""
     # grey values that become black and white, and the exponent in between
     step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
     middle = float(np.median(np.asarray(image[::step, ::step], dtype=np.float64)))
-    few = int(_BEYOND * image.size)
-    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]].tolist()
-    whole = np.issubdtype(image.dtype, np.integer)
-    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
+    cut = int(_BEYOND * image.size)
+    low, high = np.partition(image.ravel(), [cut, image.size - 1 - cut])[[cut, -1 - cut]].tolist()
+    is_integer = np.issubdtype(image.dtype, np.integer)
+    high = max(high, low + (_LEAST_SPAN if is_integer else 1e-6 * max(abs(low), 1e-30)))
     share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
     exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
 
@@ -175,7 +174,7 @@ def displayable(image: NDArray[Any]) -> Picture:
         return np.asarray(np.round(255 * np.clip(share, 0, 1) ** exponent), dtype=np.uint8)
 
     if np.issubdtype(image.dtype, np.unsignedinteger):
-        grey = curve(np.arange(np.iinfo(image.dtype).max + 1))[image]  # a look-up is fast
+        grey = curve(np.arange(np.iinfo(image.dtype).max + 1))[image]  # a look-up table is fast
     else:
         grey = curve(image)
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Where an overlay goes: a video, or a folder with a picture per frame."""
+"""Write an overlay: a video, or a folder with a picture per frame."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from mixpose.records import Estimate, FrameSet
 from mixpose.session import Session
 from mixpose.whole_files import partial_of
 
-CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
-"""Codecs by extension, of those that OpenCV's wheels bring along."""
+CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}  # all part of OpenCV's wheels
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
 _DEFAULT_FPS = 25.0
 _SLOWEST, _FASTEST = 0.5, 120.0
-_WAITING = 9  # frames, whose gaps tell the rate where a few of them are missing
+_WAITING = 9  # frames whose times give the rate, even if a few are missing
 
 
 class Overlay:
-    """Draws every frame of a run and hands the pictures on; a context for ``run(watch=...)``.
+    """Draw and write every frame of a run; a context for ``run(watch=...)``.
 
-    It goes into a video by the extension of its path, else into a folder, in which it can `resume`.
-    A `SessionError` if the path is none of these, or holds something that mixpose did not write.
+    The path is a video, by its extension, or a folder, in which it can `resume`. Raises a
+    `SessionError` if it is neither, or contains something that mixpose did not write.
     """
 
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
@@ -46,10 +45,10 @@ class Overlay:
         self._sink.close()
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Draw one frame, with the last of its bodies."""
+        """Collect the estimates of a frame; draw it with that of its last body."""
         self._estimates.append(estimate)
         if len(self._estimates) == len(self._session.labels):
-            if not self._is_sized:  # by the first frame, for all
+            if not self._is_sized:  # sizes by the first frame apply to all
                 self._session, self._is_sized = with_sizes(self._session, frame_set), True
             picture = draw_scene(self._session, frame_set, *self._estimates)
             self._sink.add(picture, estimate.frame, estimate.time_s)
@@ -57,7 +56,7 @@ class Overlay:
 
 
 def _sink(path: Path, resume: bool) -> FolderSink | VideoSink:
-    """What takes the pictures of an overlay, frame by frame."""
+    """Return the sink of the pictures of an overlay at a path."""
     if not path.parent.is_dir():
         raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
     suffix = path.suffix.casefold()
@@ -77,7 +76,7 @@ def _sink(path: Path, resume: bool) -> FolderSink | VideoSink:
 
 
 class FolderSink:
-    """Writes ``overlay_000012.png`` and so on into a folder, made with the first of them."""
+    """Write ``overlay_000012.png`` and so on into a folder, which the first of them makes."""
 
     def __init__(self, folder: Path, *, resume: bool = False) -> None:
         self._folder = folder
@@ -95,7 +94,7 @@ class FolderSink:
                     self._earlier.append(path)
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
-        """Write the picture of a frame; the first one replaces those of an earlier run."""
+        """Write the picture of a frame; the first one also deletes those of an earlier run."""
         with reporting(SessionError, f"--overlay {self._folder}: cannot be written"):
             self._folder.mkdir(exist_ok=True)
             for path in self._earlier:
@@ -104,11 +103,11 @@ class FolderSink:
         write_png(self._folder / f"overlay_{frame:06d}.png", picture)
 
     def close(self) -> None:
-        """Nothing is left to do: every picture is whole."""
+        """Do nothing: every picture is complete."""
 
 
 class VideoSink:
-    """Writes a video that plays as fast as the frames were taken, where they have times."""
+    """Write a video that plays at the rate of the frames' times, if known."""
 
     def __init__(self, path: Path) -> None:
         refuse_foreign(path, "--overlay")
@@ -119,13 +118,13 @@ class VideoSink:
         self._count = 0
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
-        """Write the picture of a frame; the first ones wait for others, which tell the rate."""
+        """Write the picture of a frame; the first ones wait until the rate can be estimated."""
         self._waiting.append((picture, time_s))
         if self._writer is not None or len(self._waiting) == _WAITING:
             self._write()
 
     def close(self) -> None:
-        """Finish the file, sign it and put it in its place: until then it has another name."""
+        """Finish the file, sign it and rename it to its path from a temporary name."""
         if self._waiting:
             self._write()
         if self._writer is None:
@@ -135,11 +134,11 @@ class VideoSink:
         try:
             with reporting(SessionError, f"--overlay {self._path}: cannot be written"):
                 sign_video(self._part)
-                # FFmpeg does not tell when a disk is full
+                # FFmpeg does not report a full disk
                 written = cv2.VideoCapture(str(self._part))
                 count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
                 written.release()
-                if count < self._count - 1:  # containers that only estimate it may be one off
+                if count < self._count - 1:  # containers that estimate the count may be off by one
                     raise SessionError(
                         f"--overlay {self._path}: {count} of {self._count} frames could be "
                         "written: is the disk full?"
@@ -149,11 +148,11 @@ class VideoSink:
             self._part.unlink(missing_ok=True)
 
     def _write(self) -> None:
-        """Write the pictures that wait, the first ones into a new file."""
+        """Write the waiting pictures, and open the video for the first ones."""
         waiting, self._waiting = self._waiting, []
         if self._writer is None:
             picture, fps = waiting[0][0], _rate([time_s for _, time_s in waiting])
-            # codecs want even sides
+            # codecs need even sides
             self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
             codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
             writer = cv2.VideoWriter(str(self._part), codec, fps, self._size)
@@ -169,7 +168,7 @@ class VideoSink:
 
 
 def _rate(times: Sequence[float | None]) -> float:
-    """Frames per second from the times of the first frames."""
+    """Estimate frames per second from the times of the first frames."""
     gaps = [
         later - earlier
         for earlier, later in pairwise(times)

@@ -1,7 +1,4 @@
-"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib.
-
-The objective is cut along each direction, and over pairs of directions.
-"""
+"""Plot range sensors, and the objective along and over directions around a pose; by matplotlib."""
 
 from __future__ import annotations
 
@@ -29,22 +26,22 @@ if TYPE_CHECKING:
 
 _DPI = 100
 _MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"
-_AROUND = 0.6  # of the extent of the expected ranges, shown around them
-_LEAST_AROUND = 6.0  # in σ
-_PLACES = 600  # at which C is drawn
-_WIDE = 1.5  # widest blurs to either side of a slice
-_NARROW = 5.0  # finest blurs to either side of a map
-_LEAST_WIDE = 8.0  # finest blurs to either side of a slice
+_AROUND = 0.6  # margin around the expected ranges, by their extent
+_LEAST_AROUND = 6.0  # least margin, in σ
+_PLACES = 600  # number of ranges at which C is drawn
+_WIDE = 1.5  # half-width of a slice, in widest blurs
+_NARROW = 5.0  # half-width of a map, in finest blurs
+_LEAST_WIDE = 8.0  # least half-width of a slice, in finest blurs
 _POINTS = 241  # of a slice
 _SIDE = 41  # points along a side of a map
 _MAPS = 3
 _BATCH = 512  # poses that are projected at once
-_APART = 0.01  # of a plot's width, from name to name of features in ranges
-_SAMPLES = 200  # per feature: enough to look at
+_APART = 0.01  # of a plot's width: least distance between names of features
+_SAMPLES = 200  # at most, per feature: enough for a plot
 
 
 def require_matplotlib() -> None:
-    """Make sure that plots can be made, else raise a `SessionError`."""
+    """Raise a `SessionError` if matplotlib is not installed."""
     try:
         import matplotlib.figure  # noqa: F401, PLC0415
     except ImportError as error:
@@ -62,10 +59,10 @@ def ranges_picture(
     width: int,
     row_height: int,
 ) -> Picture:
-    """Range sensors one below the other: measurement, densities g and C, the ranges of the pose.
+    """Plot range sensors in rows: measurements, densities g and C, the ranges of the pose.
 
-    Of each sensor the densities of some blurs `sigmas` are drawn, coarse to fine; `unit` is of
-    lengths, `row_height` that of a sensor in px.
+    `sigmas` are the blurs of g per sensor, coarse to fine; `unit` is of lengths, `row_height` that
+    of a sensor in px.
     """
     figure = _figure(width, row_height * len(findings))
     rows = figure.subplots(len(findings), 1, squeeze=False)[:, 0]
@@ -83,7 +80,7 @@ def objective_picture(
     unit: str,
     width: int,
 ) -> Picture:
-    """Slices and maps of the objective as of `objective_around`, a picture of some width in px.
+    """Plot slices and maps of `objective_around` into a picture of a width in px.
 
     `levels` are the blurs in σ_ε; 95 % ellipses of the covariance (6, 6) are drawn on the maps;
     `unit` is of lengths.
@@ -97,33 +94,33 @@ def objective_picture(
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(levels)))
     for axes in rows[len(slices) :]:
         axes.set_axis_off()
-    for k, (axes, one) in enumerate(zip(rows, slices, strict=False)):
-        for values, colour, level in zip(one.values, colours, levels, strict=True):
+    for k, (axes, cut) in enumerate(zip(rows, slices, strict=False)):
+        for values, colour, level in zip(cut.values, colours, levels, strict=True):
             label = "σ" if abs(level - 1) < 0.001 else f"{level:.2g} σ"
-            axes.plot(_shown(one.offsets, one.direction), values, color=colour, label=label)
+            axes.plot(_shown(cut.offsets, cut.direction), values, color=colour, label=label)
         axes.axvline(0, color="0.6", lw=0.8, ls=":")
-        axes.set(xlabel=_label(one.direction, unit), ylim=(0, 1.05))
+        axes.set(xlabel=_label(cut.direction, unit), ylim=(0, 1.05))
         axes.locator_params(axis="x", nbins=5)
         if k == 0:
             axes.set_ylabel("objective / its largest")
             axes.legend(fontsize=7, title="blur", title_fontsize=7, loc="upper right")
         else:
             axes.set_yticklabels([])
-    for axes, surface in zip(parts[-1].subplots(1, max(len(maps), 1), squeeze=False)[0], maps):
-        _plot_map(axes, surface, covariance, unit)
+    for axes, plane in zip(parts[-1].subplots(1, max(len(maps), 1), squeeze=False)[0], maps):
+        _plot_map(axes, plane, covariance, unit)
     return _raster(figure)
 
 
-def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> None:
-    i, j = one.directions
-    across, up = _shown(one.offsets[0], i), _shown(one.offsets[1], j)
-    axes.contourf(across, up, one.values, levels=np.linspace(min(one.values.min(), 0), 1, 21))
+def _plot_map(axes: Axes, plane: Map, covariance: Floats | None, unit: str) -> None:
+    i, j = plane.directions
+    across, up = _shown(plane.offsets[0], i), _shown(plane.offsets[1], j)
+    axes.contourf(across, up, plane.values, levels=np.linspace(min(plane.values.min(), 0), 1, 21))
     axes.plot(0, 0, "+", color="white", ms=9)
     title = "finest blur"
     if covariance is not None and np.isfinite(covariance).all():
         outline = ellipse_95(covariance[np.ix_([i, j], [i, j])])
         # a round factor that makes it large enough to be seen
-        share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
+        share = max(float(np.abs(outline[:, k]).max() / plane.offsets[k].max()) for k in range(2))
         scale = next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
         closed = np.vstack([outline, outline[:1]]) * scale
         axes.plot(_shown(closed[:, 0], i), _shown(closed[:, 1], j), color="white", lw=1.2)
@@ -137,10 +134,10 @@ def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> Non
 def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
-    """One range sensor; each curve is divided by its largest value, which the legend states."""
-    what = f"echoes as of {finding.count:.1f} points"
-    what = what if finding.points is None else f"{len(finding.points)} ranges"
-    axes.set_title(f"{finding.name}: {what}", fontsize=9, loc="left", parse_math=False)
+    """Plot a range sensor; curves are divided by their maxima, which the legend states."""
+    measured = f"echoes as of {finding.count:.1f} points"
+    measured = measured if finding.points is None else f"{len(finding.points)} ranges"
+    axes.set_title(f"{finding.name}: {measured}", fontsize=9, loc="left", parse_math=False)
     axes.set(yticks=[], ylim=(-0.03, 1.55))
     if finding.view is None:
         axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
@@ -170,7 +167,7 @@ def _plot_ranges(
 
 
 def _plot_matched(axes: Axes, view: View, body: Body, sigma: float, ranges: Floats) -> None:
-    """C, which is g blurred once more, as the matched objective looks it up."""
+    """Plot C, which is g blurred once more, as the matched objective looks it up."""
     places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)
     values = matched_objective([view], body, [sigma]).atlas.look_up(places[None, None])[..., 0]
     top = max(float(values.max()), 1e-30)
@@ -191,7 +188,7 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
         axes.errorbar(float(expected.y[i, 0]), 1.08, xerr=spread[i], label=label, **look)
     order = seen[np.argsort(expected.y[seen, 0])]
     ranges = expected.y[order, 0]
-    # features whose names would stand on each other share one line of names
+    # features whose names would overlap share one line of names
     near = np.diff(ranges) < _APART * np.ptp(axes.get_xlim())
     for group in np.split(np.arange(len(order)), np.flatnonzero(~near) + 1):
         names = ", ".join(body.labels[i] for i in order[group])
@@ -200,7 +197,7 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
 
 
 def _span(finding: Finding) -> tuple[float, float]:
-    """The ranges worth showing: around what is expected, else all that was measured."""
+    """Return the shown ranges: around the expected ones, else around all measured ones."""
     shown = np.zeros(0)
     if finding.expectation is not None:
         shown = finding.expectation.y[finding.expectation.seen, 0]
@@ -237,20 +234,20 @@ def _raster(figure: Figure) -> Picture:
 
 @dataclass(frozen=True)
 class Slice:
-    """The objective along one direction."""
+    """Values of the objective along one direction."""
 
     direction: int  # of `mixpose.rigid.TWIST_NAMES`
     offsets: Floats  # (n,) lengths or radians from the pose
-    values: Floats  # (levels, n) per level of blur, the largest of each level 1
+    values: Floats  # (levels, n) by blur, divided by the maximum of the level
 
 
 @dataclass(frozen=True)
 class Map:
-    """The objective at the finest blur over two directions."""
+    """Values of the objective at the finest blur over two directions."""
 
     directions: tuple[int, int]  # across and up
     offsets: tuple[Floats, Floats]  # (n,), (n,)
-    values: Floats  # (n, n), rows along the second direction; the largest is 1
+    values: Floats  # (n, n) divided by their maximum, rows along the second direction
 
 
 def objective_around(
@@ -261,11 +258,11 @@ def objective_around(
     options: EstimatorOptions,
     levels: Sequence[Sequence[float]],
 ) -> tuple[list[Slice], list[Map]]:
-    """Cut the objective along every free direction, and over the pairs that depend most.
+    """Evaluate the objective along all free directions, and over the most correlated pairs.
 
-    There is at least one view, and none with an empty observation. Pairs are chosen by their
-    correlation in the covariance (6, 6); without it they are the first. `levels` are the blurs per
-    level and view, coarse to fine.
+    There is at least one view, and none with an empty observation. Correlations are those of the
+    covariance (6, 6); without it the first pairs are taken. `levels` are the blurs per level and
+    view, coarse to fine.
     """
     free = np.flatnonzero(free_mask(options)).tolist()
     unit = _one_blur(views, body, T_world_object, levels[-1])
@@ -274,12 +271,12 @@ def objective_around(
     samples = body.sample(min(options.samples, _SAMPLES), seed=options.seed)
 
     def values(sigmas: Sequence[float], twists: Floats) -> Floats:
-        given = options.objective, views, body, samples, sigmas, T_world_object, options.seed
-        objective = build_objective(*given)
+        arguments = options.objective, views, body, samples, sigmas, T_world_object, options.seed
+        objective = build_objective(*arguments)
         poses = perturb(T_world_object, twists)
         parts = [objective.value(poses[k : k + _BATCH]) for k in range(0, len(poses), _BATCH)]
-        found = np.nan_to_num(np.concatenate(parts))
-        return np.asarray(found / max(float(found.max()), 1e-300))
+        heights = np.nan_to_num(np.concatenate(parts))
+        return np.asarray(heights / max(float(heights.max()), 1e-300))
 
     slices, maps = [], []
     for k in free:
@@ -301,14 +298,14 @@ def objective_around(
 
 
 def _half_width(offset: float, direction: int) -> float:
-    """An offset, but for turns half a turn at most."""
+    """Limit an offset to half a turn if the direction is a rotation."""
     return min(offset, np.pi) if direction >= 3 else offset
 
 
 def _one_blur(
     views: Sequence[View], body: Body, T_world_object: Floats, sigmas: Sequence[float]
 ) -> Floats:
-    """By how much each direction moves the features by one finest blur, in the keenest sensor."""
+    """Return offsets (6,) that move features by the finest blur in the most sensitive sensor."""
     points = body.nodes.points
     keenest = np.zeros(6)
     for view, sigma in zip(views, sigmas, strict=True):

@@ -1,7 +1,7 @@
-"""All sensors of one moment in one picture, with the pose: a frame of an overlay.
+"""Draw all sensors of one moment in one picture, with the poses: a frame of an overlay.
 
-What is small in a large frame of a camera stands once more and larger in a corner of its picture.
-A range sensor's frame is a strip: what it measured, and where the pose has the features.
+Bodies that are small in the frame of a camera are repeated, enlarged, in a corner of its picture.
+The frame of a range sensor is a strip: its measurements and the expected ranges of features.
 """
 
 from __future__ import annotations
@@ -36,13 +36,12 @@ _BLANK_SIZE = (640, 480)
 _DETECTION_PX = 2.5
 
 Posed: TypeAlias = Sequence[tuple[Body, Estimate]]
-Box: TypeAlias = tuple[Floats, float]
-"""A square of a sensor, px: the place (2,) of its upper left pixel, and its side."""
+Box: TypeAlias = tuple[Floats, float]  # a square, px: place (2,) of the upper left pixel, and side
 
-_SMALL = 0.25  # of the shorter side of a picture: what is smaller is drawn larger
-_SIDE = 0.4  # of that side, which the inset takes
-_ROOM = 0.3  # of the extent of what is small, on each side of it
-_LEAST_PX = 24.0  # of the sensor, that an inset shows at least
+_SMALL = 0.25  # of the shorter side of a picture: smaller boxes are repeated, enlarged
+_SIDE = 0.4  # side of the inset, by the shorter side of the picture
+_ROOM = 0.3  # margin on all sides of the features, by their extent
+_LEAST_PX = 24.0  # of the sensor: smallest side of a box
 
 BACKGROUND = 24  # grey level
 STRIP_SIZE = (960, 130)
@@ -54,8 +53,8 @@ _TICKS = 8
 def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> Picture:
     """Draw the frames of all sensors with the poses estimated from them, one of each body.
 
-    Cameras stand side by side, range sensors are strips below them; each of several bodies has a
-    colour of its own. The picture is of the same size for every frame, as long as the frames are.
+    Cameras are side by side, range sensors are strips below them; several bodies have different
+    colours. Frames of constant size give pictures of constant size.
     """
     posed = with_bodies(session, estimates)
     cameras = [setup for setup in session.sensors if setup.sensor.dimension == 2]
@@ -63,7 +62,7 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     rows: list[Picture] = []
     if cameras:
         columns, room = canvas.columns_for(len(cameras)), room_for(len(cameras))
-        panels = [_panel(posed, one, frame_set.frames.get(one.name), room) for one in cameras]
+        panels = [_panel(posed, setup, frame_set.frames.get(setup.name), room) for setup in cameras]
         for panel, setup in zip(panels, cameras, strict=True):
             if setup.name not in frame_set.frames:
                 _name(panel, f"{setup.name}: no frame", GREY)
@@ -81,7 +80,7 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
 
 
 def _panel(posed: Posed, setup: SensorSetup, frame: RawFrame | None, room: Size) -> Picture:
-    """A camera's frame with its poses, and those that are small in it larger in a corner."""
+    """Draw a camera's frame with the poses; if small in it, repeat them enlarged in a corner."""
     ground, part = backdrop(setup, frame, room)
     box = small_box(ground, part, posed, setup.sensor)
     if box is None:
@@ -99,28 +98,28 @@ def _panel(posed: Posed, setup: SensorSetup, frame: RawFrame | None, room: Size)
 
 
 def _mark_detections(picture: Picture, data: object, part: Part) -> None:
-    """Draw the detections of a camera that has them in place of images, if it has."""
+    """Draw the detections of a camera that gives detections instead of images."""
     if isinstance(data, PointPattern):
         for place in part.places(data.points):
-            canvas.ring(picture, place, _DETECTION_PX * canvas.stroke(picture), overlay.FOUND)
+            canvas.ring(picture, place, _DETECTION_PX * canvas.stroke(picture), overlay.MEASURED)
 
 
 def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[Body, Estimate]]:
-    """Estimates with the bodies that they are of."""
-    bodies = {one.body.name: one.body for one in session.objects}
-    return [(bodies.get(one.object, session.body), one) for one in estimates]
+    """Pair estimates with their bodies."""
+    bodies = {setup.body.name: setup.body for setup in session.objects}
+    return [(bodies.get(estimate.object, session.body), estimate) for estimate in estimates]
 
 
 def room_for(cameras: int) -> Size:
-    """Width and height in px that each of so many cameras has in a picture of them all."""
+    """Return width and height in px per camera in a picture of so many."""
     columns = canvas.columns_for(cameras)
     return LARGEST[0] // columns, LARGEST[1] // -(-cameras // columns)
 
 
 def backdrop(setup: SensorSetup, frame: RawFrame | None, room: Size | None) -> tuple[Picture, Part]:
-    """A camera's frame as a picture that fits into some room, before anything is drawn on it.
+    """Return a camera's frame as a picture that fits into a room, and the part that it shows.
 
-    Without a room it keeps its size. Detections in place of images are dots on a dark ground.
+    Without a room it keeps its size. Detections instead of images are rings on a dark ground.
     """
     data = None if frame is None else frame.data
     if data is None or isinstance(data, PointPattern | GridPattern):
@@ -136,17 +135,17 @@ def backdrop(setup: SensorSetup, frame: RawFrame | None, room: Size | None) -> t
 
 
 def resized(image: Image, room: Size | None) -> tuple[Image, float]:
-    """An image as large as some room has it, and by how much it was enlarged."""
+    """Resize an image to fit into a room; also return the factor."""
     zoom = _zoom((image.shape[1], image.shape[0]), room)
     if zoom == 1:
         return image, 1.0
     size = max(round(image.shape[1] * zoom), 1), max(round(image.shape[0] * zoom), 1)
-    way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
-    return cast(Image, cv2.resize(image, size, interpolation=way)), zoom
+    interpolation = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
+    return cast(Image, cv2.resize(image, size, interpolation=interpolation)), zoom
 
 
 def _zoom(size: Size, room: Size | None) -> float:
-    """Factor by which a picture fits into some room; small ones grow a little, by whole pixels."""
+    """Return the factor to fit into a room; small pictures grow by a whole factor, 2 at most."""
     if room is None:
         return 1.0
     zoom = min(room[0] / size[0], room[1] / size[1])
@@ -154,10 +153,7 @@ def _zoom(size: Size, room: Size | None) -> float:
 
 
 def with_sizes(session: Session, frame_set: FrameSet) -> Session:
-    """A session whose cameras all have the size of a picture, as a frame shows them.
-
-    One without a resolution, whose frames are detections, would be as large as each frame needs.
-    """
+    """Set missing resolutions of cameras by a frame, lest sizes of pictures vary by detections."""
 
     def sized(setup: SensorSetup) -> SensorSetup:
         frame = frame_set.frames.get(setup.name)
@@ -170,7 +166,7 @@ def with_sizes(session: Session, frame_set: FrameSet) -> Session:
 
 
 def _size_of(data: Pattern | None) -> Size:
-    """A size that holds detections of a camera that states no resolution."""
+    """Return a size that contains detections of a camera without a resolution."""
     if not isinstance(data, PointPattern) or not len(data.points):
         return _BLANK_SIZE
     width, height = np.ceil(1.1 * data.points.max(axis=0)).astype(int)
@@ -182,34 +178,37 @@ def draw_camera(
     setup: SensorSetup,
     picture: Picture,
     part: Part,
-    found: Floats | None = None,
+    detections: Floats | None = None,
     *,
     named: bool = True,
     captioned: bool = True,
 ) -> Picture:
-    """Draw the bodies of a moment, and features `found` (M, 2), on a frame of `backdrop`."""
+    """Draw the bodies of a moment, and `detections` (M, 2), on a frame of `backdrop`."""
     several = len(posed) > 1
     colours = overlay.BODY_COLOURS if several else (overlay.STATUS_COLOURS[posed[0][1].status],)
-    for k, (body, one) in enumerate(posed):
+    for k, (body, estimate) in enumerate(posed):
         picture = overlay.draw_pose(
-            picture, setup.sensor, body, one.T_world_object, one.covariance,
-            part=part, colour=colours[k % len(colours)], found=None if k else found, named=named,
+            picture, setup.sensor, body, estimate.T_world_object, estimate.covariance,
+            part=part, colour=colours[k % len(colours)], named=named,
+            detections=None if k else detections,
         )  # fmt: skip
     first = posed[0][1]
     if captioned and several:
-        overlay.legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
+        statuses = [(estimate.label, estimate.status) for _, estimate in posed]
+        overlay.legend(picture, statuses, first.frame)
     elif captioned:
         overlay.caption(picture, first.status, first.frame)
     return picture
 
 
 def draw_strips(posed: Posed, setup: SensorSetup, frame: RawFrame | None) -> list[Picture]:
-    """Draw what a range sensor measured, with the ranges of each body: a strip for each."""
+    """Draw a strip per body: the measurements of a range sensor and the body's expected ranges."""
     data = None if frame is None else frame.data
     pattern = data if isinstance(data, PointPattern | GridPattern) else None
-    names = [f"{setup.name}, {one.label}" if len(posed) > 1 else setup.name for _, one in posed]
+    name, several = setup.name, len(posed) > 1
+    names = [f"{name}, {estimate.label}" if several else name for _, estimate in posed]
     rows = zip(names, posed, strict=True)
-    return [draw_ranges(name, pattern, setup.sensor, *each) for name, each in rows]
+    return [draw_ranges(title, pattern, setup.sensor, *pair) for title, pair in rows]
 
 
 def _name(picture: Picture, name: str, colour: Colour) -> None:
@@ -218,11 +217,11 @@ def _name(picture: Picture, name: str, colour: Colour) -> None:
 
 
 def small_box(picture: Picture, part: Part, posed: Posed, sensor: Sensor) -> Box | None:
-    """Around all features in view, where they are small in a picture; else None."""
+    """Return a box around all features in view if it is small in the picture, else None."""
     places = [np.zeros((0, 2))]
-    for body, one in posed:
-        if one.T_world_object is not None:
-            y, _, seen = overlay.projected_features(sensor, body, one.T_world_object)
+    for body, estimate in posed:
+        if estimate.T_world_object is not None:
+            y, _, seen = overlay.projected_features(sensor, body, estimate.T_world_object)
             places.append(y[seen])
     y = np.concatenate(places)
     if len(y) < 2:
@@ -233,17 +232,17 @@ def small_box(picture: Picture, part: Part, posed: Posed, sensor: Sensor) -> Box
     return ((lower + upper - side) / 2, side) if is_small else None
 
 
-def cut_out(whole: Picture, part: Part, size: Size, way: int) -> Picture:
-    """A part of a picture of all pixels of a sensor, in some size, resized in some way."""
-    # the sensor's place of the first pixel, and how far the next is
+def cut_out(whole: Picture, part: Part, size: Size, interpolation: int) -> Picture:
+    """Cut a part out of a picture of a whole sensor; resize it to a size, by an interpolation."""
+    # place on the sensor of the first pixel, and distance to the next
     first, step = np.array(part.corner) + 0.5 / part.zoom - 0.5, 1 / part.zoom
     to_sensor = np.array([[step, 0.0, first[0]], [0.0, step, first[1]]])
-    cut = cv2.warpAffine(whole, to_sensor, size, flags=way | cv2.WARP_INVERSE_MAP)
+    cut = cv2.warpAffine(whole, to_sensor, size, flags=interpolation | cv2.WARP_INVERSE_MAP)
     return np.asarray(cut, dtype=np.uint8)
 
 
 def put_into(picture: Picture, part: Part, inset: Picture, box: Box) -> None:
-    """Put an inset into a corner of a picture, in place: not that of its caption, nor the box."""
+    """Put an inset into the corner of a picture farthest from the box, in place; not upper left."""
     height, width = picture.shape[:2]
     side, middle = len(inset), part.places(box[0] + box[1] / 2)
     corners = np.array([[width, height], [0, height], [width, 0]]) - side * np.ones(2)
@@ -259,7 +258,7 @@ def put_into(picture: Picture, part: Part, inset: Picture, box: Box) -> None:
 def draw_ranges(
     name: str, pattern: Pattern | None, sensor: Sensor, body: Body, estimate: Estimate
 ) -> Picture:
-    """Draw what a range sensor measured, None where it has no frame, with the ranges of a pose."""
+    """Draw measurements of a range sensor, None without a frame, and expected ranges of a pose."""
     size, T = STRIP_SIZE, estimate.T_world_object
     picture = np.full((size[1], size[0], 3), BACKGROUND, np.uint8)
     expected = np.zeros(0)
@@ -279,11 +278,11 @@ def draw_ranges(
         ranges = pattern.origin[0] + pattern.step * np.arange(pattern.values.shape[1])
         share = np.clip(pattern.values[0] / max(float(pattern.values[0].max()), 1e-30), -0.1, 1.0)
         heights = size[1] * (_BASE - (_BASE - _TOP) * share)
-        canvas.polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.FOUND)
+        canvas.polyline(picture, np.stack([across(ranges), heights], axis=-1), overlay.MEASURED)
     elif pattern is not None:
         for u in across(pattern.points[:, 0]):
             ends = (u, _TOP * size[1]), (u, _BASE * size[1])
-            canvas.polyline(picture, ends, overlay.FOUND, width=2)
+            canvas.polyline(picture, ends, overlay.MEASURED, width=2)
     if T is not None:
         colour = overlay.STATUS_COLOURS[estimate.status]
         spread = half_widths_95(sensor, body, T, estimate.covariance) * width / (high - low)
@@ -294,7 +293,7 @@ def draw_ranges(
 def half_widths_95(
     sensor: Sensor, body: Body, T_world_object: Floats, covariance: Floats | None
 ) -> Floats:
-    """Half-widths (N,) of the intervals that hold a feature's range with 95 %; 0 if not known."""
+    """Return half-widths (N,) of 95 % intervals of the ranges of features; 0 if not known."""
     if covariance is None or not np.isfinite(covariance).all():
         return np.zeros(len(body))
     variances = overlay.projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
@@ -304,7 +303,7 @@ def half_widths_95(
 def _span(
     sensor: Sensor, pattern: Pattern | None, expected: Floats, body: Body
 ) -> tuple[float, float]:
-    """The ranges that are shown: the sensor's limits, or steps of about two bodies around all."""
+    """Return the shown ranges: those of the profile, the sensor's limits, or steps around all."""
     if isinstance(pattern, GridPattern):
         low = float(pattern.origin[0])
         return low, low + pattern.step * max(pattern.values.shape[1] - 1, 1)
@@ -314,7 +313,7 @@ def _span(
     shown = expected[np.isfinite(expected)]
     if isinstance(pattern, PointPattern):
         shown = np.append(shown, pattern.points[:, 0])
-    # whole steps, so that the scale stands still while the body moves within one
+    # whole steps, so that the scale is constant while the body moves within one
     step = _round_number(4 * body.radius)
     if not shown.size:
         return 0.0, step
@@ -324,7 +323,7 @@ def _span(
 
 
 def _round_number(least: float) -> float:
-    """1, 2 or 5 times a power of ten, no less than a positive number."""
+    """Round a positive number up to 1, 2 or 5 times a power of ten."""
     unit = float(10.0 ** np.floor(np.log10(least)))
     return unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= least)
 
@@ -332,7 +331,7 @@ def _round_number(least: float) -> float:
 def _draw_scale(
     picture: Picture, low: float, high: float, across: Callable[[Floats], Floats]
 ) -> None:
-    """A line with round numbers between two ends."""
+    """Draw a scale with round numbers between two ranges."""
     height, width = picture.shape[:2]
     base = _BASE * height
     canvas.polyline(picture, [(_MARGIN_PX, base), (width - _MARGIN_PX, base)], GREY)
@@ -347,7 +346,7 @@ def _draw_scale(
 def _draw_expected(
     picture: Picture, places: Floats, spread: Floats, labels: Sequence[str], colour: Colour
 ) -> None:
-    """Triangles that point at the expected ranges, names above, and 95 % where wide enough."""
+    """Draw triangles at expected ranges with names, and 95 % intervals if wide enough."""
     height = picture.shape[0]
     tip, half = (_TOP - 0.02) * height, 5.0 * canvas.stroke(picture)
     previous = -np.inf
@@ -359,6 +358,6 @@ def _draw_expected(
         canvas.polyline(picture, corners, colour, closed=True)
         if spread[i] > half:
             canvas.polyline(picture, [(u - spread[i], tip), (u + spread[i], tip)], WHITE)
-        if u - previous > 3 * half:  # else numbers would lie upon each other
+        if u - previous > 3 * half:  # else names would overlap
             canvas.words(picture, labels[i], (u - 4, tip - 2.2 * half), colour, size=0.8)
             previous = u

@@ -1,4 +1,4 @@
-"""All pictures of one inspected frame, and the sheet that puts them together."""
+"""Draw all pictures of an inspected frame, and the sheet that combines them."""
 
 from __future__ import annotations
 
@@ -14,31 +14,28 @@ from mixpose.objective import View
 from mixpose.pictures import stages
 from mixpose.pictures.canvas import WHITE, Picture, in_grid, stacked, words
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
+from mixpose.pictures.overlay import MEASURED, STATUS_COLOURS
 from mixpose.pictures.plots import objective_around, objective_picture, ranges_picture
 from mixpose.records import Estimate
 from mixpose.session import Session
 
-BODIES = "bodies.png"
-"""The frames of all sensors with the poses of several bodies."""
+BODIES = "bodies.png"  # frames of all sensors with the poses of several bodies
+STAGES = ("features", "threshold", "density", "pose")  # of a camera, in order on the sheet
 
-STAGES = ("features", "threshold", "density", "pose")
-"""Pictures of a camera, as they stand on the sheet."""
-
-_LARGE = (1400, 1050)  # room of a picture of its own
-_SMALL = (460, 345)  # and on the sheet
+_LARGE = (1400, 1050)  # room of a separate picture
+_SMALL = (460, 345)  # room of a picture on the sheet
 _WIDTH = 4 * _SMALL[0] + 12
 _BLURS_ON_SHEET = 2
-_BAR_PX = 72  # of a title and a scale on the sheet, with the gaps
-_MOST_BLURS = 8  # in a picture of their own
+_BAR_PX = 72  # height of a title and a scale on the sheet, with the gaps
+_MOST_BLURS = 8  # in a separate picture
 _GAP_PX = 4
-_RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
+_RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of up to four and of more range sensors
 
 
 def inspection_pictures(
     session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
-    """All pictures of one body in one frame, by file name; ``sheet.png`` is the first."""
+    """Draw all pictures of one body in a frame, by file name; ``sheet.png`` is the first."""
     views = [finding.view for finding in findings if finding.view is not None]
     views = [view for view in views if not view.observation.is_empty]
     blurs = fitted_blurs(views, estimate)
@@ -49,14 +46,14 @@ def inspection_pictures(
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        about = session, finding, body, estimate, sigmas
-        made = _camera_pictures(*about, on_sheet=False)
-        pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        made = _camera_pictures(*about, on_sheet=True)
-        rows.append(in_grid([made[stage] for stage in STAGES if stage in made], 4, _SMALL))
+        arguments = session, finding, body, estimate, sigmas
+        by_stage = _camera_pictures(*arguments, on_sheet=False)
+        pictures |= {f"{name}_{stage}.png": picture for stage, picture in by_stage.items()}
+        by_stage = _camera_pictures(*arguments, on_sheet=True)
+        rows.append(in_grid([by_stage[stage] for stage in STAGES if stage in by_stage], 4, _SMALL))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
-        ends = [_some(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
+        ends = [_spaced_blurs(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
         height = _RANGE_ROW if len(ranged) <= 4 else _LOW_RANGE_ROW
         picture = ranges_picture(ranged, ends, body, estimate, session.unit, _WIDTH, height)
         pictures["ranges.png"] = picture
@@ -74,7 +71,7 @@ def inspection_pictures(
 
 
 def possible_names(session: Session) -> list[str]:
-    """Names of all files that may be made of a session's frame."""
+    """Return the names of all files that an inspection of a frame may write."""
     sensors = file_names([setup.name for setup in session.sensors])
     names = [f"{name}_{stage}.png" for name in sensors for stage in STAGES]
     names = ["sheet.png", "objective.png", "ranges.png", *names]
@@ -83,12 +80,12 @@ def possible_names(session: Session) -> list[str]:
 
 
 def prefixes_of(labels: Sequence[str]) -> list[str]:
-    """What the names of a body's pictures begin with; nothing where it is the only one."""
+    """Return prefixes of the pictures' names by body; "" for the only body."""
     return [""] if len(labels) == 1 else [f"{name}_" for name in file_names(labels)]
 
 
 def fitted_blurs(views: Sequence[View], estimate: Estimate) -> dict[str, list[float]]:
-    """Blurs by sensor that a pose was fitted by, in their order; σ_ε of one that it was not."""
+    """Return the blurs of a fit by sensor, in their order; σ_ε if a blur is not known."""
     levels = estimate.blurs or ({},)
     return {
         view.name: [level.get(view.name, view.observation.sigma) for level in levels]
@@ -105,7 +102,7 @@ def _camera_pictures(
     *,
     on_sheet: bool,
 ) -> dict[str, Picture]:
-    """One camera's pictures by `STAGES`; no densities without blurs."""
+    """Draw a camera's pictures by `STAGES`; no densities without blurs."""
     room = _SMALL if on_sheet else _LARGE
     pictures = {
         "features": stages.features_picture(finding, room),
@@ -113,16 +110,16 @@ def _camera_pictures(
         "pose": stages.pose_picture(finding, body, estimate, room),
     }
     if finding.view is not None and sigmas:
-        few = _some(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
+        few = _spaced_blurs(sigmas, _BLURS_ON_SHEET if on_sheet else _MOST_BLURS)
         side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
         panel = (_SMALL[0] // len(few) - 2, _SMALL[1] // 2 - _BAR_PX) if on_sheet else (side, side)
-        about = finding.view, body, estimate.T_world_object, few, session.estimator
-        pictures["density"] = stages.densities_picture(*about, panel)
+        arguments = finding.view, body, estimate.T_world_object, few, session.estimator
+        pictures["density"] = stages.densities_picture(*arguments, panel)
     return pictures
 
 
 def _heading(session: Session, estimate: Estimate) -> Picture:
-    """What the sheet is of, and what its marks mean."""
+    """Draw the title of the sheet, and the legend of its marks."""
     picture = np.zeros((40, _WIDTH, 3), np.uint8)
     whose = f"{estimate.label} " if len(session.labels) > 1 else ""
     text = f"{session.path.name}, frame {estimate.frame}: {whose}"
@@ -130,19 +127,19 @@ def _heading(session: Session, estimate: Estimate) -> Picture:
     colour = STATUS_COLOURS[estimate.status]
     u = words(picture, f"{estimate.status}  ", (u + 8, 27), colour, size=1.2)
     if any(setup.sensor.dimension == 2 for setup in session.sensors):
-        u = words(picture, "+ found", (u + 40, 27), FOUND)
+        u = words(picture, "+ found", (u + 40, 27), MEASURED)
         if estimate.T_world_object is not None:
             u = words(picture, "o where the pose has a feature, numbered", (u + 24, 27), colour)
             words(picture, "ellipse: its place with 95 %", (u + 24, 27), WHITE)
     return picture
 
 
-def _some(sigmas: Sequence[float], most: int) -> list[float]:
-    """The first and the last blur, and as many between them as there is room for."""
+def _spaced_blurs(sigmas: Sequence[float], most: int) -> list[float]:
+    """Select at most so many blurs, evenly by number, with the first and the last."""
     chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, most)).astype(int))
     return [sigmas[k] for k in chosen] if sigmas else []
 
 
 def file_names(wanted: Sequence[str]) -> list[str]:
-    """Names that any file system takes, no two alike."""
+    """Convert names to distinct names that any file system allows."""
     return distinct(wanted, partial(re.sub, r"[^\w.-]", "_"), str.casefold)

@@ -1,4 +1,4 @@
-"""Pictures and videos carry a signature, so that mixpose overwrites its own and nobody else's."""
+"""Sign pictures and videos, so that mixpose overwrites only files that it wrote."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ def sign_figure(path: Path) -> None:
 
 
 def _signed(png: bytes) -> bytes:
+    """Insert the signature into a PNG as its second chunk."""
     body = b"tEXt" + b"Software\0" + SIGNATURE
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     return png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:]
@@ -56,7 +57,7 @@ def sign_video(path: Path) -> None:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether a file is empty or carries the signature."""
+    """Test whether a file is empty or has the signature."""
     with path.open("rb") as stream:
         beginning = stream.read(_LOOK_AT)
         size = stream.seek(0, 2)
@@ -66,7 +67,7 @@ def is_ours(path: Path) -> bool:
 
 
 def refuse_foreign(path: Path, option: str) -> None:
-    """Raise a `SessionError` if a file to be written is there, and mixpose did not write it."""
+    """Raise a `SessionError` if the path is a folder, or a file that mixpose did not write."""
     if path.is_dir():
         raise SessionError(f"{option}: {path} is a folder where a file is to be written")
     if path.is_file() and not is_ours(path):

@@ -1,9 +1,9 @@
-"""Pictures of what happens to one camera's frame: features, threshold, densities, pose.
+"""Draw the stages of one camera's frame: features, threshold, densities, pose.
 
-Densities are those that a frame was estimated with, g and C, blur by blur: g is the observed
-density g0 ∗ ε, and C is g blurred once more, which the matched objective looks up.  Objectives that
-draw samples look g up on a grid around them.  Panels of one kind have one scale, which a bar below
-states: it is logarithmic, as a peak falls with the square of the blur.
+The densities are those of the fit, g and C, per blur: g is the observed density g0 ∗ ε, and C is g
+blurred once more, which the matched objective looks up.  Objectives that draw samples look g up on
+a grid around these.  Panels of one kind share a scale, shown by a bar below: it is logarithmic, as
+a peak falls with the square of the blur.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ from mixpose.pictures.scene import backdrop, cut_out
 from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
-Look: TypeAlias = Callable[[Floats], NDArray[Any]]  # values of a density (...,) at places (..., 2)
+DensityAt: TypeAlias = Callable[[Floats], NDArray[Any]]  # values (...,) at places (..., 2)
 
 ABOVE: Colour = (0, 140, 255)
 _DIMMED = 0.45
 _MARK_PX = 9.0
 _MAGNIFIERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-_ELLIPSE_PX = 20.0  # larger half-axis of an ellipse that is easily seen
-_AROUND = 0.35  # of the body's extent, shown around it
+_ELLIPSE_PX = 20.0  # larger half-axis of an ellipse that is well visible
+_AROUND = 0.35  # margin around the body, by its extent
 _LEAST_AROUND_PX = 25.0
 
-_STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
-_FINEST = 4  # of these each way in a pixel
-_AT_ONCE = 2**20  # of these: 16 MB of coordinates
-_SHOWN = 1e-3  # of the lowest peak: what is less is black
-_BAR_LINES = 1.6  # height of a bar, lines of captions
-# widest blurs around the body: C is √2 wider, and a peak of it is shown as far as √(2 ln 1/_SHOWN)
+_STEPS_PER_SIGMA = 1.5  # places per σ at which a density is looked up
+_FINEST = 4  # most such places along each side of a pixel
+_AT_ONCE = 2**20  # places at a time: 16 MB of coordinates
+_SHOWN = 1e-3  # of the lowest peak: smaller values are black
+_BAR_LINES = 1.6  # height of a bar, in lines of captions
+# in widest blurs: peaks of C are √2 wider, and are visible up to √(2 ln 1/_SHOWN) deviations
 _MARGIN = 5.3
 
 
 def features_picture(finding: Finding, room: Size) -> Picture:
-    """The frame with a cross at every feature found."""
+    """Draw the frame with crosses at all detections."""
     picture, part = backdrop(finding.setup, finding.frame, room)
     _mark(picture, part, finding)
     is_grid, count = finding.points is None, finding.count
@@ -64,7 +64,7 @@ def features_picture(finding: Finding, room: Size) -> Picture:
 
 
 def threshold_picture(finding: Finding, room: Size) -> Picture:
-    """What the extraction goes by: pixels above the threshold, grey values, or the response."""
+    """Draw the basis of the extraction: pixels above the threshold, grey values or the response."""
     picture, part = backdrop(finding.setup, finding.frame, room)
     options = finding.setup.extract
     data = None if finding.frame is None else finding.frame.data
@@ -81,7 +81,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         title = "grey values above the threshold"
     elif options.method == "blobs":
         picture = np.asarray(np.round(_DIMMED * picture), dtype=np.uint8)
-        # a pixel of the picture is marked if any of those behind it is
+        # a pixel of the picture is marked if any pixel of the frame in it is
         behind = np.ones([max(int(np.ceil(1 / part.zoom)), 1)] * 2, np.uint8)
         mask = cv2.dilate(Light(data, options).above, behind)
         picture[cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0] = ABOVE
@@ -96,7 +96,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
 
 
 def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -> Picture:
-    """The part of the frame around the body, enlarged, with the pose on it."""
+    """Draw the part of the frame around the body, enlarged, with the pose."""
     T = estimate.T_world_object
     if finding.view is None or T is None:
         picture, _ = backdrop(finding.setup, finding.frame, room)
@@ -105,10 +105,9 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     whole, _ = backdrop(finding.setup, finding.frame, None)
     cut = cut_out(whole, part, room, cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR)
     factor, note = _magnifier(finding, body, estimate, part.zoom, canvas.stroke(cut))
-    posed = T, estimate.covariance, estimate.status, estimate.frame
-    drawn = overlay.draw_pose(
-        cut, finding.setup.sensor, body, *posed, part=part, found=finding.points, magnified=factor
-    )
+    posed = body, T, estimate.covariance, estimate.status, estimate.frame
+    sensor, points = finding.setup.sensor, finding.points
+    drawn = overlay.draw_pose(cut, sensor, *posed, part=part, detections=points, magnified=factor)
     if note:
         place = canvas.caption_place(drawn)[0], drawn.shape[0] - 8
         canvas.words(drawn, note, place, WHITE, size=0.8)
@@ -118,7 +117,7 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
 def _magnifier(
     finding: Finding, body: Body, estimate: Estimate, zoom: float, scale: float
 ) -> tuple[int, str]:
-    """A round factor that makes ellipses large enough to be seen, and what to say of them."""
+    """Choose a round factor that makes ellipses visible, and describe them."""
     T, covariance = estimate.T_world_object, estimate.covariance
     if T is None or covariance is None or not np.isfinite(covariance).all():
         return 1, ""
@@ -130,7 +129,7 @@ def _magnifier(
     largest = [np.linalg.norm(overlay.ellipse_95(spread), axis=1).max() for spread in spreads]
     room = min(_ELLIPSE_PX * scale, 0.4 * zoom * overlay.median_gap(y[seen]))
     allowed = room / max(zoom * float(np.median(largest)), 1e-12)
-    factor = max((each for each in _MAGNIFIERS if each <= allowed), default=1)
+    factor = max((n for n in _MAGNIFIERS if n <= allowed), default=1)
     enlarged = f", drawn {factor} times as large" if factor > 1 else ""
     return factor, f"95 % within {max(largest):.2g} px{enlarged}"
 
@@ -138,7 +137,7 @@ def _magnifier(
 def shown_box(
     view: View, body: Body, T: Floats | None, margin: float | None
 ) -> tuple[Floats, Floats]:
-    """The part of a camera's image around the body, or around all that was found."""
+    """Return the corners of a camera's image around the body, else around all detections."""
     y = np.zeros((0, 2))
     if T is not None:
         y, seen = view.sensor.project(transform(T, body.nodes.points))
@@ -153,44 +152,44 @@ def shown_box(
 
 
 def fitted(box: tuple[Floats, Floats], room: Size) -> Part:
-    """The part of a sensor with a box of its coordinates that fits into some room."""
+    """Return the part of a sensor that shows a box of its coordinates as large as a room allows."""
     extent = np.maximum(box[1] - box[0] + 1, 1)
     zoom = float(min(room[0] / extent[0], room[1] / extent[1]))
-    # the box in the middle; what else there is room for is shown too
+    # the box is in the middle of the room, which may show more
     corner = np.floor(box[0] - (np.array(room) / zoom - extent) / 2)
     return Part(zoom, (float(corner[0]), float(corner[1])))
 
 
 def _mark(picture: Picture, part: Part, finding: Finding) -> None:
-    """A cross at each point found, whose arms begin outside of what is seen of small spots."""
+    """Draw crosses at detections, whose arms begin outside of small spots."""
     points = finding.points
     if points is None or not len(points):
         return
     thin, zoom = canvas.stroke(picture), part.zoom
-    gaps = cKDTree(points).query(points, k=2)[0][:, 1]  # infinite of a lone one
+    gaps = cKDTree(points).query(points, k=2)[0][:, 1]  # infinite for a single detection
     reach = min(_MARK_PX * thin, max(0.45 * zoom * float(np.median(gaps)), 3.0))
     pattern = None if finding.view is None else finding.view.observation.pattern
     radii = pattern.radii if isinstance(pattern, PointPattern) else np.zeros(len(points))
-    # three pixels more than at half of its height, one where nobody knows, and half of a line
+    # radius at half height plus 3 px, or 1 px if unknown, plus half of a line
     spots = zoom * (1.1 * radii + np.where(radii > 0, 3.0, 1.0)) + 1.5 * thin
     for place, spot, gap in zip(part.places(points), spots, zoom * gaps, strict=True):
         inner = spot if reach / 3 < spot < reach else reach / 3
         outer = min(inner + 2 * reach / 3, max(gap - spot, inner + 2.0))
-        canvas.cross(picture, place, inner, outer, overlay.FOUND)
+        canvas.cross(picture, place, inner, outer, overlay.MEASURED)
 
 
 def titled(picture: Picture, title: str) -> Picture:
-    """The picture, with a caption in its upper left corner."""
+    """Write a caption into the upper left corner of a picture, in place, and return it."""
     canvas.words(picture, title, canvas.caption_place(picture), WHITE, size=0.9)
     return picture
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A density on a picture."""
+    """Values of a density on the pixels of a picture."""
 
     title: str
-    values: Floats  # (H, W) in 1/px², of each pixel the largest
+    values: Floats  # (H, W) in 1/px², largest in a pixel
 
 
 def densities_picture(
@@ -201,24 +200,24 @@ def densities_picture(
     options: EstimatorOptions,
     room: Size,
 ) -> Picture:
-    """A row of g at the blurs of a fit, a row of C, and the scale of each below it.
+    """Draw a row of g at the blurs of a fit, and a row of C, with their scales below.
 
     `sigmas` are standard deviations of a feature in px, in the order of the fit, the last σ_ε or
-    less. What there is about the pose is shown, in panels of a size `room`; without a pose, what is
-    about all that was found.
+    less. Panels of a size `room` show the surroundings of the body, or, without a pose, those of
+    all detections.
     """
     box = shown_box(view, body, T, _MARGIN * max(sigmas))
     part = fitted(box, room)
     rows = []
     for panels in panels_of(view, body, T, sigmas, options, part, room):
-        peaks = [float(one.values.max()) for one in panels]
-        top = max(peaks) or 1.0  # where nothing was found about the body, all is black
+        peaks = [float(panel.values.max()) for panel in panels]
+        top = max(peaks) or 1.0  # without detections around the body all is black
         bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
         drawn = []
-        for one in panels:
-            picture = _coloured(one.values, bottom, top)
+        for panel in panels:
+            picture = _coloured(panel.values, bottom, top)
             above = round(1.5 * canvas.line_height(picture)), picture.shape[1], 3
-            head = titled(np.zeros(above, np.uint8), one.title)
+            head = titled(np.zeros(above, np.uint8), panel.title)
             drawn.append(np.concatenate([head, picture]))
         row = canvas.in_grid(drawn, len(drawn))
         rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
@@ -234,47 +233,50 @@ def panels_of(
     part: Part,
     size: Size,
 ) -> list[list[Panel]]:
-    """The panels of g and those of C, on a picture (width, height) of a part of the image.
+    """Return the panels of g and those of C, of a size (width, height), for a part of the image.
 
-    The sampled objectives climb g alone; C is then that at σ_ε, by which the pose is judged.
+    Sampled objectives climb g alone; the only C is then that at σ_ε, by which the pose is judged.
     """
     is_matched = options.objective == "matched"
-    judged = list(sigmas) if is_matched else [view.observation.sigma]
+    matched_sigmas = list(sigmas) if is_matched else [view.observation.sigma]
     lower = np.array(part.corner) - 1.0
     shown = lower, lower + np.array(size) / part.zoom + 2.0
     pattern = view.observation.pattern
     points = pattern.points if isinstance(pattern, PointPattern) else np.zeros((0, 2))
-    observed, twice = [], []
-    look: Look
+    g_panels, matched_panels = [], []
+    density_at: DensityAt
     for sigma in sigmas:
         if is_matched or T is None:
-            # exact sums on a grid
-            word, look = "g", view.observation.density(sigma, shown).sample
+            # exact sums, on a grid
+            word, density_at = "g", view.observation.density(sigma, shown).sample
         else:
-            # as the objectives that draw samples have it: around these, and 0 elsewhere
+            # as in objectives that draw samples: around these, 0 elsewhere
             samples = body.sample(options.samples, seed=options.seed)
-            word, look = "g sampled", partial(_sampled, sampled_terms([view], samples, [sigma], T))
-        values = _largest(look, sigma, points, part, size)
-        observed.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
-    for sigma in judged:
-        look = partial(_looked_up, matched_objective([view], body, [sigma]).atlas)
+            terms = sampled_terms([view], samples, [sigma], T)
+            word, density_at = "g sampled", partial(_sampled, terms)
+        values = _largest(density_at, sigma, points, part, size)
+        g_panels.append(Panel(f"{word}, σ = {sigma:.3g} px", values))
+    for sigma in matched_sigmas:
+        density_at = partial(_looked_up, matched_objective([view], body, [sigma]).atlas)
         title = f"C = g ∗ ε, σ = {sigma:.3g} px"
-        twice.append(Panel(title, _largest(look, sigma, points, part, size)))
-    return [observed, twice]
+        matched_panels.append(Panel(title, _largest(density_at, sigma, points, part, size)))
+    return [g_panels, matched_panels]
 
 
 def _sampled(terms: Sequence[SampledTerm], places: Floats) -> NDArray[Any]:
+    """Look up the density of the first term at places; 0 without terms."""
     return terms[0].density.sample(places)[..., 0] if terms else np.zeros(places.shape[:-1])
 
 
 def _looked_up(atlas: Atlas, places: Floats) -> NDArray[Any]:
+    """Look up the density of the only view in an atlas at places."""
     return atlas.look_up(places[None])[0, ..., 0]
 
 
-def _largest(look: Look, sigma: float, points: Floats, part: Part, size: Size) -> Floats:
-    """Of each pixel of a picture (H, W) the largest value of a density, lest peaks be missed.
+def _largest(density_at: DensityAt, sigma: float, points: Floats, part: Part, size: Size) -> Floats:
+    """Return the largest value of a density within each pixel (H, W), lest peaks be missed.
 
-    Peaks too narrow for that are where the detections (n, 2) are.
+    Values at the detections (n, 2) are included, as their peaks may be too narrow for the grid.
     """
     width, height = size
     fine = min(max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1), _FINEST)
@@ -285,24 +287,24 @@ def _largest(look: Look, sigma: float, points: Floats, part: Part, size: Size) -
     largest, rows = np.zeros((height, width)), max(_AT_ONCE // (fine * fine * width), 1)
     for first in range(0, height, rows):
         places = np.stack(np.meshgrid(u, v[first * fine : (first + rows) * fine]), axis=-1)
-        blocks = np.asarray(look(places), np.float64).reshape(-1, fine, width, fine)
+        blocks = np.asarray(density_at(places), np.float64).reshape(-1, fine, width, fine)
         largest[first : first + rows] = np.maximum(blocks.max(axis=(1, 3)), 0.0)
     column, row = np.round(part.places(points)).astype(np.intp).T
     shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     if shown.any():
-        np.maximum.at(largest, (row[shown], column[shown]), look(points[shown][None])[0])
+        np.maximum.at(largest, (row[shown], column[shown]), density_at(points[shown][None])[0])
     return largest
 
 
 def _coloured(values: Floats, bottom: float, top: float) -> Picture:
-    """Densities in colours, black below `bottom` and brightest at `top`."""
+    """Convert densities to colours, black below `bottom` and brightest at `top`."""
     share = np.log(np.maximum(values, bottom) / bottom) / np.log(top / bottom)
     grey = np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
 
 
 def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
-    """The scale of a row of panels as a bar, with the powers of ten on it."""
+    """Draw the scale of a row of panels as a bar with powers of ten."""
     line = canvas.line_height(panel)
     shares = np.linspace(0, 1, width)
     bar = np.tile(bottom * (top / bottom) ** shares, (max(round(0.4 * line), 4), 1))
@@ -312,7 +314,7 @@ def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
     largest = f"{top:.1e} / px²"
     end = width - canvas.width_of(picture, largest, size=size) - 0.3 * line
     canvas.words(picture, largest, (end, baseline), WHITE, size=size)
-    free = 0.0  # from here on there is room for words
+    free = 0.0  # u from which on words have room
     for power in np.arange(np.ceil(np.log10(bottom)), np.floor(np.log10(top)) + 1):
         u, word = width * (power - np.log10(bottom)) / np.log10(top / bottom), f"1e{power:.0f}"
         reach = canvas.width_of(picture, word, size=size) + 0.5 * line

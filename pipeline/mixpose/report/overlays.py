@@ -1,4 +1,4 @@
-"""A few frames of the recording with their poses drawn on them."""
+"""Draw poses on a few frames of the recording."""
 
 from __future__ import annotations
 
@@ -22,24 +22,23 @@ from mixpose.rigid import transform
 from mixpose.runner import observation_of, source_spec
 from mixpose.session import SensorSetup, Session
 
-_EVENLY = 4  # frames, beside the best, the worst and one that is lost
+_EVENLY = 4  # evenly spaced frames, besides the best, the worst and a lost one
 _MOST_CAMERAS = 6  # the page must stay small
 _WIDEST = 720  # px
 _JPEG_QUALITY = 80
-_MARGIN = 2.0  # how much larger than the object its surroundings are
-_MOST_SHARE = 0.7  # of an image; larger surroundings show all of it
-_LEAST_PX = 120  # of the camera; smaller surroundings show grains
+_MARGIN = 2.0  # size of the shown surroundings, by that of the object
+_MOST_SHARE = 0.7  # of an image; for larger surroundings all of it is shown
+_LEAST_PX = 120  # of the camera; in smaller surroundings only pixels are seen
 _LARGEST_ZOOM = 4.0
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera's frame with the pose on it."""
+    """A camera's frame with the pose drawn on it."""
 
     sensor: str
-    uri: str  # holds the whole JPEG
-    # of the JPEG in px
-    width: int
+    uri: str  # contains the whole JPEG
+    width: int  # of the JPEG, px
     height: int
     zoom: float  # pixels of the JPEG per pixel of the camera
     is_part: bool  # whether it shows only the surroundings of the object
@@ -58,7 +57,7 @@ class OverlayFrame:
 def overlay_frames(
     session: Session | None, poses: PoseFile, series: Series, errors: Errors | None
 ) -> tuple[list[OverlayFrame], list[str]]:
-    """A few frames, ascending, with their poses on them, and sentences on what is not read."""
+    """Draw poses on selected frames, ascending; also return sentences on what cannot be read."""
     if session is None:
         return [], []
     opened, notices = _open(session, poses.sources)
@@ -87,7 +86,7 @@ def overlay_frames(
 
 
 def chosen_frames(series: Series, errors: Errors | None) -> dict[int, str]:
-    """Frames worth looking at with the reason: evenly spaced, best, worst and first lost one."""
+    """Select frames, with reasons: evenly spaced ones, best, worst and the first lost frame."""
     count = len(series.frames)
     if not count:
         return {}
@@ -108,14 +107,14 @@ def chosen_frames(series: Series, errors: Errors | None) -> dict[int, str]:
 
 
 def _open(session: Session, replaced: Mapping[str, str]) -> tuple[dict[str, Source], list[str]]:
-    """Recordings with images; a stream is over, and is not asked for again."""
+    """Open the recordings with images, and return notices; a stream cannot be read again."""
     opened: dict[str, Source] = {}
     notices: list[str] = []
     for setup in session.sensors:
-        own = replaced.get(setup.name)
-        if setup.model == "lateration" or not (own or setup.source):
+        replacement = replaced.get(setup.name)
+        if setup.model == "lateration" or not (replacement or setup.source):
             continue
-        spec = source_spec(session, setup, own)
+        spec = source_spec(session, setup, replacement)
         names = (spec.source,) if isinstance(spec.source, str) else spec.source
         if any("://" in name or is_stream(str(spec.base / name)) for name in names):
             continue
@@ -135,8 +134,9 @@ def _open(session: Session, replaced: Mapping[str, str]) -> tuple[dict[str, Sour
 def _read(
     opened: Mapping[str, Source], wanted: Mapping[int, str]
 ) -> Generator[FrameSet, None, None]:
+    """Read the wanted frames of all recordings, by number."""
     if any(source.kind == "video" for source in opened.values()):
-        # once through: going to a frame of a video means decoding all before it
+        # in one pass: to reach a frame of a video, all frames before it are decoded
         for frame_set in pair(opened, min(wanted), max(wanted) + 1):
             if frame_set.number in wanted:
                 yield frame_set
@@ -148,21 +148,22 @@ def _read(
 def _shot(
     session: Session, setup: SensorSetup, frame: RawFrame, image: Image, line: PoseLine
 ) -> Shot:
+    """Draw a pose on a camera's frame, cut to the surroundings of the object, as a JPEG."""
     picture = displayable(image)
     height, width = picture.shape[:2]
     (left, top), (right, bottom) = _surroundings(session, setup, line, width, height)
     is_part = (right - left, bottom - top) != (width, height)
     zoom = min(_WIDEST / (right - left), _LARGEST_ZOOM if is_part else 1.0)
     size = round((right - left) * zoom), max(round((bottom - top) * zoom), 1)
-    kind = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
+    interpolation = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
     part, scaled = Part(zoom, (left, top)), picture[top:bottom, left:right]
-    scaled = np.asarray(cv2.resize(scaled, size, interpolation=kind), dtype=np.uint8)
-    found = None  # features as the run found them
-    with suppress(MixposeError):  # the pose can be drawn all the same
+    scaled = np.asarray(cv2.resize(scaled, size, interpolation=interpolation), dtype=np.uint8)
+    detections = None  # extracted as in the run
+    with suppress(MixposeError):  # the pose can be drawn without them
         pattern = observation_of(session, setup, frame).pattern
-        found = pattern.points if isinstance(pattern, PointPattern) else None
+        detections = pattern.points if isinstance(pattern, PointPattern) else None
     posed = line.T_world_object, line.covariance, line.status, line.frame
-    drawn = draw_pose(scaled, setup.sensor, session.body, *posed, part=part, found=found)
+    drawn = draw_pose(scaled, setup.sensor, session.body, *posed, part=part, detections=detections)
     _, jpeg = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     uri = f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode('ascii')}"
     return Shot(setup.name, uri, *size, zoom, is_part)
@@ -171,7 +172,7 @@ def _shot(
 def _surroundings(
     session: Session, setup: SensorSetup, line: PoseLine, width: int, height: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Corners of the part of an image to show: all of it, or about an object small in it."""
+    """Return corners of the part of an image to show: around a small object, else all of it."""
     whole = (0, 0), (width, height)
     if line.T_world_object is None:
         return whole

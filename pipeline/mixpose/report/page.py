@@ -1,4 +1,4 @@
-"""The page: what it says, put into its template, and the session that its poses came from."""
+"""Render the page of a run: contents, templates, and the session of its poses."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 MARK = '<meta name="generator" content="mixpose report'
-"""By which a page is known as one of ours."""
+"""Mark of pages that mixpose wrote."""
 
 _TEMPLATE, _BODY_TEMPLATE = "page.html.j2", "body.html.j2"
 _STATUSES: tuple[Status, ...] = ("ok", "ambiguous", "lost")
 _MOST_RANGES = 40
-_LARGEST = 2_000_000  # bytes; no session file is near it
+_LARGEST = 2_000_000  # bytes; session files are far smaller
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number that sums a run up."""
+    """A number that summarises a run."""
 
     name: str
     value: str
@@ -41,7 +41,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class SensorRow:
-    """How one sensor took part in the run."""
+    """Contribution of one sensor to the run."""
 
     name: str
     model: str
@@ -52,7 +52,7 @@ class SensorRow:
 
 
 def page_templates() -> Environment:
-    """The templates of pages, or a `SessionError` that names the extra with what makes them."""
+    """Load the templates of pages; raise a `SessionError` that names the missing extra."""
     try:
         import matplotlib  # noqa: F401, PLC0415
         from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
@@ -71,11 +71,10 @@ def page_templates() -> Environment:
 
 
 def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
-    """The report of a run as one HTML page without anything outside it.
+    """Render the report of a run as one self-contained HTML page.
 
-    `cut` says whether the last line of the poses was cut off; `version` is of mixpose. A
-    `SessionError` if a library is missing, a `RecordingError` if poses and truth cannot be
-    compared.
+    `cut` says whether the last line of the poses was cut off; `version` is of mixpose. Raises a
+    `SessionError` if a library is missing, a `RecordingError` if poses and truth are incomparable.
     """
     environment = page_templates()
     labels = list(dict.fromkeys(line.label for line in poses.poses))
@@ -84,8 +83,8 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     if truth is not None and len(labels) > 1:
         poses, swaps = as_numbered(poses, truth)
     files = [_of_body(poses, label) for label in labels] if len(labels) > 1 else [poses]
-    template = environment.get_template(_BODY_TEMPLATE)  # of what is said of each body
-    parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
+    template = environment.get_template(_BODY_TEMPLATE)  # of the part on one body
+    parts, contents = [], [_body_content(file, truth, cut, origin) for file in files]
     for k, content in enumerate(contents):
         at = f"-{k + 1}" if len(files) > 1 else ""
         parts.append(template.render(at=at, truth=truth, **content))
@@ -93,7 +92,7 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     return environment.get_template(_TEMPLATE).render(
         mark=MARK,
         version=version,
-        name="/".join(path.parts[-2:]),  # the folder says more than the file alone
+        name="/".join(path.parts[-2:]),  # the folder identifies a run better than the file alone
         truth=truth,
         facts=_facts(poses, labels),
         notices=contents[0]["notices"] if len(files) == 1 else [],
@@ -107,18 +106,18 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
 def _body_content(
     poses: PoseFile, truth: PoseFile | None, cut: bool, origin: Origin
 ) -> dict[str, Any]:
-    """What the page says about one body."""
+    """Collect the contents of the page on one body."""
     from mixpose.report import figures  # noqa: PLC0415 - needs matplotlib
     from mixpose.report.overlays import overlay_frames  # noqa: PLC0415
 
     series = series_of(poses)
     errors = None if truth is None else errors_of(series, poses, truth)
     evaluation = None
-    if truth is not None:  # which may hold other bodies
-        own = _of_body(truth, series.label)
-        evaluation = evaluate(poses, own if own.poses else truth, numbered=True)
+    if truth is not None:  # it may contain other bodies
+        body_truth = _of_body(truth, series.label)
+        evaluation = evaluate(poses, body_truth if body_truth.poses else truth, numbered=True)
     if origin.session is not None and len(origin.session.labels) > 1:
-        names = [one.body.name for one in origin.session.objects]
+        names = [setup.body.name for setup in origin.session.objects]
         alone = origin.session.with_only(series.object) if series.object in names else None
         origin = replace(origin, session=alone)
     overlays, overlay_notices = overlay_frames(origin.session, poses, series, errors)
@@ -189,14 +188,14 @@ def _ranges_text(series: Series, status: Status) -> str:
 
 
 def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
-    found = [Figure("frames", str(len(series.frames)), _span(series))]
+    figures = [Figure("frames", str(len(series.frames)), _span(series))]
     if evaluation is not None and evaluation.rotation_deg and evaluation.translation:
         for name, errors, unit in (
             ("rotation error, RMS", evaluation.rotation_deg, "°"),
             ("position error, RMS", evaluation.translation, f" {series.unit}"),
         ):
             most = f"at most {_short(errors.max)}{unit}"
-            found.append(Figure(name, f"{_short(errors.rms)}{unit}", most))
+            figures.append(Figure(name, f"{_short(errors.rms)}{unit}", most))
     for name, widths, unit in (
         ("position, 95 %", series.half_width[:, :3], f" {series.unit}"),
         ("turn, 95 %", series.half_width[:, 3:], "°"),
@@ -206,15 +205,15 @@ def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
             middle, count = float(np.nanmedian(widest)), int(np.isinf(widest).sum())
             value = "open" if np.isinf(middle) else f"± {_short(middle)}{unit}"
             note = f"; open in {count} frames" if count else ""
-            found.append(Figure(name, value, f"median of the least certain axis{note}"))
+            figures.append(Figure(name, value, f"median of the least certain axis{note}"))
     posed = series.score[[status != "lost" for status in series.status]]
     if np.isfinite(posed).any():
-        found.append(Figure("score", _median(posed), "median of frames with a pose; 1 is best"))
+        figures.append(Figure("score", _median(posed), "median of frames with a pose; 1 is best"))
     if np.isfinite(series.latency_ms).any():
         slow = float(np.nanpercentile(series.latency_ms, 95))
         value = f"{_median(series.latency_ms)} ms"
-        found.append(Figure("per frame", value, f"median; 95 % within {_short(slow)} ms"))
-    return found
+        figures.append(Figure("per frame", value, f"median; 95 % within {_short(slow)} ms"))
+    return figures
 
 
 def _span(series: Series) -> str:
@@ -245,7 +244,7 @@ def _sensor_rows(
 
 
 def _unit_of(origin: Origin, series: Series) -> Callable[[str], str]:
-    """Unit of the residuals of a sensor, as far as the session can tell."""
+    """Return a function from the name of a sensor to the unit of its residuals, if known."""
     setups = () if origin.session is None else origin.session.sensors
     units = {s.name: "px" if s.sensor.unit == "px" else series.unit for s in setups}
     return lambda name: units.get(name, "sensor units")
@@ -257,47 +256,46 @@ def _median(values: Floats) -> str:
 
 
 def _short(value: float) -> str:
-    """Three digits that count, and no power of ten where people would write none."""
+    """Format a number with three significant digits, or as an integer from 1000 to a million."""
     return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What is known of the session file."""
+    """What is known of the session file of a run."""
 
     named: str | None = None  # path in the header of the poses
-    path: Path | None = None  # where it was found
+    path: Path | None = None  # of the file that was read
     text: str | None = None  # its text
-    notice: str | None = None  # what is wrong: missing, changed, no session any more
-    # only if the file is the very one that the poses were estimated with
-    session: Session | None = None
+    notice: str | None = None  # problem: missing, changed, no longer a session
+    session: Session | None = None  # only if the file is unchanged since the run
 
 
 def find_session(poses: PoseFile) -> Origin:
-    """Read the session file that the header names, or its like beside the poses.
+    """Read the session file that the header names, or one of the same name next to the poses.
 
-    A file that is not the one of the run is shown only if it is a session file: a header may name
-    any file, and whoever passes the page on should not pass on that.
+    A file that has changed is shown only if it is a session file: a header may name any file, and
+    its contents should not be passed on with the page.
     """
     named = poses.header.get("session")
     if not isinstance(named, str) or not named:
         return Origin(notice="The poses file names no session file.")
     wanted = poses.header.get("session_sha256")
-    found = [
+    candidates = [
         (path, content)
         for path in (Path(named), poses.path.parent / Path(named).name)
         if (content := _bytes_of(path)) is not None
     ]
-    if not found:
+    if not candidates:
         return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
-    for path, content in found:
+    for path, content in candidates:
         if hashlib.sha256(content).hexdigest() == wanted:
             text = content.decode("utf-8-sig", errors="replace")
             try:
                 return Origin(named, path, text, session=load_session(path))
             except SessionError as error:
                 return Origin(named, path, text, f"The session cannot be read again: {error}")
-    path, content = found[0]
+    path, content = candidates[0]
     notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
     if isinstance(wanted, str):
         notice = f"{path} has changed since the run: its SHA-256 is not the one in the poses file."
@@ -309,6 +307,7 @@ def find_session(poses: PoseFile) -> Origin:
 
 
 def _bytes_of(path: Path) -> bytes | None:
+    """Read a file; None if it is missing, unreadable or too large for a session."""
     with suppress(OSError):
         if path.is_file() and path.stat().st_size <= _LARGEST:
             return path.read_bytes()

@@ -1,4 +1,4 @@
-"""The poses of a run, and their errors, as arrays over frames."""
+"""Arrange the poses of a run, and their errors, as arrays over frames."""
 
 from __future__ import annotations
 
@@ -21,53 +21,49 @@ from mixpose.records import Floats, Mask, Status
 Texts: TypeAlias = NDArray[np.str_]
 
 SIGMAS_95 = 1.96
-"""Standard deviations to either side that hold 95 % of a Gaussian."""
+"""Half-width of the interval that contains 95 % of a Gaussian, in standard deviations."""
 
 _HALF_TURN_DEG = 180.0
-_DECIMALS_DEG = 7  # an axis that is held turns by rounding errors, and should be seen to stand
+_DECIMALS_DEG = 7  # rounding errors of a held rotation should not show
 
 
 @dataclass(frozen=True)
 class Series:
-    """A run over its n frames, ascending; NaN where a frame does not have a value."""
+    """A run over its n frames, ascending; NaN where a frame has no value."""
 
     object: str
-    label: str  # the body in one word
-    unit: str  # of lengths; "units" where the file does not say it
-    frames: tuple[int, ...]  # they come from file names, and may be longer than an int64
-    # (n,), where a frame stands in figures: its time in s, or its number where times are missing
-    x: Floats
+    label: str  # of the body in pose lines
+    unit: str  # of lengths; "units" if the file does not state it
+    frames: tuple[int, ...]  # numbers from file names may be longer than an int64
+    x: Floats  # (n,) abscissa of frames: times in s, or frame numbers if times are missing
     x_label: str
-    breaks: Mask  # (n,), whether frame numbers are missing before a frame
+    breaks: Mask  # (n,) whether more frame numbers than usual are missing before a frame
     status: Texts  # (n,)
     position: Floats  # (n, 3)
-    # (n, 3), rotation vector in world axes, degrees, of the turn from `T_reference`
-    turn_deg: Floats
-    # (n, 6), of the 95 % bands of position and turn, length units and degrees; infinite where a
-    # direction is open: a turn beyond half a turn may be any
+    turn_deg: Floats  # (n, 3) rotation vectors from `T_reference`, in world axes, degrees
+    # (n, 6) of 95 % bands, length units and degrees; infinite if open, as beyond half a turn
     half_width: Floats
-    T_reference: Floats  # (4, 4), the first pose that is "ok", or else the first pose
+    T_reference: Floats  # (4, 4) the first pose that is "ok", else the first pose
     score: Floats  # (n,)
     latency_ms: Floats  # (n,)
     rms: Mapping[str, Floats]  # (n,) by sensor; NaN in lost frames too
     explained: Mapping[str, Floats]  # likewise
-    # (n,) by sensor and feature: infinite where it was in view and not met, NaN where it was not in
-    # view and in lost frames
+    # (n,) by sensor and feature: infinite if not met, NaN if not in view or the frame is lost
     residuals: Mapping[str, Mapping[str, Floats]]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors against the truth at the frames of a `Series`; NaN where there is none."""
+    """Errors against the truth at the frames of a `Series`; NaN without pose or truth."""
 
     rotation_deg: Floats  # (n,)
     distance: Floats  # (n,)
-    position: Floats  # (n, 3), of the right answer that the pose was held against
-    turn_deg: Floats  # (n, 3), its turn, as in `Series`
+    position: Floats  # (n, 3) of the true pose that the pose was compared with, modulo symmetries
+    turn_deg: Floats  # (n, 3) of the true pose, as in `Series`
 
 
 def series_of(file: PoseFile) -> Series:
-    """Arrange the lines of a poses file by frame, or a `RecordingError` of several objects."""
+    """Arrange the lines of a poses file by frame; raise a `RecordingError` for several objects."""
     lines = sorted(file.poses, key=lambda line: line.frame)
     names = sorted({line.label for line in lines})
     if len(names) > 1:
@@ -105,18 +101,18 @@ def series_of(file: PoseFile) -> Series:
 
 
 def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
-    """Errors of every frame, modulo symmetries; a `RecordingError` if that cannot be compared."""
-    found = errors_to_truth(poses, truth)
-    by_frame = {error.frame: error.twist for error in found if error.object == series.label}
-    nothing = np.full(6, np.nan)
-    each = [by_frame.get(frame) for frame in series.frames]
-    twists = np.array([nothing if twist is None else twist for twist in each]).reshape(-1, 6)
+    """Return errors of all frames modulo symmetries; `RecordingError` if poses are incomparable."""
+    errors = errors_to_truth(poses, truth)
+    by_frame = {error.frame: error.twist for error in errors if error.object == series.label}
+    missing = np.full(6, np.nan)
+    listed = [by_frame.get(frame) for frame in series.frames]
+    twists = np.array([missing if twist is None else twist for twist in listed]).reshape(-1, 6)
     position = series.position - twists[:, :3]
     turned = np.full_like(position, np.nan)
     known = np.isfinite(twists[:, 0])
     pose = Rotation.from_rotvec(np.radians(series.turn_deg[known]))
-    right = Rotation.from_rotvec(twists[known, 3:]).inv() * pose
-    turned[known] = np.degrees(right.as_rotvec())
+    true_turn = Rotation.from_rotvec(twists[known, 3:]).inv() * pose
+    turned[known] = np.degrees(true_turn.as_rotvec())
     return Errors(
         rotation_deg=np.degrees(np.linalg.norm(twists[:, 3:], axis=1)),
         distance=np.linalg.norm(twists[:, :3], axis=1),
@@ -126,7 +122,7 @@ def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
 
 
 def turns_deg(T: Floats, T_reference: Floats) -> Floats:
-    """Rotation vectors (n, 3) in world axes, degrees, from the reference to poses (n, 4, 4)."""
+    """Return rotation vectors (n, 3) from a reference to poses (n, 4, 4), world axes, degrees."""
     turns = np.full((len(T), 3), np.nan)
     known = np.isfinite(T[:, 0, 0])
     if known.any():
@@ -135,25 +131,26 @@ def turns_deg(T: Floats, T_reference: Floats) -> Floats:
 
 
 def jumps_of_turns(turn_deg: Floats) -> Mask:
-    """Before which frames (n,) rotation vectors (n, 3) pass half a turn, all components at once."""
+    """Return a mask (n,) of frames before which a rotation vector wraps at half a turn."""
     with np.errstate(invalid="ignore"):
         far = np.linalg.norm(np.diff(turn_deg, axis=0), axis=1) > _HALF_TURN_DEG
     return np.concatenate([np.zeros(min(len(turn_deg), 1), dtype=bool), far])
 
 
 def frame_ranges(series: Series, status: Status) -> list[tuple[int, int]]:
-    """First and last frame of each stretch of frames in a row that have a status."""
+    """Return the first and last frame of all stretches of consecutive frames with a status."""
     ranges: list[tuple[int, int]] = []
     goes_on = False
-    for frame, is_break, found in zip(series.frames, series.breaks, series.status, strict=True):
-        if found == status:
+    for frame, is_break, value in zip(series.frames, series.breaks, series.status, strict=True):
+        if value == status:
             first = ranges.pop()[0] if goes_on and not is_break else frame
             ranges.append((first, frame))
-        goes_on = found == status
+        goes_on = value == status
     return ranges
 
 
 def _reference(T: Floats, status: Texts) -> Floats:
+    """Return the first pose (4, 4) that is "ok", else the first pose, else the identity."""
     for wanted in (status == "ok", status != "lost"):
         if wanted.any():
             return np.asarray(T[np.argmax(wanted)])
@@ -165,31 +162,32 @@ def _numbers(values: list[float | None]) -> Floats:
 
 
 def _of_sensor(lines: list[PoseLine], name: str, what: str) -> Floats:
-    """What a sensor says of the poses; of a lost frame it says how little the best guess fits."""
-    told = [None if line.status == "lost" else line.sensors.get(name) for line in lines]
-    return _numbers([getattr(one, what, None) for one in told])
+    """Return a value of a sensor per frame; NaN in lost frames, where it rates a rejected pose."""
+    reports = [None if line.status == "lost" else line.sensors.get(name) for line in lines]
+    return _numbers([getattr(report, what, None) for report in reports])
 
 
 def _of_features(lines: list[PoseLine], name: str) -> dict[str, Floats]:
-    """How far off a sensor met each feature."""
-    found: dict[str, Floats] = {}
+    """Return a sensor's residuals (n,) by feature."""
+    residuals: dict[str, Floats] = {}
     for k, line in enumerate(lines):
         if line.status == "lost" or name not in line.sensors:
             continue
         for feature, residual in line.sensors[name].residuals.items():
-            values = found.setdefault(feature, np.full(len(lines), np.nan))
+            values = residuals.setdefault(feature, np.full(len(lines), np.nan))
             values[k] = np.inf if residual is None else residual
-    return found
+    return residuals
 
 
 def _breaks(frames: Sequence[int]) -> Mask:
-    """Where more frame numbers are left out than usual in the file."""
+    """Return a mask of frames before which more numbers are missing than usual in the file."""
     steps = np.array([0, *(after - before for before, after in pairwise(frames))], dtype=np.float64)
     usual = np.median(steps[1:]) if len(steps) > 1 else 1.0
     return np.asarray(steps[: len(frames)] > 1.5 * usual)
 
 
 def _half_widths(lines: list[PoseLine], T: Floats, T_reference: Floats) -> Floats:
+    """Return half-widths (n, 6) of 95 % bands of position and turn, as in `Series`."""
     widths = np.full((len(lines), 6), np.nan)
     turns = np.radians(turns_deg(T, T_reference))
     for i, line in enumerate(lines):
@@ -205,13 +203,13 @@ def _half_widths(lines: list[PoseLine], T: Floats, T_reference: Floats) -> Float
 
 
 def rotation_vector_jacobian(vector: Floats) -> Floats:
-    """Change (3, 3) of a rotation vector by a small further turn in world axes; radians, at most π.
+    """Return the change (3, 3) of a rotation vector, at most π, by a small turn in world axes.
 
     Inverse of the left Jacobian of SO(3): J. Solà et al., A micro Lie theory for state estimation
     in robotics, 2018, equation 146.
     """
     x, y, z = vector
     across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = max(float(np.linalg.norm(vector)), 1e-9)  # of less nothing would be left of the share
+    angle = max(float(np.linalg.norm(vector)), 1e-9)  # at less, the share loses all digits
     share = 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))
     return np.asarray(np.eye(3) - across / 2 + share * across @ across)
