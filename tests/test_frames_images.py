@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, SourceSpec, open_source, read_image
@@ -156,6 +157,22 @@ def test_size_must_be_that_of_the_first_image(tmp_path: Path) -> None:
     assert [next(stream).number, next(stream).number] == [1, 2]
     with pytest.raises(RecordingError, match=r"f3\.png: found 32x23 .* 32x24 like f1\.png"):
         next(stream)
+
+
+def test_a_tiff_file_of_several_images_is_refused_and_one_with_a_thumbnail_is_read(
+    tmp_path: Path,
+) -> None:
+    image = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    tifffile.imwrite(tmp_path / "three.tif", np.stack([image] * 3), photometric="minisblack")
+    with pytest.raises(RecordingError, match=r"three\.tif: holds 3 images; allowed is one image"):
+        read_image(tmp_path / "three.tif")
+    with tifffile.TiffWriter(tmp_path / "small.tif") as file:
+        file.write(image)
+        file.write(image[::2, ::2], subfiletype=1)
+    assert np.array_equal(read_image(tmp_path / "small.tif"), image)
+    (tmp_path / "cut.tif").write_bytes((tmp_path / "three.tif").read_bytes()[:6])
+    with pytest.raises(RecordingError, match=r"cut\.tif: "):
+        read_image(tmp_path / "cut.tif")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".pgm", ".tif", ".webp"])

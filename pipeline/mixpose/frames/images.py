@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import re
 import stat
+import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +31,7 @@ _TOO_LARGE = f"found more pixels than are allowed, {MOST_PIXELS}"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _PIECE = 4096  # bytes; zlib releases the interpreter lock from 5 kB on
 _JPEG_START = b"\xff\xd8\xff"
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # nanoseconds since 1970, from 1973 to the limit of an int64 in 2262: no camera counts so far
 _FIRST_STAMP, _LAST_STAMP = 10**17, 2**63
 _START_OF_SCAN = 0xDA
@@ -180,6 +183,11 @@ def read_image(path: Path) -> Image:
     fault = _fault_of(data)
     if fault is not None:
         raise RecordingError(f"{path}: {fault}; record or copy it again, or leave it out")
+    if data.startswith(_TIFF_STARTS) and (count := _pages(data)) > 1:
+        raise RecordingError(
+            f"{path}: holds {count} images; allowed is one image in a file: split it, with "
+            "ImageMagick as: magick frames.tif frame_%04d.png"
+        )
     try:
         image = cv2.imdecode(
             np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -227,6 +235,17 @@ def _fault_of(data: bytes) -> str | None:
     if data.startswith(_JPEG_START) and not _jpeg_is_whole(data):
         return "cut short: the JPEG data have no end"
     return None
+
+
+def _pages(data: bytes) -> int:
+    """Count the images of a TIFF file, without thumbnails; 1 if it is damaged."""
+    from tifffile import TiffFile, TiffFileError  # noqa: PLC0415 - takes 50 ms, for TIFF alone
+
+    try:
+        with TiffFile(io.BytesIO(data)) as file:
+            return len(file.pages) - sum(bool(page.aspage().is_reduced) for page in file.pages)
+    except (TiffFileError, ValueError, struct.error, IndexError):
+        return 1  # the decoder says what is wrong
 
 
 def _png_fault(data: bytes) -> str | None:
