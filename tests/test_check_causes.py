@@ -38,9 +38,12 @@ def mirrored(session: Session) -> Session:
     return with_points(session, session.body.means * [1, -1, 1])
 
 
-def explained(good: int, rms: float = 0.1) -> Any:
+def explained(count: int, rms: float = 0.1) -> Any:
     return SimpleNamespace(
-        poses=[None] * 4, met=lambda *_: 50.0, good=lambda _: good, rms=lambda *_: rms
+        poses=[None] * 4,
+        met_count=lambda *_: 50.0,
+        explained_count=lambda _: count,
+        rms=lambda *_: rms,
     )
 
 

@@ -72,7 +72,7 @@ def check_session(request: CheckRequest) -> None:
     for one in session.objects:
         _say_object(report, session, one)
     surveys: dict[str, recordings.Survey] = {}
-    some = None if quick else recordings.some_of(opened)
+    some = None if quick else recordings.frames_to_count(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as moved:
@@ -89,7 +89,7 @@ def check_session(request: CheckRequest) -> None:
     given = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
     report.lines += given.lines
     if doubts.mended is None:
-        counts = keys.told_apart(report.of_counts, len(session.sensors))
+        counts = keys.with_own_tables(report.of_counts, len(session.sensors))
         report.warnings = [*counts, *report.warnings, *given.warnings, *doubts.warnings]
         if doubts.unexplained and not (report.of_counts or doubts.warnings):
             report.warnings.append(doubts.unexplained)
