@@ -2,8 +2,7 @@
 
 `recordings` reads every frame; `keys`, `placement` and `lookalikes` warn by the session itself and
 by counts of features.  `geometry` estimates a few frames, and `trials` tries corrections of the
-session: `changes` of it as a whole, and `values` fitted to matches, judged by `evidence` and
-`rules`.
+session, `changes` of it as a whole and `values` fitted to matches, by `evidence` and `rules`.
 """
 
 from mixpose.checking.changes import times_as_large as times_as_large

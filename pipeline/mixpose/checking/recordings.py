@@ -144,12 +144,11 @@ def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
     """Warn of tables with repeated detections, and of recordings whose times go back."""
     warnings = []
     for name, survey in surveys.items():
-        doubled, count = survey.doubled, len(survey.numbers)
-        if 2 * len(doubled) > count:  # ranges in whole cm are sometimes equal by chance
+        if 2 * len(survey.doubled) > len(survey.numbers):  # ranges in whole cm may coincide
             warnings.append(
                 f"sensor {name!r}: the same detection stands twice or more in "
-                f"{len(doubled)} of {count} frames, as {doubled[0]}: are rows "
-                "of its table repeated? Each counts as a feature of its own"
+                f"{len(survey.doubled)} of {len(survey.numbers)} frames, as {survey.doubled[0]}: "
+                "are rows of its table repeated? Each counts as a feature of its own"
             )
         ordered = sorted(survey.times.items())
         back = [(k, b, a) for (_, a), (k, b) in pairwise(ordered) if b < a]

@@ -12,10 +12,9 @@ class DiagnosisRules:
     """Rules when a change of the session explains its frames better and is reported."""
 
     frames: int = constant(4, "estimated: a wrong session shows in all, a hidden body in some")
-    sure: float = constant(7.0, "log odds from which a frame is explained, as a pose is ok")
+    sure: float = constant(7.0, "log odds from which a frame is explained, or a pose is ok")
     met: float = constant(
-        0.5,
-        "share of what a sensor could meet, at least: beside a hand 0.6, by wrong normals 0.4",
+        0.5, "of what a sensor could meet, at least: beside a hand 0.6, by wrong normals 0.4"
     )
     noise: float = constant(
         0.75, "RMS offset in sigma: right sessions of real recordings have up to 0.65, others 1"
@@ -26,8 +25,7 @@ class DiagnosisRules:
         "of 80 changes; a marker that is found again gains 9 in a frame",
     )
     undecided: float = constant(
-        6.0,
-        "nats from which a gain by values is too large for chance: more frames are tried",
+        6.0, "nats from which a gain by values is too large for chance: more frames are tried"
     )
     chance: float = constant(5.0, "nats by which two searches of the same frame may differ")
     rival: float = constant(10.0, "nats within which another change is as good: twice `chance`")
