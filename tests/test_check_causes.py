@@ -145,7 +145,7 @@ def test_two_changes_together_change_body_and_cameras_of_a_session(right: Sessio
         ],
     )
     both = larger.and_also(swap)
-    changed = both.of(right, frames_of(right, recorded(right))[0][1])
+    changed = both.apply(right, frames_of(right, recorded(right))[0][1])
     np.testing.assert_allclose(changed.body.means, 2 * right.body.means)
     assert [s.sensor for s in changed.sensors] == [s.sensor for s in right.sensors[::-1]]
     assert (both.what, both.remedy) == ("a, and c", "b, and d")

@@ -24,7 +24,7 @@ from diagnosed import (
 
 import mixpose
 from mixpose.body import Body
-from mixpose.checking.changes import Change, of_units
+from mixpose.checking.changes import Change, point_units
 from mixpose.checking.evidence import best_pose
 from mixpose.checking.geometry import _seen_by_some, geometry_doubts
 from mixpose.checking.recordings import survey
@@ -246,7 +246,7 @@ def test_changes_that_gain_far_less_drop_out_after_a_frame(
 
 def test_points_of_another_unit_have_markers_of_that_unit(right: Session) -> None:
     spheres = replace(right.body, shape="sphere", radii=np.full(7, 6.0))
-    larger = next(of_units(spheres)).body(spheres)
+    larger = next(point_units(spheres)).body(spheres)
     np.testing.assert_allclose(larger.means, 1000 * spheres.means)
     assert larger.radii is not None
     np.testing.assert_allclose(larger.radii, 6000.0)

@@ -1,4 +1,4 @@
-"""Set threads while a frame is computed, and restore them afterwards.
+"""Settings of threads while a frame is computed, restored afterwards.
 
 Linear algebra gets one: the matrices of a frame are small, so that threads of a BLAS library wait
 for each other far longer than they compute, above all if other programs keep the processor busy.

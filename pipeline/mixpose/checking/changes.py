@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, of_points, of_size
-from mixpose.checking.evidence import Frames, Views, best_pose, can_tell, without_start
+from mixpose.checking.evidence import Frames, Views, are_sufficient, best_pose, without_start
 from mixpose.checking.placement import Camera
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.objective import View
@@ -64,7 +64,7 @@ class Change:
             values=self.values + other.values,
         )
 
-    def of(self, session: Session, views: Views) -> Session:
+    def apply(self, session: Session, views: Views) -> Session:
         """Return the session with body and sensors changed, but its recordings as they are."""
         sensors = {view.name: view.sensor for view in self.views(views)}
         setups = [replace(s, sensor=sensors.get(s.name, s.sensor)) for s in session.sensors]
@@ -77,12 +77,12 @@ def changes(session: Session) -> Iterator[Change]:
     clouds = [setup.name for setup in session.sensors if isinstance(setup.sensor, CloudSensor)]
     ranges = [setup.name for setup in session.sensors if isinstance(setup.sensor, RangeSensor)]
     planes = [plane for name in clouds for plane in plane_names(name)]
-    yield from _in_another_unit("points", clouds, planes)
-    yield from _in_another_unit("ranges", ranges, ranges)
+    yield from _sensor_units("points", clouds, planes)
+    yield from _sensor_units("ranges", ranges, ranges)
     if is_pointlike(session.body):
         if len(clouds) < len(session.sensors):  # with clouds only, the change of points is the same
-            yield from of_units(session.body)
-        yield from _of_the_body(session.body)
+            yield from point_units(session.body)
+        yield from _body_changes(session.body)
     sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
     yield from _inversions(sensors)
     for a, b in combinations(sensors, 2):
@@ -93,7 +93,7 @@ def changes(session: Session) -> Iterator[Change]:
         )
     for a, b in combinations(sensors, 2):
         if type(sensors[a]) is type(sensors[b]):
-            yield _of_sensors(
+            yield _sensor_change(
                 f"calibrations of {a!r} and {b!r} {{are}} swapped",
                 "with camera_matrix and distortion of each given to the other",
                 (a, b),
@@ -102,8 +102,8 @@ def changes(session: Session) -> Iterator[Change]:
     yield from _flips(cameras, "mirrored", "left and right", 0)
     for names in _all_or_one(list(sensors)):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
-            yield _of_sensors(
-                f"camera_matrix of {called(names)} {{is}} that of images {images} as large",
+            yield _sensor_change(
+                f"camera_matrix of {quoted(names)} {{is}} that of images {images} as large",
                 f"with fx, fy, cx and cy {done}",
                 names,
                 partial(_scaled, factor=factor),
@@ -123,15 +123,15 @@ def _flips(cameras: Sequence[SensorSetup], what: str, ends: str, axis: int) -> I
         return _with_points(view, lambda points: np.where(is_flipped, last - points, points))
 
     for names in _all_or_one(list(sized)):
-        yield _of_sensors(
-            f"images of {called(names)} {{are}} {what}",
+        yield _sensor_change(
+            f"images of {quoted(names)} {{are}} {what}",
             f"with {ends} of them exchanged",
             names,
             flipped,
         )
 
 
-def _of_sensors(
+def _sensor_change(
     what: str, remedy: str, names: Sequence[str], changed: Callable[[View], View]
 ) -> Change:
     """Return a change of the views of the sensors with these names."""
@@ -156,18 +156,18 @@ def _with_lens(view: View, lenses: Mapping[str, Any]) -> View:
     return _with(view, camera_matrix=lens.camera_matrix, distortion=lens.distortion)
 
 
-def _in_another_unit(what: str, names: Sequence[str], views: Sequence[str]) -> Iterator[Change]:
+def _sensor_units(what: str, names: Sequence[str], views: Sequence[str]) -> Iterator[Change]:
     """Yield changes of the unit of length in which sensors measure."""
     for factor, scaled in _UNITS if names else ():
-        yield _of_sensors(
-            f"the {what} of {called(names)} {{are}} in another unit than the session",
+        yield _sensor_change(
+            f"the {what} of {quoted(names)} {{are}} in another unit than the session",
             f"with them {scaled}",
             views,
             partial(_with_points, changed=partial(np.multiply, factor)),
         )
 
 
-def _of_the_body(body: Body) -> Iterator[Change]:
+def _body_changes(body: Body) -> Iterator[Change]:
     middle, normals = body.means.mean(axis=0), body.normals
     mirror = np.array([1.0, 1.0, -1.0])
     mirrored = None if normals is None else normals * mirror
@@ -184,7 +184,7 @@ def _of_the_body(body: Body) -> Iterator[Change]:
         )
 
 
-def of_units(body: Body) -> Iterator[Change]:
+def point_units(body: Body) -> Iterator[Change]:
     """Yield changes of the unit of the body's points alone, say metres for millimetres."""
     for factor, scaled in _UNITS:
         yield Change(
@@ -225,7 +225,7 @@ def moved_by(before: Floats, after: Floats, unit: str) -> str:
     return f"with it moved by {length} {unit} and turned by {angle} deg"
 
 
-def called(names: Sequence[str]) -> str:
+def quoted(names: Sequence[str]) -> str:
     """Join names of sensors in words."""
     return " and ".join(repr(name) for name in names)
 
@@ -235,8 +235,8 @@ def _inversions(sensors: Mapping[str, Any]) -> Iterator[Change]:
     poses = {name: sensor.T_sensor_world for name, sensor in sensors.items()}
     far = [name for name, T in poses.items() if not np.allclose(T, np.eye(4), atol=1e-5)]
     for names in _all_or_one(far):
-        yield _of_sensors(
-            f"T_sensor_world of {called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
+        yield _sensor_change(
+            f"T_sensor_world of {quoted(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
             "(it maps world to sensor coordinates)",
             "with the inverse",
             names,
@@ -272,7 +272,7 @@ def by_cameras_alone(session: Session, frames: Frames) -> Iterator[Change]:
             sensor, T_alone = cameras[name]
             T_other = next(T for other, (_, T) in cameras.items() if other != name)
             T = sensor.T_sensor_world @ T_alone @ inverse(T_other)
-            moved = _of_sensors(
+            moved = _sensor_change(
                 misplaced(setup),
                 moved_by(sensor.T_sensor_world, T, session.unit),
                 [name],
@@ -305,8 +305,8 @@ def _other_sizes(session: Session, alone: Sequence[dict[str, Any]]) -> Iterator[
 
 def _alone(session: Session, number: int, view: View) -> Floats | None:
     """Search T_world_object (4, 4) by one camera alone; return None if it finds none."""
-    if not (isinstance(view.sensor, Camera) and can_tell([view], len(session.body))):
+    if not (isinstance(view.sensor, Camera) and are_sufficient([view], len(session.body))):
         return None
-    free, guesses = without_start(session), DiagnosisRules().guesses
-    pose, _ = best_pose(free, session.body, number, [view], guesses)
+    anywhere, guesses = without_start(session), DiagnosisRules().guesses
+    pose, _ = best_pose(anywhere, session.body, number, [view], guesses)
     return None if pose is None else pose.T_world_object

@@ -1,6 +1,6 @@
-"""How well a body and sensors, those of the session or changed ones, explain frames.
+"""Score how well a body and sensors, of the session or changed, explain frames.
 
-And which detection each feature met, to fit values to several frames.
+Also match features to detections, to fit values to several frames.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def estimate_of(session: Session, number: int, views: Views) -> Estimate:
     return tracker.advance(track, number, _TIME_S, views)[1]
 
 
-def can_tell(views: Views, features: int) -> bool:
+def are_sufficient(views: Views, features: int) -> bool:
     """Test whether detections can determine a pose; grids of values always may.
 
     They need more coordinates than a pose has, as any pose meets six, and one in ten of the body's

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.checking.changes import Change, called, of_units
-from mixpose.checking.evidence import Frames, can_tell, estimate_of, evidence_of, pose_near
+from mixpose.checking.changes import Change, point_units, quoted
+from mixpose.checking.evidence import Frames, are_sufficient, estimate_of, evidence_of, pose_near
 from mixpose.checking.keys import judge
 from mixpose.checking.placement import Camera, expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.trials import IN_A_ROW, Diagnosis, Otherwise, diagnosis, late_sensor
+from mixpose.checking.trials import IN_A_ROW, Diagnosis, Extracted, diagnosis, late_sensor
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
@@ -57,18 +57,18 @@ def geometry_doubts(
         source.kind == "live" or (isinstance(source, Video) and source.size is None)
         for source in sources.values()
     )
-    has_space = any(isinstance(setup.sensor, Camera | CloudSensor) for setup in session.sensors)
-    if len(session.labels) > 1 or has_streams or not (has_space or len(sources) > 1):
+    is_sufficient = any(isinstance(setup.sensor, Camera | CloudSensor) for setup in session.sensors)
+    if len(session.labels) > 1 or has_streams or not (is_sufficient or len(sources) > 1):
         return Doubts()
     recording, count = _Recording(session, sources, surveys), DiagnosisRules().frames
     frames = [(frame.number, observe(session, frame)) for frame in recording.shared(count)]
     if not frames:
         return Doubts()
     chosen = [number for number, _ in frames]
-    others = _otherwise(recording, chosen)
+    others = _extracted(recording, chosen)
     tries = (frames, *(changed for _, changed in others))
-    if not any(can_tell(views, len(session.body)) for tried in tries for _, views in tried):
-        return _at_the_start(recording)
+    if not any(are_sufficient(views, len(session.body)) for tried in tries for _, views in tried):
+        return _start_doubts(recording)
 
     def further() -> Frames:
         """Return as many frames again, between those chosen already."""
@@ -77,14 +77,14 @@ def geometry_doubts(
         chosen.extend(number for number, _ in more)
         return more
 
-    def otherwise(is_good: bool) -> Otherwise:
+    def extracted(is_good: bool) -> Extracted:
         """Return other extractions; if nothing is explained, also for counts as expected."""
-        return others if others or is_good else _otherwise(recording, chosen, are_odd=False)
+        return others if others or is_good else _extracted(recording, chosen, are_odd=False)
 
-    best = diagnosis(session, frames, otherwise, further)
+    best = diagnosis(session, frames, extracted, further)
     if (reported := _reported(recording, frames, best)) is not None:
         return reported
-    doubts = _at_the_start(recording) if best.explained or len(sources) == 1 else Doubts()
+    doubts = _start_doubts(recording) if best.explained or len(sources) == 1 else Doubts()
     numbers = ", ".join(map(str, sorted(chosen[: best.count])))
     met = f", features met to {best.rms:.2g} sigma in the median" if best.explained else ""
     tried = f"{best.explained} of {best.count} frames that were estimated ({numbers}) are explained"
@@ -111,7 +111,7 @@ def _reported(recording: _Recording, frames: Frames, result: Diagnosis) -> Doubt
         return None
     # if a cloud is in another unit, its table has to be mended and not the session
     are_clouds = all(isinstance(setup.sensor, CloudSensor) for setup in session.sensors)
-    mended = None if are_clouds else change.of(session, frames[0][1])
+    mended = None if are_clouds else change.apply(session, frames[0][1])
     return Doubts((f"{result.change}, {result.gain}",), mended, tried=result.gain)
 
 
@@ -179,7 +179,7 @@ class _Recording:
             yield FrameSet(number, next(times, None), frames)  # as `pair` does
 
 
-def _at_the_start(recording: _Recording) -> Doubts:
+def _start_doubts(recording: _Recording) -> Doubts:
     """Warn if the first frame has the body at [start] only with points in another unit."""
     rules, session, start = DiagnosisRules(), recording.session, recording.session.start
     first = next(recording.read(recording.numbers()[:1]), None)
@@ -192,11 +192,11 @@ def _at_the_start(recording: _Recording) -> Doubts:
 
     if evidence(session.body) > rules.sure:
         return Doubts()
-    for change in of_units(session.body):
+    for change in point_units(session.body):
         if evidence(change.body(session.body)) > rules.sure + rules.margin:
             what = "points and translation of [start] are in two units of length"
             where = f"the body is at [start] in frame {number}"
-            return Doubts((f"{what}: {change.remedy}, {where}",), change.of(session, views))
+            return Doubts((f"{what}: {change.remedy}, {where}",), change.apply(session, views))
     return Doubts()
 
 
@@ -238,14 +238,14 @@ def _seen_by_some(estimate: Estimate) -> str:
     if not blind or not alone:
         return ""
     return (
-        f"frame {estimate.frame}: {called(alone)} alone {'shows' if len(alone) == 1 else 'show'} "
-        f"the body where {called(blind)} {'does' if len(blind) == 1 else 'do'} not see it, by "
+        f"frame {estimate.frame}: {quoted(alone)} alone {'shows' if len(alone) == 1 else 'show'} "
+        f"the body where {quoted(blind)} {'does' if len(blind) == 1 else 'do'} not see it, by "
         "the session as it is or with any one change of it: is it in view of all, or are several "
         "calibrations, T_sensor_world or sources those of others?"
     )
 
 
-def _otherwise(recording: _Recording, numbers: Sequence[int], *, are_odd: bool = True) -> Otherwise:
+def _extracted(recording: _Recording, numbers: Sequence[int], *, are_odd: bool = True) -> Extracted:
     """Extract images with other polarity or method; with `are_odd` only if all counts are odd."""
     session, surveys = recording.session, recording.surveys
     for setup in session.sensors:
@@ -267,7 +267,7 @@ def _otherwise(recording: _Recording, numbers: Sequence[int], *, are_odd: bool =
     for key, value, what in ways:
         names = [setup.name for setup in session.sensors if key in setup.own]
         tables = ["[extract]"] if len(names) < len(session.sensors) else []
-        tables += [f"[sensor.extract] of {called(names)}"] if names else []
+        tables += [f"[sensor.extract] of {quoted(names)}"] if names else []
         where = " and in ".join(tables)
         change = Change(f"features {{are}} {what}", f'with {key} = "{value}" in {where}')
         option: dict[str, Any] = {key: value}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.body import LookAlike, congruent_parts, of_size
-from mixpose.checking.changes import called
+from mixpose.checking.changes import quoted
 from mixpose.checking.evidence import estimate_of, without_start
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.placement import Camera, typical_poses
@@ -30,15 +30,15 @@ from mixpose.session import SensorSetup, Session
 _FEW = 0.6  # of the expected features: fewer are too few
 _SHARED, _OWN = "in [extract]", "in its own [sensor.extract]"
 _ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
-_MANY, _MANY_MORE = 5.0, 20  # factor of the expected count and surplus: both are too many
+_MANY, _MANY_MORE = 5.0, 20  # too many is more than this factor of the expected count, and surplus
 _OFF_CENTRE = 0.25  # of the image: lenses are centred better, crops and other sizes often are not
 _WIDEST = 0.05  # of an image: a wider sigma hides how features of a body lie
 _NOISES = 3.0  # standard deviations within which markers of two bodies are congruent
-_LEAST = 0.01  # of the smaller body's radius: nearer than this they always are
+_LEAST = 0.01  # of the smaller body's radius: markers as near are always congruent
 
 
 def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
-    """Say if a count of features is "too few" or "too many"; `fewest` of the body are in view."""
+    """Say if a count of features is "too few" or "too many"; as few as `fewest` may be in view."""
     least = expected if fewest is None else fewest
     if count < min(_FEW * least, least - 1):
         return "too few"
@@ -69,8 +69,8 @@ def advice(
     if before > expected:
         trials = [trial for trial in trials if trial.points <= 2 * expected]
     # the body has to be found for sure: in clutter a pose may be ambiguous, too
-    free = without_start(session)
-    sure = (t for t in trials if estimate_of(free, number, t.views).status == "ok")
+    anywhere = without_start(session)
+    sure = (t for t in trials if estimate_of(anywhere, number, t.views).status == "ok")
     chosen = next(sure, None)
     if chosen is None and before < expected and trials:
         chosen = trials[0]  # more features do no harm, even if they do not show the body
@@ -89,10 +89,10 @@ def advice(
     keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
     change = keys.get(options.method, "polarity, threshold, min_area and max_area")
     own_keys = [key for key in re.findall(r"\w+", change) if key in setup.own]
-    where = f", {' and '.join(own_keys)} {_OWN}" if own_keys else ""
+    tables = f", {' and '.join(own_keys)} {_OWN}" if own_keys else ""
     is_hidden = before > 0 and session.body.normals is None
     hidden = "; or give normals in [object], if the body hides some of them" if is_hidden else ""
-    return f"change {change} {_SHARED}{where}{hidden}"
+    return f"change {change} {_SHARED}{tables}{hidden}"
 
 
 def with_own_tables(warnings: Sequence[str], sensors: int) -> list[str]:
@@ -173,7 +173,7 @@ def _off_centre(session: Session) -> list[str]:
 
 
 def _too_wide(session: Session) -> list[str]:
-    """Warn of a sigma wider than the whole body, or than its usual size in an image."""
+    """Warn of a sigma wider than the whole body, or than a twentieth of an image."""
     ranges, images = list[SensorSetup](), list[SensorSetup]()
     for setup in session.sensors:
         sigma, resolution = setup.extract.sigma, setup.resolution
@@ -208,7 +208,7 @@ def _lines_as_points(session: Session) -> list[str]:
     if not (bodies and cameras):
         return []
     return [
-        f"{called(bodies)}: segments are seen as lines of grey values, and {called(cameras)} "
+        f"{quoted(bodies)}: segments are seen as lines of grey values, and {quoted(cameras)} "
         f'{"gives" if len(cameras) == 1 else "give"} points: set method = "intensity" in '
         "[extract], of images, or give the ends of the lines as points"
     ]

@@ -55,7 +55,7 @@ def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
 
 def placement_warnings(session: Session) -> list[str]:
     """Warn of what is most likely wrong about the poses of sensors and body, a line each."""
-    warnings = _twins(session) + _too_large(session)
+    warnings = _coincident(session) + _too_large(session)
     if session.start is None:
         return warnings + _no_common_view(session)
     T = session.start.T_world_object
@@ -77,7 +77,7 @@ def placement_warnings(session: Session) -> list[str]:
     return warnings + hint
 
 
-def _twins(session: Session) -> list[str]:
+def _coincident(session: Session) -> list[str]:
     """Warn of sensors with the same place and orientation, or too near to each other."""
     warnings = []
     for a, b in combinations(session.sensors, 2):
@@ -259,7 +259,7 @@ def _centre(sensor: Camera) -> Floats:
 
 def _numbers(values: Floats, digits: int = 4) -> str:
     largest = float(np.abs(values).max())
-    # rounding errors relative to the largest are zero
+    # rounding errors, by the largest value, are shown as zero
     shown = (0.0 if abs(v) <= 1e-9 * largest else float(f"{v:.{digits}g}") for v in values)
     return f"({', '.join(f'{value:g}' for value in shown)})"
 

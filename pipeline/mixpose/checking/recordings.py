@@ -35,7 +35,7 @@ Damage: TypeAlias = list[tuple[int | None, str]]
 
 @dataclass(frozen=True)
 class Survey:
-    """What the frames of one sensor hold."""
+    """Counts and oddities of the frames of one sensor."""
 
     numbers: tuple[int, ...]  # frames that could be read, ascending
     counted: tuple[int, ...]  # frames in which features were extracted
@@ -48,7 +48,7 @@ class Survey:
     is_whole: bool = True  # whether all frames were read
     times: Mapping[int, float] = field(default_factory=dict)  # of frames that have one, in s
     repeated: tuple[int, ...] = ()  # frames that are not empty and equal the one before
-    doubled: tuple[int, ...] = ()  # frames of a table that has a detection twice or more
+    doubled: tuple[int, ...] = ()  # frames of a table with a detection twice or more
     # counted frames, with detections in place of the image; without any if there were too many
     features: Mapping[int, RawFrame] = field(default_factory=dict)
 
@@ -95,7 +95,7 @@ def survey(
             before = shown
             if isinstance(data, np.ndarray):
                 size = (data.shape[1], data.shape[0])
-            elif isinstance(data, PointPattern) and has_twins(data.points):
+            elif isinstance(data, PointPattern) and has_duplicates(data.points):
                 doubled.append(number)
             if not isinstance(data, np.ndarray) or looked_at is None or number in looked_at:
                 counted.append(number)
@@ -135,7 +135,7 @@ def frames_to_count(sources: Mapping[str, Source]) -> set[int] | None:
     return set(spread_over(numbers, _COUNTED))
 
 
-def has_twins(points: Floats) -> bool:
+def has_duplicates(points: Floats) -> bool:
     """Test whether any two of points (n, m) are the same, to the last digit."""
     return len(np.unique(points, axis=0)) < len(points)
 

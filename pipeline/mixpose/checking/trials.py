@@ -26,7 +26,7 @@ from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.session import Session
 
-Otherwise: TypeAlias = Sequence[tuple[Change, Frames]]
+Extracted: TypeAlias = Sequence[tuple[Change, Frames]]
 """Changes of how features are extracted, each with the frames extracted that way."""
 
 IN_A_ROW = 3
@@ -95,23 +95,23 @@ class Tried(NamedTuple):
 def diagnosis(
     session: Session,
     frames: Frames,
-    otherwise: Callable[[bool], Otherwise] = lambda _: (),
+    extracted: Callable[[bool], Extracted] = lambda _: (),
     further: Callable[[], Frames] = lambda: (),
 ) -> Diagnosis:
     """Find what is most likely wrong with a session of one body, by frames of its recording.
 
-    Frames come with their numbers, those that show most first. `otherwise`, told whether any frame
+    Frames come with their numbers, those that show most first. `extracted`, given whether any frame
     is explained, returns changes of how features are extracted. `further` returns more frames, for
     a change by values that is undecided.
     """
     session, rules = evidence.without_start(session), DiagnosisRules()
-    before = _as_it_is(session, frames)
+    before = _unchanged(session, frames)
     case = _Case(session, frames[: len(before.poses)], before)
     frames = case.frames
     well = sum(evidence.is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.explained_count(rules) < len(frames) or 2 * well < len(frames):
-        tried += _without_values(case, otherwise(before.explained_count(rules) > 0))
+        tried += _without_values(case, extracted(before.explained_count(rules) > 0))
     # if a change without values explains all frames to within the noise, values would only fit that
     if not any(
         all(evidence.is_well_explained(pose, rules) for pose in trial.explained.poses)
@@ -126,7 +126,7 @@ def diagnosis(
     if likeliest.change or all(t.gain < rules.undecided for t in tried if t.change.values):
         return likeliest
     more = further()
-    before = Explained(before.poses + _as_it_is(session, more).poses)
+    before = Explained(before.poses + _unchanged(session, more).poses)
     case = _Case(session, [*frames, *more][: len(before.poses)], before)
     return simplest([*_with_values(case, before)], before, rules)
 
@@ -140,7 +140,7 @@ def explanation(session: Session, frames: Frames) -> str | None:
     return late_sensor(session, frames) or diagnosis(session, frames).change or None
 
 
-def _as_it_is(session: Session, frames: Frames) -> Explained:
+def _unchanged(session: Session, frames: Frames) -> Explained:
     """Search poses by the session as it is, in fewer frames if a long search is in vain."""
     rules, poses, remaining = DiagnosisRules(), list[ScoredPose | None](), DiagnosisRules().in_vain
     for number, views in frames:
@@ -152,14 +152,14 @@ def _as_it_is(session: Session, frames: Frames) -> Explained:
     return Explained(tuple(poses))
 
 
-def _without_values(case: _Case, others: Otherwise) -> Iterator[Tried]:
+def _without_values(case: _Case, others: Extracted) -> Iterator[Tried]:
     """Try changes in a race through the frames in which those far behind the best drop out."""
     session, before, runners = case.session, case.before, [_Runner(*each) for each in others]
     runners += [_Runner(change, case.frames) for change in changes(session)]
     rules, remaining = DiagnosisRules(), DiagnosisRules().all_guesses
     for k in range(len(case.frames)):
         best = 0.0
-        racing = chain(list(runners), _less_simple(case, runners) if k == 0 else ())
+        racing = chain(list(runners), _more_complex(case, runners) if k == 0 else ())
         for place, runner in enumerate(racing):
             if remaining < 0 and (k == 0 or place > 0):
                 break  # only the best so far goes on, which takes few guesses
@@ -178,8 +178,8 @@ def _without_values(case: _Case, others: Otherwise) -> Iterator[Tried]:
         yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
 
 
-def _less_simple(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
-    """Yield changes by single cameras, then pairs of changes, until one explains a frame."""
+def _more_complex(case: _Case, runners: Sequence[_Runner]) -> Iterator[_Runner]:
+    """Yield changes by single cameras, then pairs, while the best so far do not explain a frame."""
     session, rules = case.session, DiagnosisRules()
 
     def leaders() -> list[_Runner]:

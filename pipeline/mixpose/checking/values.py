@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.checking.changes import OTHER_SIZE, called, misplaced, moved_by, times_as_large
+from mixpose.checking.changes import OTHER_SIZE, misplaced, moved_by, quoted, times_as_large
 from mixpose.checking.evidence import CameraMatches
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats
@@ -65,7 +65,7 @@ class Adjustment:
     poses: Sequence[Floats]  # (4, 4) start of each frame
     nearest: Sequence[Sequence[CameraMatches]] = field(default_factory=list)  # of missed features
 
-    def of(self, unknown: Unknown) -> Adjustment:
+    def for_unknown(self, unknown: Unknown) -> Adjustment:
         """Add the detections nearest to the feature that is corrected, where it was missed."""
         sensors: Mapping[str, Any] = self.sensors
         unbounded = {  # cameras without the bounds of their images
@@ -99,7 +99,7 @@ class Adjustment:
 
 def promise(unknown: Unknown, given: Adjustment) -> float:
     """Predict the nats that values gain, by one step of least squares."""
-    given, k = given.of(unknown), len(unknown.deviations)
+    given, k = given.for_unknown(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
     zero = np.zeros(given.motion * len(given.poses) + k)
@@ -120,7 +120,7 @@ def promise(unknown: Unknown, given: Adjustment) -> float:
 
 def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:
     """Fit values (k,) and poses (4, 4) to the matches; return None if these are too few."""
-    given, k = given.of(unknown), len(unknown.deviations)
+    given, k = given.for_unknown(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return None
     poses, state = list(given.poses), np.zeros(given.motion * len(given.poses) + k)
@@ -255,7 +255,7 @@ def _moved(sensor: Any, v: Floats) -> Any:
 def _distortion(names: Sequence[str]) -> Unknown:
     """Return two coefficients of distortion for each camera that has none."""
     return Unknown(
-        f"distortion of {called(names)} {{is}} left out",
+        f"distortion of {quoted(names)} {{is}} left out",
         lambda v: "with two coefficients k1 and k2 for each lens",
         np.full(2 * len(names), _BENT),
         sensors={n: partial(_bent, chosen=slice(2 * k, 2 * k + 2)) for k, n in enumerate(names)},
