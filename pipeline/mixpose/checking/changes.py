@@ -54,7 +54,7 @@ class Change:
     leads: bool = True  # whether it is combined with other changes
 
     def and_also(self, other: Change) -> Change:
-        """Return the change of both together."""
+        """Return the change that makes both changes."""
         return Change(
             f"{self.what}, and {other.what}",
             f"{self.remedy}, and {other.remedy}",

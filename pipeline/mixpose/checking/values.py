@@ -66,7 +66,7 @@ class Adjustment:
     nearest: Sequence[Sequence[CameraMatches]] = field(default_factory=list)  # of missed features
 
     def for_unknown(self, unknown: Unknown) -> Adjustment:
-        """Add the detections nearest to the feature that is corrected, where it was missed."""
+        """Match the corrected feature to nearest detections where missed; drop bounds of images."""
         sensors: Mapping[str, Any] = self.sensors
         unbounded = {  # cameras without the bounds of their images
             name: replace(s, resolution=None) if hasattr(s, "resolution") else s
