@@ -209,7 +209,7 @@ def said_of(session: Session, known: Surveys) -> tuple[list[str], float]:
         key = (str(session.path), str(setup.source), repr(setup.extract))
         if key not in known:
             known[key] = survey(
-                session, setup, sources[setup.name], looked_at=frames_to_count(sources)
+                session, setup, sources[setup.name], to_count=frames_to_count(sources)
             )
         surveys[setup.name] = known[key]
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})

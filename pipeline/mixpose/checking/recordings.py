@@ -67,13 +67,13 @@ def survey(
     source: Source,
     *,
     quick: bool = False,
-    looked_at: Collection[int] | None = None,
+    to_count: Collection[int] | None = None,
     done: Callable[[], None] = lambda: None,
 ) -> Survey:
     """Read the frames of a sensor as a run would, past damaged images.
 
     `quick` reads a few frames only, as is always done for a stream, which has no end. Features are
-    extracted from the images of frames `looked_at`, None for all. `done` is called after each
+    extracted from the images of frames `to_count`, None for all. `done` is called after each
     frame. Raises `SessionError` if a user's function that extracts features fails.
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
@@ -97,7 +97,7 @@ def survey(
                 size = (data.shape[1], data.shape[0])
             elif isinstance(data, PointPattern) and has_duplicates(data.points):
                 doubled.append(number)
-            if not isinstance(data, np.ndarray) or looked_at is None or number in looked_at:
+            if not isinstance(data, np.ndarray) or to_count is None or number in to_count:
                 counted.append(number)
                 observation = observation_of(session, setup, frame)
                 pattern = observation.pattern

@@ -79,7 +79,7 @@ def check_session(request: CheckRequest) -> None:
         for setup in session.sensors:
             source = opened[setup.name]
             surveys[setup.name] = recordings.survey(
-                session, setup, source, quick=quick, looked_at=some, done=partial(moved, advance=1)
+                session, setup, source, quick=quick, to_count=some, done=partial(moved, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
