@@ -299,11 +299,8 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
     (best, gain), *others = near
     change = best.change
     # other values of the same thing are no rival
-    rivals = [
-        trial.change
-        for trial, _ in others
-        if trial.change.values == change.values and trial.change.what != change.what
-    ]
+    rivals = [trial.change for trial, _ in others if trial.change.what != change.what]
+    rivals = [rival for rival in rivals if rival.values == change.values]
     words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
     reported = [change, *rivals[:1]]
     what = ", or ".join(c.what.format(**words) for c in reported)
