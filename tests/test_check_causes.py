@@ -38,9 +38,12 @@ def mirrored(session: Session) -> Session:
     return with_points(session, session.body.means * [1, -1, 1])
 
 
-def explained(good: int, rms: float = 0.1) -> Any:
+def explained(count: int, rms: float = 0.1) -> Any:
     return SimpleNamespace(
-        poses=[None] * 4, met=lambda *_: 50.0, good=lambda _: good, rms=lambda *_: rms
+        poses=[None] * 4,
+        met_count=lambda *_: 50.0,
+        explained_count=lambda _: count,
+        rms=lambda *_: rms,
     )
 
 
@@ -142,7 +145,7 @@ def test_two_changes_together_change_body_and_cameras_of_a_session(right: Sessio
         ],
     )
     both = larger.and_also(swap)
-    changed = both.of(right, frames_of(right, recorded(right))[0][1])
+    changed = both.apply(right, frames_of(right, recorded(right))[0][1])
     np.testing.assert_allclose(changed.body.means, 2 * right.body.means)
     assert [s.sensor for s in changed.sensors] == [s.sensor for s in right.sensors[::-1]]
     assert (both.what, both.remedy) == ("a, and c", "b, and d")

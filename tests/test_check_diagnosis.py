@@ -24,9 +24,9 @@ from diagnosed import (
 
 import mixpose
 from mixpose.body import Body
-from mixpose.checking.changes import Change, of_units
+from mixpose.checking.changes import Change, point_units
 from mixpose.checking.evidence import best_pose
-from mixpose.checking.geometry import _by_some, geometry_doubts
+from mixpose.checking.geometry import _seen_by_some, geometry_doubts
 from mixpose.checking.recordings import survey
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
@@ -47,7 +47,7 @@ def right() -> Session:
 
 def test_a_right_session_has_nothing_wrong(right: Session) -> None:
     found = diagnosis(right, frames_of(right, recorded(right)))
-    assert (found.change, found.good) == ("", 4)
+    assert (found.change, found.explained) == ("", 4)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_frames_of_fewer_coordinates_than_a_pose_has_are_not_searched(
 
     def asks(*arguments: object) -> Diagnosis:
         asked.append(arguments)
-        return Diagnosis(good=1)
+        return Diagnosis(explained=1)
 
     monkeypatch.setattr("mixpose.checking.geometry.diagnosis", asks)
     assert geometry_doubts(few, sources, surveys).warnings == ()
@@ -246,16 +246,19 @@ def test_changes_that_gain_far_less_drop_out_after_a_frame(
 
 def test_points_of_another_unit_have_markers_of_that_unit(right: Session) -> None:
     spheres = replace(right.body, shape="sphere", radii=np.full(7, 6.0))
-    larger = next(of_units(spheres)).body(spheres)
+    larger = next(point_units(spheres)).body(spheres)
     np.testing.assert_allclose(larger.means, 1000 * spheres.means)
     assert larger.radii is not None
     np.testing.assert_allclose(larger.radii, 6000.0)
 
 
 def test_a_feature_met_by_chance_outweighs_no_evidence() -> None:
-    def explained(good: int, met: float, rms: float) -> Any:
+    def explained(count: int, met: float, rms: float) -> Any:
         return SimpleNamespace(
-            poses=[None] * 4, met=lambda *_: met, good=lambda _: good, rms=lambda *_: rms
+            poses=[None] * 4,
+            met_count=lambda *_: met,
+            explained_count=lambda _: count,
+            rms=lambda *_: rms,
         )
 
     smaller = Change("the body {is} of another size", "with it smaller", values=1)
@@ -268,9 +271,12 @@ def test_a_feature_met_by_chance_outweighs_no_evidence() -> None:
 
 
 def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:
-    def explained(good: int, rms: float) -> Any:
+    def explained(count: int, rms: float) -> Any:
         return SimpleNamespace(
-            poses=[None] * 4, met=lambda *_: 50.0, good=lambda _: good, rms=lambda *_: rms
+            poses=[None] * 4,
+            met_count=lambda *_: 50.0,
+            explained_count=lambda _: count,
+            rms=lambda *_: rms,
         )
 
     other_size = Change("the body {is} of another size", "with it larger", values=1)
@@ -289,7 +295,7 @@ def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:
 def test_a_pose_that_one_of_several_cameras_shows_is_no_session_without_a_warning() -> None:
     def said(**shares: float) -> str:
         sensors = {name: SensorReport(share > 0, share, None) for name, share in shares.items()}
-        return _by_some(Estimate(91, None, "board", "ok", np.eye(4), None, 0.5, sensors))
+        return _seen_by_some(Estimate(91, None, "board", "ok", np.eye(4), None, 0.5, sensors))
 
     assert said(a=0.9, b=0.8) == ""
     assert said(a=0.9, b=0.0, c=0.0).startswith(

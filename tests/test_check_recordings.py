@@ -15,11 +15,11 @@ from checked import copied, report_on
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.checking import judge
-from mixpose.checking.keys import told_apart
+from mixpose.checking.keys import with_own_tables
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import (
     Survey,
-    some_of,
+    frames_to_count,
 )
 from mixpose.cli.app import CheckRequest
 from mixpose.cli.check import check_session
@@ -115,17 +115,17 @@ def test_features_are_counted_in_some_images_of_a_long_recording_and_all_are_rea
 
 def test_images_to_count_in_are_the_same_of_all_sensors(recording: Path) -> None:
     session = mixpose.load_session(recording / "session.toml")
-    assert some_of(open_sources(session, {})) == set(range(8))
+    assert frames_to_count(open_sources(session, {})) == set(range(8))
     for n in range(8, 49):
         shutil.copy(recording / "left0000.png", recording / f"left{n:04d}.png")
         shutil.copy(recording / "right0000.png", recording / f"right{n:04d}.png")
     (recording / "right0000.png").unlink()  # a frame that one sensor lacks displaces no other
-    found = some_of(open_sources(session, {}))
+    found = frames_to_count(open_sources(session, {}))
     assert found is not None
     assert (len(found), min(found), max(found)) == (20, 1, 48)
     cut_to(recording, 1)
     (recording / "right0001.png").write_bytes(b"")
-    assert some_of(open_sources(session, {})) == {0, 1}  # none pairs: those of each
+    assert frames_to_count(open_sources(session, {})) == {0, 1}  # none pairs: those of each
 
 
 def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
@@ -396,11 +396,11 @@ def test_a_key_is_shared_only_where_all_sensors_want_one_value() -> None:
     one, other = ("with threshold = 90 in [extract] it would be 7", "with threshold = 150 in "
                   "[extract] it would be 7")  # fmt: skip
     own = "with threshold = 90 in its own [sensor.extract] it would be 7"
-    assert told_apart([one, one, "else"], 2) == [one, one, "else"]
-    assert told_apart([one, other], 2) == [own, own.replace("90", "150")]
+    assert with_own_tables([one, one, "else"], 2) == [one, one, "else"]
+    assert with_own_tables([one, other], 2) == [own, own.replace("90", "150")]
     # the third sensor finds what it should
-    assert told_apart([one, one], 3) == [own, own]
-    assert told_apart([one], 1) == [one]
+    assert with_own_tables([one, one], 3) == [own, own]
+    assert with_own_tables([one], 1) == [one]
 
 
 @pytest.mark.parametrize("late", [False, True])

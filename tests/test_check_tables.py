@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mixpose.checking.recordings import Survey, has_twins, numbering_warnings, order_warnings
+from mixpose.checking.recordings import Survey, has_duplicates, numbering_warnings, order_warnings
 from mixpose.frames import SourceSpec, open_source
 
 
@@ -18,8 +18,8 @@ def test_rows_that_are_repeated_and_times_that_go_back_are_told() -> None:
     assert "stands twice or more in 2 of 3 frames, as 4: are rows" in first
     assert "'left': frame 5 is at 0.15 s and the frame before it at 0.2 s; a run ends" in second
     assert order_warnings({"left": replace(own, times={3: 0.1, 4: 0.1}, doubled=(4,))}) == []
-    assert has_twins(np.array([[1.0, 2], [3, 4], [1, 2]]))
-    assert not has_twins(np.array([[1.0, 2], [3, 4], [1, 3]]))
+    assert has_duplicates(np.array([[1.0, 2], [3, 4], [1, 2]]))
+    assert not has_duplicates(np.array([[1.0, 2], [3, 4], [1, 3]]))
 
 
 def test_times_without_numbers_beside_numbers_are_told(tmp_path: Path) -> None:

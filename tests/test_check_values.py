@@ -13,7 +13,7 @@ from diagnosed import (
     poses,
 )
 
-from mixpose.checking.evidence import Seen
+from mixpose.checking.evidence import CameraMatches
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import Adjustment, adjusted, promise, unknowns
 from mixpose.rigid import perturb, transform
@@ -29,11 +29,11 @@ def right() -> Session:
     return replace(session, start=None)
 
 
-def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:
+def exact(session: Session, points: np.ndarray) -> list[list[CameraMatches]]:
     """What the cameras meet of a body without noise, all at once."""
     return [
         [
-            Seen(
+            CameraMatches(
                 each.name,
                 np.arange(7),
                 each.sensor.project(transform(T, points))[0],
@@ -46,7 +46,7 @@ def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:
     ]
 
 
-def given_to(session: Session, frames: Sequence[Sequence[Seen]]) -> Adjustment:
+def given_to(session: Session, frames: Sequence[Sequence[CameraMatches]]) -> Adjustment:
     sensors = {setup.name: setup.sensor for setup in session.sensors}
     return Adjustment(session.body.means, sensors, frames, poses())
 

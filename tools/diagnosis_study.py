@@ -26,7 +26,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.checking import key_warnings, with_image_sizes
 from mixpose.checking.geometry import geometry_doubts
 from mixpose.checking.placement import placement_warnings
-from mixpose.checking.recordings import Survey, some_of, survey
+from mixpose.checking.recordings import Survey, frames_to_count, survey
 from mixpose.records import Floats
 from mixpose.rigid import inverse
 from mixpose.runner import open_sources
@@ -208,7 +208,9 @@ def said_of(session: Session, known: Surveys) -> tuple[list[str], float]:
     for setup in session.sensors:
         key = (str(session.path), str(setup.source), repr(setup.extract))
         if key not in known:
-            known[key] = survey(session, setup, sources[setup.name], looked_at=some_of(sources))
+            known[key] = survey(
+                session, setup, sources[setup.name], to_count=frames_to_count(sources)
+            )
         surveys[setup.name] = known[key]
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     began = time.process_time()

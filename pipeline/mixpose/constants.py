@@ -1,4 +1,4 @@
-"""How a tunable number is written down: a field of a frozen dataclass that says why it is so.
+"""Define tunable numbers as fields of frozen dataclasses, each with the reason for its value.
 
 `docs/constants.md` is made from these fields.
 """
@@ -12,5 +12,5 @@ T = TypeVar("T")
 
 
 def constant(value: T, why: str) -> T:
-    """A field with a default and the reason for it: a derivation, a test or a measured row."""
+    """Return a field with a default and its reason: a derivation, a test or a measured row."""
     return field(default=value, metadata={"why": why})

@@ -1,7 +1,6 @@
-"""Frozen records as plain JSON and back, exactly: every bit of every number.
+"""Encode frozen records as plain JSON and decode them exactly: every bit of every number.
 
-What a record holds may be numbers, text, None, arrays, tuples, named ones too, mappings and further
-records.
+Records may hold numbers, text, None, arrays, tuples and named tuples, mappings and further records.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ T = TypeVar("T")
 _KIND = "is"
 
 
-def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
-    """A record as what `json.dumps` takes; `TypeError` if it holds something else than it may."""
+def encode(value: object) -> Any:  # noqa: PLR0911 - one return per kind of value
+    """Return a record as `json.dumps` takes it; raise `TypeError` if it holds anything else."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        held = {each.name: encode(getattr(value, each.name)) for each in dataclasses.fields(value)}
-        return {_KIND: type(value).__name__, **held}
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):  # named
+        names = [field.name for field in dataclasses.fields(value)]
+        return {_KIND: type(value).__name__, **{k: encode(getattr(value, k)) for k in names}}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):  # a named tuple
         return {_KIND: type(value).__name__, **{k: encode(v) for k, v in value._asdict().items()}}
     if isinstance(value, np.ndarray):
-        # sums depend in their last bit on the order in memory
+        # the order in memory changes the last bit of sums
         by_columns = value.flags.f_contiguous and not value.flags.c_contiguous
         return {
             _KIND: "array",
@@ -48,18 +47,18 @@ def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
 
 
 def decode(record: type[T], data: Any) -> T:
-    """A record from what `encode` made of it, as `json.loads` has it.
+    """Return the record from what `encode` made of it, as `json.loads` returns that.
 
-    Only what annotations of the outermost record name is ever made.  Raises `ValueError` if the
-    data are not those of such a record.
+    Only types in the annotations of the outermost record are ever created.  Raises `ValueError` if
+    the data are not those of such a record.
     """
     try:
-        found = _decoded(data, _records_in(record, {}))
+        decoded = _decoded(data, _records_in(record, {}))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"no {record.__name__}: {error}") from error
-    if not isinstance(found, record):
-        raise ValueError(f"no {record.__name__}: found {type(found).__name__}")
-    return found
+    if not isinstance(decoded, record):
+        raise ValueError(f"no {record.__name__}: found {type(decoded).__name__}")
+    return decoded
 
 
 def _decoded(data: Any, known: Mapping[str, type]) -> Any:
@@ -73,14 +72,14 @@ def _decoded(data: Any, known: Mapping[str, type]) -> Any:
         return np.array(values, order=data["order"])
     if kind == "mapping":
         return {_decoded(key, known): _decoded(value, known) for key, value in data["items"]}
-    held = {name: _decoded(value, known) for name, value in data.items() if name != _KIND}
-    return known[kind](**held)
+    fields = {name: _decoded(value, known) for name, value in data.items() if name != _KIND}
+    return known[kind](**fields)
 
 
 def _records_in(annotation: Any, known: dict[str, type]) -> dict[str, type]:
-    """The records that an annotation names, and those in their fields, by name."""
-    named = isinstance(annotation, type) and hasattr(annotation, "_asdict")
-    if isinstance(annotation, type) and (named or dataclasses.is_dataclass(annotation)):
+    """Collect the records that an annotation names, and those in their fields, by name."""
+    is_named = isinstance(annotation, type) and hasattr(annotation, "_asdict")
+    if isinstance(annotation, type) and (is_named or dataclasses.is_dataclass(annotation)):
         if annotation.__name__ not in known:
             known[annotation.__name__] = annotation
             for hint in typing.get_type_hints(annotation).values():

@@ -1,7 +1,7 @@
 """Errors that a user can mend: one base class, one line each.
 
-A message says what was found, what is allowed and what to do.  The command line prints it
-without a traceback and leaves with `exit_status`.
+A message says what was found, what is allowed and what to do.  The command line prints it without
+a traceback and exits with `exit_status`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class RecordingError(MixposeError):
 
 @contextmanager
 def reporting(kind: type[MixposeError], what: str) -> Iterator[None]:
-    """Tell of an OSError inside as an error of ours: what cannot be done, and why."""
+    """Raise an OSError inside as an error of mixpose that says what cannot be done, and why."""
     try:
         yield
     except OSError as error:
@@ -37,7 +37,7 @@ def reporting(kind: type[MixposeError], what: str) -> Iterator[None]:
 
 
 def require_package(what: str, package: str, extra: str, more: str = "") -> None:
-    """Refuse, by a SessionError, what needs a package that is not installed; an extra has it."""
+    """Raise a SessionError that names the extra to install if a package is missing."""
     if find_spec(package.removesuffix("-sdk")) is None:
         raise SessionError(
             f"{what}: needs the package {package}; install it with: "

@@ -1,8 +1,8 @@
-"""Many independent tasks at once: in threads, in processes, or on a cluster.
+"""Run independent tasks in parallel: in threads, in processes, or on a cluster.
 
 A cluster is one of ``dask.distributed`` (the extra ``[dask]``): ``local`` starts one on this
-machine, an address such as ``tcp://head:8786`` names the scheduler of one that is running.  It
-repeats the tasks of a worker that was lost, so a task must do no harm when it is done twice.
+machine, an address such as ``tcp://head:8786`` names the scheduler of a running one.  It repeats
+the tasks of a worker that was lost, so a task must do no harm if it runs twice.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 LOCAL = "local"
-"""In place of an address: a cluster of this machine's own."""
+"""In place of an address: a cluster on this machine."""
 
 PATIENCE_S = 20.0
-"""How long a scheduler may take to answer."""
+"""Longest wait for the answer of a scheduler."""
 
 
 class Executor(Protocol):
-    """Does tasks; each is tried to its end whatever becomes of the others."""
+    """Runs tasks; an error in one does not stop the others."""
 
     def run(
         self, function: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> Iterator[tuple[int, Result | Exception]]:
-        """Do a function for each task; as they are done, places and results, or what was raised."""
+        """Call a function with each task; yield indices with results or errors, as they end."""
 
 
 class _Pool:
@@ -73,26 +73,25 @@ class _Cluster:
 
 @contextmanager
 def _pooled(started: futures.Executor) -> Iterator[Executor]:
-    """Tasks of a pool; after an error none is begun any more."""
+    """Run tasks in a pool; after an error no further one is started."""
     try:
         yield _Pool(started)
     except BaseException:
-        # once: to shut it down again, as `with` does, would take back that the rest is cancelled;
-        # those that run are waited for
+        # a second shutdown, as by `with`, would undo the cancelling; running tasks are waited for
         started.shutdown(cancel_futures=True)
         raise
     started.shutdown()
 
 
 def in_threads(workers: int) -> AbstractContextManager[Executor]:
-    """As many tasks at a time as there are workers, in threads: for tasks that mostly wait."""
+    """Return an executor with threads as workers, for tasks that mostly wait."""
     return _pooled(futures.ThreadPoolExecutor(workers))
 
 
 def in_processes(workers: int | None = None) -> AbstractContextManager[Executor]:
-    """The same in processes, as many as there are processors if not said: for tasks that compute.
+    """Return an executor with processes, by default one per processor, for tasks that compute.
 
-    The linear algebra of each has one thread.
+    Linear algebra has one thread in each.
     """
     context = multiprocessing.get_context("spawn")
     return _pooled(futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread))
@@ -100,7 +99,7 @@ def in_processes(workers: int | None = None) -> AbstractContextManager[Executor]
 
 @contextmanager
 def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]:
-    """The workers of a scheduler at an address, or of this machine's own cluster (`LOCAL`).
+    """Run tasks on workers of a scheduler at an address, or of a cluster on this machine (`LOCAL`).
 
     Raises SessionError if ``dask.distributed`` is not installed, or no scheduler answers.
     """
@@ -127,5 +126,5 @@ def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]
 
 
 def executor(scheduler: str | None, workers: int | None = None) -> AbstractContextManager[Executor]:
-    """A context with the processes of this machine, or with a cluster where one is named."""
+    """Return an executor with processes of this machine, or with the cluster of a scheduler."""
     return in_processes(workers) if scheduler is None else on_cluster(scheduler, workers)

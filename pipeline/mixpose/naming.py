@@ -1,4 +1,4 @@
-"""Names that are told apart."""
+"""Make names distinct."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from collections.abc import Callable, Sequence
 def distinct(
     wanted: Sequence[str], plain: Callable[[str], str], alike: Callable[[str], str] = str
 ) -> list[str]:
-    """Names made plain, of which no two are alike: a number from 2 on is put behind others.
+    """Make names plain and distinct by numbers, from 2 on, behind repeated ones.
 
-    Those that are plain already come first, and stay as they are. `alike` is the same of names that
-    count as one: ``str.casefold`` for those of files, as some file systems know no capitals.
+    Names that are plain already come first, and stay as they are. `alike` maps names that count as
+    the same to one: ``str.casefold`` for files, as some file systems ignore case.
     """
-    made = [plain(name) for name in wanted]
+    plain_names = [plain(name) for name in wanted]
     taken: set[str] = set()
-    found: dict[int, str] = {}
-    for k in sorted(range(len(made)), key=lambda k: made[k] != wanted[k]):
-        name, number = made[k], 2
+    names: dict[int, str] = {}
+    for k in sorted(range(len(wanted)), key=lambda k: plain_names[k] != wanted[k]):
+        name, number = plain_names[k], 2
         while alike(name) in taken:
-            name, number = f"{made[k]}_{number}", number + 1
+            name, number = f"{plain_names[k]}_{number}", number + 1
         taken.add(alike(name))
-        found[k] = name
-    return [found[k] for k in range(len(made))]
+        names[k] = name
+    return [names[k] for k in range(len(wanted))]

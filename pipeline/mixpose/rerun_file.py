@@ -1,8 +1,8 @@
-"""A recording for the Rerun viewer: what the sensors saw, what was found in it, and the poses.
+"""Write a recording for the Rerun viewer: frames of the sensors, their features, and the poses.
 
-What is logged is in `docs/formats.md`: sensors with their images and bodies with their features
-below ``world``, g_l below ``density``, ``plots/score`` and ``status``.  Of several bodies each has
-its name behind the last two, and behind ``predicted``.  Lengths are in the session's unit.
+`docs/formats.md` lists what is logged: sensors with their images and bodies with their features
+below ``world``, g_l below ``density``, ``plots/score`` and ``status``.  With several bodies, the
+last two and ``predicted`` end in the body's name.  Lengths are in the session's unit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _BODY_COLOURS = (
 _FOUND = (90, 170, 255)
 _DENSITY_WIDTH = 640
 _JPEG_QUALITY = 85
-# Rerun's pixels have their corners at integers
+# Rerun has the corners of pixels at integers
 _HALF = 0.5
 
 
@@ -44,8 +44,8 @@ def write_rerun_file(
 ) -> None:
     """Write the recording of the frames that have a pose line.
 
-    Its sources are opened; lines are by ascending frame number, in the unit of the session that the
-    poses were estimated with. A `RecordingError` if a frame cannot be read; the file then holds the
+    Sources are open; lines have ascending frame numbers, and are in the unit of the session that
+    estimated them. Raises `RecordingError` if a frame cannot be read; the file then holds the
     frames before it.
     """
     stream = rr.RecordingStream("mixpose", send_properties=False)
@@ -54,7 +54,7 @@ def write_rerun_file(
     stream.save(path, default_blueprint=_blueprint(session))
     try:
         scene = _Scene(stream, session)
-        scene.stand_still(lines)
+        scene.log_static(lines)
         scene.play(sources, lines)
     finally:
         stream.flush()
@@ -63,19 +63,19 @@ def write_rerun_file(
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is logged, and where to."""
+    """Log of a session to a stream."""
 
     stream: Any
     session: Session
 
-    def stand_still(self, lines: Sequence[PoseLine]) -> None:
+    def log_static(self, lines: Sequence[PoseLine]) -> None:
         """Log what does not move: sensors, and the object's features in its own frame."""
         for setup in self.session.sensors:
             self._sensor(setup, lines)
-        # no radii: what stands still overrules what moves, and a lost body's points are hidden
-        for one in self.session.objects:
-            for label in one.labels:
-                points = rr.Points3D(one.body.means)
+        # no radii: static ones would overrule those that hide the points of a lost body
+        for model in self.session.objects:
+            for label in model.labels:
+                points = rr.Points3D(model.body.means)
                 self.stream.log(["world", label, "points"], points, static=True)
 
     def play(self, sources: Mapping[str, Source], lines: Sequence[PoseLine]) -> None:
@@ -87,8 +87,8 @@ class _Scene:
             for frame_set in pair(sources, min(waiting), max(waiting) + 1):
                 if frame_set.number in waiting:
                     self._moment(waiting.pop(frame_set.number), frame_set)
-        for rest in waiting.values():
-            self._moment(rest, None)
+        for remaining in waiting.values():
+            self._moment(remaining, None)
 
     def _moment(self, lines: Sequence[PoseLine], frames: FrameSet | None) -> None:
         self.stream.reset_time()
@@ -128,7 +128,7 @@ class _Scene:
         )
 
     def _seen(self, setup: SensorSetup, frames: FrameSet) -> None:
-        """The frame of one sensor, the features found in it and their density."""
+        """Log the frame of one sensor, its features and their density."""
         frame = frames.frames[setup.name]
         size = setup.resolution
         place = ["world", setup.name, "image"]
@@ -138,35 +138,35 @@ class _Scene:
         observation = observation_of(self.session, setup, frame)
         pattern = observation.pattern
         if isinstance(pattern, PointPattern) and pattern.dimension == 2:
-            found, radius = pattern.points + _HALF, rr.Radius.ui_points(4)
-            self.stream.log([*place, "features"], rr.Points2D(found, radii=radius, colors=_FOUND))
+            points, radius = pattern.points + _HALF, rr.Radius.ui_points(4)
+            self.stream.log([*place, "features"], rr.Points2D(points, radii=radius, colors=_FOUND))
         density = _density(observation, size)
         if density is not None:
             self.stream.log(["density", setup.name], density)
 
     def _pose(self, line: PoseLine) -> None:
-        # of several bodies each has entities of its own
-        own = [line.label] if len(self.session.labels) > 1 else []
-        said = f"{line.label} " if own else ""
+        # each of several bodies has its own entities
+        names = [line.label] if len(self.session.labels) > 1 else []
+        label = f"{line.label} " if names else ""
         score = line.score if line.score is not None else 1.0
-        self.stream.log(["plots", "score", *own], rr.Scalars(score))
-        self.stream.log(["status", *own], rr.TextLog(f"frame {line.frame}: {said}{line.status}"))
+        self.stream.log(["plots", "score", *names], rr.Scalars(score))
+        self.stream.log(["status", *names], rr.TextLog(f"frame {line.frame}: {label}{line.status}"))
         places = ["world", line.label], ["world", f"{line.label} covariance"]
         T = line.T_world_object
         predicted = [
-            ["world", setup.name, "image", "predicted", *own] for setup in self.session.sensors
+            ["world", setup.name, "image", "predicted", *names] for setup in self.session.sensors
         ]
         if T is None:
             for place in (*places, *predicted):
                 self.stream.log(place, rr.Clear(recursive=False))
-            # a transform that is cleared leaves the points where the world's origin is
+            # without a transform the points would be at the world's origin: hide them
             self.stream.log(["world", line.label, "points"], rr.Points3D.from_fields(radii=[0.0]))
             return
-        bodies = {one.body.name: one.body for one in self.session.objects}
+        bodies = {model.body.name: model.body for model in self.session.objects}
         body = bodies.get(line.object, self.session.body)
         colour = _COLOURS[line.status]
         labels = self.session.labels
-        if own and line.status == "ok" and line.label in labels:
+        if names and line.status == "ok" and line.label in labels:
             colour = _BODY_COLOURS[labels.index(line.label) % len(_BODY_COLOURS)]
         self.stream.log(places[0], _transform(T))
         shown = rr.Points3D.from_fields(radii=[0.03 * body.radius], colors=[colour])
@@ -174,7 +174,7 @@ class _Scene:
         if line.covariance is None:
             self.stream.log(places[1], rr.Clear(recursive=False))
         else:
-            # where the position is with 95 %
+            # it holds the position with 95 %
             half_axes, axes = rigid.position_ellipsoid_95(line.covariance)
             turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
             ellipsoid = rr.Ellipsoids3D(
@@ -211,7 +211,7 @@ def _jpeg(image: NDArray[np.uint8]) -> Any:
 
 
 def _density(observation: Observation, size: tuple[int, int] | None) -> Any:
-    """g_l over the whole sensor, brightest where it is largest; None where nothing was seen."""
+    """Draw g_l over the whole sensor; return None without features."""
     if observation.is_empty:
         return None
     lower, upper = observation.extent
@@ -229,7 +229,7 @@ def _density(observation: Observation, size: tuple[int, int] | None) -> Any:
 
 
 def _blueprint(session: Session) -> Any:
-    """The world beside the sensors' images and densities."""
+    """Lay out the world beside the sensors' images and densities."""
     world = rrb.Spatial3DView(origin="/world", name="world")
     cameras = [setup.name for setup in session.sensors if setup.sensor.dimension == 2]
     part = {name: rr.escape_entity_path_part(name) for name in cameras}

@@ -1,4 +1,4 @@
-"""Which frames of a recording are taken."""
+"""The choice of frames of a recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Selection:
-    """Which frames of a recording are estimated, as by `range`: numbers, `stop` excluded."""
+    """Numbers of the frames to estimate, as in `range`: `stop` is excluded."""
 
     start: int | None = None
     stop: int | None = None

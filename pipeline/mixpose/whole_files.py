@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pathlib import Path
 
 
 def partial_of(path: Path) -> Path:
-    """Where a file is written before it is whole: beside it, hidden, with its suffix."""
+    """Return the path of a file while it is written: beside it, hidden, with its suffix."""
     return path.with_name(f".{path.stem}.part{path.suffix}")
 
 
 @contextmanager
 def appearing_whole(path: Path) -> Iterator[Path]:
-    """A path to write to, moved to `path` at the end; nothing is left of it after an error.
+    """Yield a path to write to, moved to `path` at the end and deleted after an error.
 
-    What stood at `path` stays until then, and its mode and links to it after that.  A device or a
-    pipe is written to as it is.  An OSError that names no file, as that of a full disk, gets the
-    name of this one.
+    An old file at `path` stays until then; its mode and symbolic links to it are kept.  A device or
+    a pipe is written to directly.  An OSError without a file name, as for a full disk, gets that of
+    `path`.
     """
     if path.exists() and not path.is_file():
         yield path
@@ -31,7 +31,7 @@ def appearing_whole(path: Path) -> Iterator[Path]:
         yield part
         if path.exists():
             shutil.copymode(path, part)
-        os.replace(part, path)  # noqa: PTH105 - also where the file exists, on every system
+        os.replace(part, path)  # noqa: PTH105 - replaces an existing file on every system
     except OSError as error:
         error.filename = error.filename or str(path)
         raise

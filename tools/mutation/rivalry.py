@@ -82,8 +82,8 @@ MUTANTS = (
     Mutant(
         "checking-times-of-other-moments-are-silent",
         "checking/recordings.py",
-        "(off := float(np.median(apart))) > usual:",
-        "(off := float(np.median(apart))) > 1e9:",
+        "(off := float(np.median(gaps))) > usual:",
+        "(off := float(np.median(gaps))) > 1e9:",
         "frames that are paired by number are of other moments, and nothing is said",
         ("test_check_pairing.py",),
     ),

@@ -1,9 +1,8 @@
-"""What can be said of a session before its poses are estimated.
+"""Check a session and its recording before poses are estimated.
 
-`recordings` reads every frame, `keys`, `placement` and `lookalikes` doubt what the session says by
-itself and by the features that are found.  `geometry` takes a few frames, and `trials` tries what
-else the session could have said: `changes` of it as a whole, and `values` that are adjusted to what
-sensors met, judged by `evidence` and `rules`.
+`recordings` reads every frame; `keys`, `placement` and `lookalikes` warn by the session itself and
+by counts of features.  `geometry` estimates a few frames, and `trials` tries corrections of the
+session, `changes` of it as a whole and `values` fitted to matches, by `evidence` and `rules`.
 """
 
 from mixpose.checking.changes import times_as_large as times_as_large

@@ -1,6 +1,6 @@
-"""How well frames are explained by a body and sensors, as they are given or as they may be.
+"""Score how well a body and sensors, of the session or changed, explain frames.
 
-And which feature was met by which detection, for values that are fitted to several frames.
+Also match features to detections, to fit values to several frames.
 """
 
 from __future__ import annotations
@@ -31,36 +31,36 @@ from mixpose.tracking.likelihood import likelihood_of
 
 Views: TypeAlias = Sequence[View]
 Frames: TypeAlias = Sequence[tuple[int, Views]]
-Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # as in `Seen`
+Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # features, observed, noise of `CameraMatches`
 Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
 
-_BEGIN_S = 0.0  # of the first frame, of which the time tells nothing but that sensors have one
-_FEW = 3  # features in view that tell of a pose
-_FEWEST = 0.1  # of the body's features, without which no pose is told
-_MISSED = 0.3  # of the body: a camera that meets less mostly misses it
+_TIME_S = 0.0  # of a single frame: any will do, but late sensors need one
+_FEW = 3  # features in view, from which a sensor constrains the pose
+_FEWEST = 0.1  # of the body's features: frames with fewer detections determine no pose
+_MISSED = 0.3  # of the expected features: a camera that meets less mostly misses the body
 _REACH = 3.0  # times sigma, from a displaced feature to its detection
-_BESIDE = 10.0  # times sigma, from a feature that is missed to a detection that may be its own
-_AWAY = 0.15  # of the image, the longest displacement
-_DISPLACEMENTS = 2000  # that are tried
+_NEARBY = 10.0  # times sigma, from a missed feature to a detection that may be its own
+_FARTHEST = 0.15  # of the image, the longest displacement
+_DISPLACEMENTS = 2000  # tried at most
 
 
 @dataclass(frozen=True)
 class Explained:
-    """The best poses of some frames; None where nothing was seen or found."""
+    """The best pose of each frame; None if nothing was seen or no pose was found."""
 
     poses: tuple[ScoredPose | None, ...]
 
     @property
     def evidence(self) -> float:
-        """Log odds of all against clutter, which explains what no pose does."""
+        """Sum of log odds against clutter; a frame that clutter explains better adds 0."""
         return sum(evidence_of(pose) for pose in self.poses)
 
-    def good(self, rules: DiagnosisRules) -> int:
-        """How many frames are explained, by all of their sensors."""
+    def explained_count(self, rules: DiagnosisRules) -> int:
+        """Count the frames that are explained by all of their sensors."""
         return sum(pose is not None and is_explained(pose, rules) for pose in self.poses)
 
-    def met(self, feature: int | None = None) -> float:
-        """Number of features that sensors meet; how many meet one of them."""
+    def met_count(self, feature: int | None = None) -> float:
+        """Count the features that sensors meet, or the sensors that meet one feature."""
         return sum(
             float(pose.matches.shares[:, _columns(feature)].sum())
             for pose in self.poses
@@ -68,20 +68,20 @@ class Explained:
         )
 
     def rms(self, feature: int | None = None) -> float:
-        """Root mean square of what features, or one, are met off, in sigma: of the median frame."""
-        found = [rms_of(pose, feature) for pose in self.poses if pose is not None]
-        return float(np.median([each for each in found if np.isfinite(each)] or [0.0]))
+        """Return the median over frames of the RMS offset of all features, or of one, in sigma."""
+        offsets = [rms_of(pose, feature) for pose in self.poses if pose is not None]
+        return float(np.median([rms for rms in offsets if np.isfinite(rms)] or [0.0]))
 
 
 def evidence_of(pose: ScoredPose | None) -> float:
-    """Log odds of a pose against clutter, 0 at least."""
+    """Return the log odds of a pose against clutter, at least 0."""
     return 0.0 if pose is None else max(pose.log_evidence, 0.0)
 
 
 def rms_of(pose: ScoredPose, feature: int | None = None) -> float:
-    """Root mean square offset of a pose, or of a feature there, in sigma; NaN of none."""
+    """Return the RMS offset of all features, or of one, at a pose, in sigma; NaN if none is met."""
     matches, noise = pose.matches, NOISE_OF_SIGMA**2
-    # a cut spot counts as far as it is exact
+    # a spot that is cut counts less, by its extra variance
     shares = (matches.shares * (noise / (noise + matches.extra)))[:, _columns(feature)]
     total = float(shares.sum())
     squares = float((shares * matches.squared[:, _columns(feature)]).sum())
@@ -93,10 +93,10 @@ def _columns(feature: int | None) -> slice:
 
 
 def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:
-    """Whether a pose is sure, and no sensor sees much beside what it meets."""
+    """Test whether a pose is sure and every sensor meets enough of the features it could."""
     matches = pose.matches
-    # what a sensor sees of which the body is out of its view is no body, or the view is wrong; a
-    # feature or two there are met by any change
+    # if a sensor with detections has the body out of view, they are clutter or the view is wrong;
+    # a feature or two there could be met under any change
     in_view = np.where(matches.expected >= _FEW, matches.expected, matches.expected.max())
     could = np.minimum(matches.count, in_view)
     return bool(
@@ -107,31 +107,31 @@ def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:
 
 
 def is_well_explained(pose: ScoredPose | None, rules: DiagnosisRules) -> bool:
-    """Whether what is met is met to within what good recordings err by, too."""
+    """Test whether a pose is explained with offsets as small as those of good recordings."""
     return pose is not None and is_explained(pose, rules) and rms_of(pose) < rules.noise
 
 
-def anywhere(session: Session) -> Session:
-    """The session without a start, where none is needed: it may be what is wrong."""
+def without_start(session: Session) -> Session:
+    """Return the session without its start, which may be wrong, if no start is needed."""
     return replace(session, start=None) if free_mask(session.estimator).all() else session
 
 
 def estimate_of(session: Session, number: int, views: Views) -> Estimate:
-    """What a run tells of a frame that is its first."""
+    """Return the estimate of a run whose first frame this is."""
     tracker, track = begin(session)
-    return tracker.advance(track, number, _BEGIN_S, views)[1]
+    return tracker.advance(track, number, _TIME_S, views)[1]
 
 
-def can_tell(views: Views, features: int) -> bool:
-    """Whether detections have more coordinates than a pose, which meets as many as it has itself.
+def are_sufficient(views: Views, features: int) -> bool:
+    """Test whether detections can determine a pose; grids of values always may.
 
-    And are a tenth of the body's features at least: each that is met gains up to ten nats against
-    clutter, and one that is missed costs two.
+    They need more coordinates than a pose has, as any pose meets six, and one in ten of the body's
+    features: a feature met gains up to ten nats against clutter, one missed costs two.
     """
     patterns = [view.observation.pattern for view in views]
-    points = [each.points for each in patterns if isinstance(each, PointPattern)]
+    points = [pattern.points for pattern in patterns if isinstance(pattern, PointPattern)]
     are_few = max(map(len, points), default=0) < _FEWEST * features
-    are_enough = sum(each.size for each in points) > len(TWIST_NAMES) and not are_few
+    are_enough = sum(detections.size for detections in points) > len(TWIST_NAMES) and not are_few
     return len(points) < len(patterns) or are_enough
 
 
@@ -143,15 +143,15 @@ def best_pose(
     guesses: float = np.inf,
     useful: float = -np.inf,
 ) -> tuple[ScoredPose | None, int]:
-    """The best pose of a frame, searched for with as many guesses at most, and how many it took.
+    """Search for the best pose of a frame; return it and the number of guesses made.
 
-    Where no pose with `useful` evidence is in sight, there may be none.
+    The search may end early, without a pose, if none with `useful` evidence is in sight.
     """
     tracker, track = begin(replace(session, body=body))
     search = replace(tracker.rules.search, max_guesses=guesses, useful=useful)
     tracker = replace(tracker, rules=replace(tracker.rules, search=search))
-    with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
-        data = tracker.data(track, number, _BEGIN_S, views)
+    with np.errstate(all="ignore"), one_blas_thread():  # a changed body may be anywhere
+        data = tracker.data(track, number, _TIME_S, views)
         ranked = tracker.explain(data)
     made = sum(report.made for report, _ in data.searches)
     return (ranked[0] if ranked else None), made
@@ -160,10 +160,10 @@ def best_pose(
 def pose_near(
     session: Session, body: Body, number: int, views: Views, T_world_object: Floats
 ) -> ScoredPose | None:
-    """The pose of a frame near another (4, 4)."""
+    """Fit the pose of a frame from a start (4, 4); return None if no view takes part."""
     tracker, track = begin(replace(session, body=body))
     with np.errstate(all="ignore"), one_blas_thread():
-        data = tracker.data(track, number, _BEGIN_S, views)
+        data = tracker.data(track, number, _TIME_S, views)
         if not data.views:
             return None
         likelihood, start = likelihood_of(data), Start(T_world_object, data.close_uncertainty)
@@ -171,81 +171,81 @@ def pose_near(
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What one camera met of the body in a frame."""
+class CameraMatches:
+    """Features of the body that one camera met in a frame."""
 
     name: str
     features: Indices  # (n,)
     observed: Floats  # (n, 2)
-    noise: Floats  # (n,) standard deviations, in sensor units; of cut spots larger ones
-    seconds: Floats  # (n,) after the frame's time that it was seen; where that is unknown, about so
+    noise: Floats  # (n,) standard deviations, in sensor units; larger for cut spots
+    seconds: Floats  # (n,) from the frame's time to the exposure, a guess if unknown
 
-    def only(self, chosen: Mask | slice) -> Seen:
-        """Some of the features."""
-        features, observed = self.features[chosen], self.observed[chosen]
-        return Seen(self.name, features, observed, self.noise[chosen], self.seconds[chosen])
+    def only(self, chosen: Mask | slice) -> CameraMatches:
+        """Return the matches of the chosen features."""
+        pairs = self.features[chosen], self.observed[chosen], self.noise[chosen]
+        return CameraMatches(self.name, *pairs, self.seconds[chosen])
 
     @classmethod
-    def by(cls, view: View, pairs: Pairs) -> Seen:
-        """What a view met."""
+    def of(cls, view: View, pairs: Pairs) -> CameraMatches:
+        """Return the matches of a view, each with its moment."""
         seconds = read_times(view.sensor, pairs[1], view.delay + (view.unsure or 0.0), view.readout)
         return cls(view.name, *pairs, np.broadcast_to(seconds, len(pairs[0])))
 
 
-def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
-    """What poses met, frame by frame and camera by camera.
+def matches_of(frames: Sequence[Posed]) -> list[list[CameraMatches]]:
+    """Return the matches of poses, frame by frame and camera by camera.
 
-    A camera that mostly misses the body may see it elsewhere, and about as far off in all frames:
-    by the displacement that brings most of the predicted features upon detections.
+    A camera that mostly misses the body may see it displaced by about as much in all frames: it
+    takes the displacement that brings most predicted features to detections, if that matches more.
     """
     cameras: dict[str, list[tuple[int, View]]] = {}
     for f, (views, pose) in enumerate(frames):
         for view in views:
             if is_camera(view) and view.name in pose.matches.names:
                 cameras.setdefault(view.name, []).append((f, view))
-    seen: list[list[Seen]] = [[] for _ in frames]
-    for name, own in cameras.items():
-        matches = [frames[f][1].matches for f, _ in own]
-        rows = [each.names.index(name) for each in matches]
-        pairs = [_met(each, k) for each, k in zip(matches, rows)]
-        expected = sum(float(each.expected[k]) for each, k in zip(matches, rows))
+    by_frame: list[list[CameraMatches]] = [[] for _ in frames]
+    for name, camera_frames in cameras.items():
+        matches = [frames[f][1].matches for f, _ in camera_frames]
+        rows = [m.names.index(name) for m in matches]
+        pairs = [_met(m, k) for m, k in zip(matches, rows)]
+        expected = sum(float(m.expected[k]) for m, k in zip(matches, rows))
         if _count(pairs) < _MISSED * expected:
             predicted = [
-                (np.flatnonzero(each.weights[k] > 0), each.places[k])
-                for each, k in zip(matches, rows)
+                (np.flatnonzero(m.weights[k] > 0), m.places[k]) for m, k in zip(matches, rows)
             ]
-            pairs = max(pairs, _shifted([view for _, view in own], predicted), key=_count)
-        for (f, view), met in zip(own, pairs):
+            pairs = max(pairs, _shifted([view for _, view in camera_frames], predicted), key=_count)
+        for (f, view), met in zip(camera_frames, pairs):
             if len(met[0]):
-                seen[f].append(Seen.by(view, met))
-    return seen
+                by_frame[f].append(CameraMatches.of(view, met))
+    return by_frame
 
 
-def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
-    """Features that were missed, with the nearest detection that belongs to none."""
-    found = []
+def nearest_to_missed(frames: Sequence[Posed]) -> list[list[CameraMatches]]:
+    """Match each missed feature to the nearest unclaimed detection, frame by frame."""
+    by_frame = []
     for views, pose in frames:
-        matches, own = pose.matches, list[Seen]()
+        matches, nearest = pose.matches, list[CameraMatches]()
         for view in filter(is_camera, views):
             if view.name not in matches.names:
                 continue
             k = matches.names.index(view.name)
             features = np.flatnonzero((matches.weights[k] > 0) & (matches.shares[k] <= 0.5))
-            taken = matches.detections[k, matches.shares[k] > 0.5]  # by which features are met
-            free = np.setdiff1d(np.arange(len(_pattern(view).points)), taken)
-            if len(features) and len(free):
-                near = _BESIDE * view.observation.sigma
-                away, at = cKDTree(_pattern(view).points[free]).query(
-                    matches.places[k, features], distance_upper_bound=near
+            claimed = matches.detections[k, matches.shares[k] > 0.5]
+            unclaimed = np.setdiff1d(np.arange(len(_pattern(view).points)), claimed)
+            if len(features) and len(unclaimed):
+                reach = _NEARBY * view.observation.sigma
+                distances, indices = cKDTree(_pattern(view).points[unclaimed]).query(
+                    matches.places[k, features], distance_upper_bound=reach
                 )
-                is_near = np.isfinite(away)
-                own.append(Seen.by(view, _pairs(view, features[is_near], free[at[is_near]])))
-        found.append(own)
-    return found
+                is_near = np.isfinite(distances)
+                pairs = _pairs(view, features[is_near], unclaimed[indices[is_near]])
+                nearest.append(CameraMatches.of(view, pairs))
+        by_frame.append(nearest)
+    return by_frame
 
 
 def is_camera(view: View) -> bool:
-    """Whether a view holds points in the image of a camera with a centre."""
+    """Test whether a view holds points in the image of a camera with a centre."""
     has_points = isinstance(view.observation.pattern, PointPattern)
     return has_points and isinstance(view.sensor, Camera)
 
@@ -267,6 +267,7 @@ def _count(pairs: Sequence[Pairs]) -> int:
 
 
 def _met(matches: Matches, k: int) -> Pairs:
+    """Return the features that sensor k met, with places of detections and noise."""
     features = np.flatnonzero(matches.shares[k] > 0.5)
     observed = matches.places[k, features] + matches.sigmas[k] * matches.offsets[k, features]
     deviations = np.sqrt(NOISE_OF_SIGMA**2 + matches.extra[k, features])
@@ -274,21 +275,21 @@ def _met(matches: Matches, k: int) -> Pairs:
 
 
 def _shifted(views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]) -> list[Pairs]:
-    """Features and the detections upon which one displacement of all brings them."""
+    """Pair features with detections by the one displacement of all views that pairs most."""
     detections, sensor = [_pattern(view).points for view in views], views[0].sensor
     assert isinstance(sensor, Camera)
     differences = np.concatenate(
         [(d[:, None] - y[None, i]).reshape(-1, 2) for d, (i, y) in zip(detections, predicted)]
     )
-    far = _AWAY * 2 * float(sensor.camera_matrix[0, 2])
-    differences = differences[np.linalg.norm(differences, axis=1) < far][:_DISPLACEMENTS]
+    farthest = _FARTHEST * 2 * float(sensor.camera_matrix[0, 2])
+    differences = differences[np.linalg.norm(differences, axis=1) < farthest][:_DISPLACEMENTS]
     trees, near = [cKDTree(d) for d in detections], _REACH * views[0].observation.sigma
 
     def hits(shift: Any) -> list[Pairs]:
-        found = []
-        for tree, view, (i, y) in zip(trees, views, predicted):
-            away, at = tree.query(y[i] + shift, distance_upper_bound=near)
-            found.append(_pairs(view, i[np.isfinite(away)], at[np.isfinite(away)]))
-        return found
+        pairs = []
+        for tree, view, (i, places) in zip(trees, views, predicted):
+            distances, nearest = tree.query(places[i] + shift, distance_upper_bound=near)
+            pairs.append(_pairs(view, i[np.isfinite(distances)], nearest[np.isfinite(distances)]))
+        return pairs
 
     return max(map(hits, differences), key=_count, default=[])

@@ -1,4 +1,4 @@
-"""Keys of a session that are odd by themselves, or find far too few or too many features."""
+"""Warn of odd keys of a session, and of keys that give far too few or too many features."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.body import LookAlike, congruent_parts, of_size
-from mixpose.checking.changes import called
-from mixpose.checking.evidence import anywhere, estimate_of
+from mixpose.checking.changes import quoted
+from mixpose.checking.evidence import estimate_of, without_start
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.placement import Camera, typical_poses
 from mixpose.errors import MixposeError
@@ -30,15 +30,15 @@ from mixpose.session import SensorSetup, Session
 _FEW = 0.6  # of the expected features: fewer are too few
 _SHARED, _OWN = "in [extract]", "in its own [sensor.extract]"
 _ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
-_MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
+_MANY, _MANY_MORE = 5.0, 20  # too many is more than this factor of the expected count, and surplus
 _OFF_CENTRE = 0.25  # of the image: lenses are centred better, crops and other sizes often are not
-_WIDEST = 0.05  # of an image: what is as wide hides how features of a body lie
-_NOISES = 3.0  # standard deviations that markers may be off each other
-_LEAST = 0.01  # of the smaller body's radius: nearer than this they are the same
+_WIDEST = 0.05  # of an image: a wider sigma hides how features of a body lie
+_NOISES = 3.0  # standard deviations within which markers of two bodies are congruent
+_LEAST = 0.01  # of the smaller body's radius: markers as near are always congruent
 
 
 def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
-    """Whether features are "too few" or "too many" for a body, `fewest` of which may be seen."""
+    """Say if a count of features is "too few" or "too many"; as few as `fewest` may be in view."""
     least = expected if fewest is None else fewest
     if count < min(_FEW * least, least - 1):
         return "too few"
@@ -48,55 +48,55 @@ def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
 def advice(
     session: Session, setup: SensorSetup, number: int, image: Image | None, expected: int
 ) -> str:
-    """What to change so that about as many features are found as the sensor should see of the body.
+    """Say which key to change so that about as many features are found as the sensor should see.
 
-    Each key is tried by itself on one image, and the body is looked for in what is found then: as
-    many features as it has may be clutter that is larger or brighter than it. Where the sensor has
-    detections and no image, nothing can be tried.
+    Each key is tried by itself on one image, and the body is searched for in the features: as many
+    as expected may still be clutter, larger or brighter than the body. Without an image, of a table
+    of detections, nothing can be tried.
     """
     options = setup.extract
     if image is None:
         return "the table of detections does not fit the body: look at its rows"
     if options.method not in METHODS:
         return f"look at what {options.method} returns"
-    frame = RawFrame(number, 0.0, image)  # late sensors need a time, of one frame any
-    before, _ = _found(session, setup, frame, {})
+    frame = RawFrame(number, 0.0, image)  # late sensors need a time; for one frame any will do
+    before, _ = _extracted(session, setup, frame, {})
     tried = _trials(options, image)
-    trials = [_Trial(k, v, *_found(session, setup, frame, {k: v})) for k, v in tried]
-    trials = [t for t in trials if t.found >= 0.9 * expected and judge(t.found, expected) is None]
-    # the rule that goes by each image comes first, as a number may suit this image alone
-    trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.found - expected)))
+    trials = [_Trial(k, v, *_extracted(session, setup, frame, {k: v})) for k, v in tried]
+    trials = [t for t in trials if t.points >= 0.9 * expected and judge(t.points, expected) is None]
+    # "auto" comes first: it adapts to each image, and a number may suit this image alone
+    trials.sort(key=lambda trial: (trial.value != "auto", abs(trial.points - expected)))
     if before > expected:
-        trials = [trial for trial in trials if trial.found <= 2 * expected]
-    # the body has to be found for sure: clutter may be ambiguous, too
-    chosen = next(
-        (t for t in trials if estimate_of(anywhere(session), number, t.views).status == "ok"), None
-    )
+        trials = [trial for trial in trials if trial.points <= 2 * expected]
+    # the body has to be found for sure: in clutter a pose may be ambiguous, too
+    anywhere = without_start(session)
+    sure = (t for t in trials if estimate_of(anywhere, number, t.views).status == "ok")
+    chosen = next(sure, None)
     if chosen is None and before < expected and trials:
-        chosen = trials[0]  # what finds more loses nothing, even where the body cannot be told
+        chosen = trials[0]  # more features do no harm, even if they do not show the body
     if chosen is not None:
         value = chosen.value
         written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
         where = setup.table_of(chosen.key)
-        return f"with {chosen.key} = {written} in {where} it would be {chosen.found}"
+        return f"with {chosen.key} = {written} in {where} it would be {chosen.points}"
     if before > expected:
-        left = [trial.found for trial in trials if trial.value == "auto"]
-        rule = f', nor with threshold = "auto", which leaves {left[0]}' if left else ""
+        by_auto = [trial.points for trial in trials if trial.value == "auto"]
+        rule = f', nor with threshold = "auto", which leaves {by_auto[0]}' if by_auto else ""
         return (
             f"with no value tried the body is found for sure{rule}; clutter is allowed for, and "
             "mixpose inspect shows what is found"
         )
     keys = {"corners": "method and threshold", "log": "polarity, threshold and spot_sigma"}
     change = keys.get(options.method, "polarity, threshold, min_area and max_area")
-    own = [key for key in re.findall(r"\w+", change) if key in setup.overridden]
-    beside = f", {' and '.join(own)} {_OWN}" if own else ""
+    own_keys = [key for key in re.findall(r"\w+", change) if key in setup.overridden]
+    tables = f", {' and '.join(own_keys)} {_OWN}" if own_keys else ""
     is_hidden = before > 0 and session.body.normals is None
     hidden = "; or give normals in [object], if the body hides some of them" if is_hidden else ""
-    return f"change {change} {_SHARED}{beside}{hidden}"
+    return f"change {change} {_SHARED}{tables}{hidden}"
 
 
-def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
-    """Warnings about some of so many sensors: a key is shared where all of them want one value."""
+def with_own_tables(warnings: Sequence[str], sensors: int) -> list[str]:
+    """Advise a sensor's own [sensor.extract] unless all of so many sensors need the same value."""
     values: dict[str, list[str]] = {}
     for warning in warnings:
         if advised := _ADVISED.search(warning):
@@ -111,11 +111,11 @@ def told_apart(warnings: Sequence[str], sensors: int) -> list[str]:
 
 
 class _Trial(NamedTuple):
-    """A key with another value, and what is found with it."""
+    """A key with another value, and the features found with it."""
 
     key: str
     value: Any
-    found: int
+    points: int
     views: list[View]
 
 
@@ -136,26 +136,26 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
     return [(key, value) for key, value in trials if getattr(options, key) != value]
 
 
-def _found(
+def _extracted(
     session: Session, setup: SensorSetup, frame: RawFrame, changed: dict[str, Any]
 ) -> tuple[int, list[View]]:
-    """How many points the sensor alone finds with other options; none where they are wrong."""
+    """Count the points of one sensor with changed options, and return its views; 0 on an error."""
     options, views = replace(setup.extract, **changed), list[View]()
     if options.max_area is None or options.max_area > options.min_area:
         alone = replace(session, sensors=(replace(setup, extract=options),))
         with suppress(MixposeError):
             views = observe(alone, FrameSet(frame.number, frame.time_s, {setup.name: frame}))
-    seen = [view.observation for view in views]
-    return sum(each.found for each in seen if each.points is not None), views
+    observations = [view.observation for view in views]
+    return sum(seen.found for seen in observations if seen.points is not None), views
 
 
 def key_warnings(session: Session) -> list[str]:
-    """What is most likely wrong about calibrations and widths; images have their recorded sizes."""
+    """Warn of calibrations, widths and lines, for a session with the sizes of recorded images."""
     return _off_centre(session) + _too_wide(session) + _lines_as_points(session)
 
 
 def _off_centre(session: Session) -> list[str]:
-    """Principal points far from the middle: a calibration of images of another size."""
+    """Warn of principal points far from the middle: a calibration of images of another size."""
     warnings = []
     for setup in session.sensors:
         sensor = setup.sensor
@@ -173,7 +173,7 @@ def _off_centre(session: Session) -> list[str]:
 
 
 def _too_wide(session: Session) -> list[str]:
-    """Widths in which the whole body disappears, or all that an image shows of it."""
+    """Warn of a sigma wider than the whole body, or than a twentieth of an image."""
     ranges, images = list[SensorSetup](), list[SensorSetup]()
     for setup in session.sensors:
         sigma, resolution = setup.extract.sigma, setup.resolution
@@ -198,8 +198,8 @@ def _too_wide(session: Session) -> list[str]:
 
 
 def _lines_as_points(session: Session) -> list[str]:
-    """Cameras of which points are taken that should see the lines of a body."""
-    bodies = [one.body.name for one in session.objects if not is_pointlike(one.body)]
+    """Warn of cameras that extract points, though a body has segments."""
+    bodies = [model.body.name for model in session.objects if not is_pointlike(model.body)]
     cameras = [
         setup.name
         for setup in session.sensors
@@ -208,14 +208,14 @@ def _lines_as_points(session: Session) -> list[str]:
     if not (bodies and cameras):
         return []
     return [
-        f"{called(bodies)}: segments are seen as lines of grey values, and {called(cameras)} "
+        f"{quoted(bodies)}: segments are seen as lines of grey values, and {quoted(cameras)} "
         f'{"gives" if len(cameras) == 1 else "give"} points: set method = "intensity" in '
         "[extract], of images, or give the ends of the lines as points"
     ]
 
 
 def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> list[str]:
-    """Pairs of sensors that read the same recording, some of which are `replaced` by name."""
+    """Warn of sensors that read the same recording; `replaced` has other recordings, by sensor."""
     read = {
         setup.name: {
             os.path.realpath(place) if os.path.exists(place) else place  # noqa: PTH110 - or an address
@@ -224,8 +224,8 @@ def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> lis
         for setup in session.sensors
     }
     warnings = []
-    for (a, own), (b, others) in combinations(read.items(), 2):
-        if both := own & others:
+    for (a, files_a), (b, files_b) in combinations(read.items(), 2):
+        if both := files_a & files_b:
             first = os.path.basename(min(both))  # noqa: PTH119 - of an address too
             files = first if len(both) == 1 else f"{len(both)} files ({first}, ...)"
             warnings.append(
@@ -236,28 +236,28 @@ def shared_source_warnings(session: Session, replaced: Mapping[str, str]) -> lis
 
 
 def shared_part_warnings(session: Session) -> list[str]:
-    """Pairs of bodies that are congruent within the noise, or whose largest such parts are."""
+    """Warn of bodies that are congruent within the noise, as a whole or in large parts."""
     warnings = list[str]()
     if len(session.objects) < 2:
         return warnings
     noise = _noise_length(session)
-    # one camera alone knows no size
+    # one camera alone does not see the size of a body
     is_alone = len(session.sensors) == 1 and session.sensors[0].model in ("pinhole", "fisheye")
-    for one, other in combinations([each.body for each in session.objects], 2):
-        factor = one.radius / other.radius if is_alone else 1.0
+    for body, other in combinations([model.body for model in session.objects], 2):
+        factor = body.radius / other.radius if is_alone else 1.0
         for size in dict.fromkeys((1.0, round(factor, 9))):
             resized = other if size == 1 else of_size(other, size)
-            least = _LEAST * min(one.radius, resized.radius)
-            reach = max(least, _NOISES * noise, one.spread, resized.spread)
-            parts = congruent_parts(one, resized, reach)
-            if parts and (size == 1 or len(parts[0].features) == len(one) == len(other)):
+            least = _LEAST * min(body.radius, resized.radius)
+            reach = max(least, _NOISES * noise, body.spread, resized.spread)
+            parts = congruent_parts(body, resized, reach)
+            if parts and (size == 1 or len(parts[0].features) == len(body) == len(other)):
                 warnings.append(_text(parts[0], session.unit, size))
                 break
     return warnings
 
 
 def _noise_length(session: Session) -> float:
-    """What markers err by in the world, where the bodies are about: the best of the sensors."""
+    """Return the noise of a marker in the world, near a typical pose, by the best sensor."""
     lengths = []
     for setup in session.sensors:
         if setup.sensor.dimension == 1:
@@ -273,22 +273,22 @@ def _noise_length(session: Session) -> float:
 
 
 def _text(part: LookAlike, unit: str, size: float) -> str:
-    one, other = part.body, part.other
+    body, other = part.body, part.other
     pairs = ", ".join(
-        f"{one.labels[i]} like {other.labels[j]}"
+        f"{body.labels[i]} like {other.labels[j]}"
         for i, j in zip(part.features, part.partners, strict=True)
     )
-    off = part.off if part.off > 1e-9 * one.radius else 0.0  # what is rounded
-    if len(part.features) == len(one) == len(other):
+    off = part.off if part.off > 1e-9 * body.radius else 0.0  # less is a rounding error
+    if len(part.features) == len(body) == len(other):
         resized, remedy = "", "give one [[object]] with count"
         if size != 1:
             resized, remedy = f", {size:.3g} times as large,", "add a sensor"
         return (
-            f"the bodies {one.name!r} and {other.name!r}{resized} are congruent to {off:.2g} "
+            f"the bodies {body.name!r} and {other.name!r}{resized} are congruent to {off:.2g} "
             f"{unit} (markers {pairs}): nothing tells them apart; {remedy}, or move a marker"
         )
     return (
-        f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
+        f"{len(part.features)} markers of {body.name!r} lie like {len(part.features)} of "
         f"{other.name!r} to {off:.2g} {unit} ({pairs}): where the others are hidden the one may be "
         "the other; expect ambiguous frames, or move a marker"
     )

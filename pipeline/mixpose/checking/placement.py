@@ -1,6 +1,6 @@
-"""Where sensors stand, where they look, and whether the body starts in their view.
+"""Check where sensors stand and look, and whether the body starts in their view.
 
-Where the session names no start, typical poses have the body in view, turned at random.
+If the session has no start, typical poses have the body in view, turned at random.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ Looking: TypeAlias = Camera | ParallelBeam
 
 _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
-_LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
-_LARGEST_M = 20.0  # in metres: what is larger than a lorry is hardly seen as one rigid body
-_SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
+_LENSES_APART_M = 3e-3  # two lenses do not fit nearer to each other
+_LARGEST_M = 20.0  # a lorry: larger things are hardly seen as one rigid body
+_SMALL = 3.0  # times sigma: a smaller image of a body shows no orientation
 _TRIED = 64
 
 
 def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
-    """Place in the world and viewing direction of a sensor, a line each."""
+    """Describe the place and the viewing direction of a sensor in the world."""
     sensor = setup.sensor
     if isinstance(sensor, RangeSensor):
         return [f"at {_numbers(sensor.position)} {unit} in the world"]
@@ -54,8 +54,8 @@ def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
 
 
 def placement_warnings(session: Session) -> list[str]:
-    """What is most likely wrong about where sensors and body are, a line each."""
-    warnings = _twins(session) + _too_large(session)
+    """Warn of what is most likely wrong about the poses of sensors and body, a line each."""
+    warnings = _coincident(session) + _too_large(session)
     if session.start is None:
         return warnings + _no_common_view(session)
     T = session.start.T_world_object
@@ -77,8 +77,8 @@ def placement_warnings(session: Session) -> list[str]:
     return warnings + hint
 
 
-def _twins(session: Session) -> list[str]:
-    """Sensors that stand at one place with one orientation."""
+def _coincident(session: Session) -> list[str]:
+    """Warn of sensors with the same place and orientation, or too near to each other."""
     warnings = []
     for a, b in combinations(session.sensors, 2):
         if isinstance(a.sensor, RangeSensor) and isinstance(b.sensor, RangeSensor):
@@ -88,9 +88,9 @@ def _twins(session: Session) -> list[str]:
                 )
         elif isinstance(a.sensor, Looking) and isinstance(b.sensor, Looking):
             T_a, T_b = a.sensor.T_sensor_world, b.sensor.T_sensor_world
-            apart = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
-            near = apart <= 1e-6 * max(session.body.radius, float(np.linalg.norm(T_a[:3, 3])))
-            if near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:
+            distance = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
+            is_near = distance <= 1e-6 * max(session.body.radius, float(np.linalg.norm(T_a[:3, 3])))
+            if is_near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:
                 warnings.append(
                     f"sensors {a.name!r} and {b.name!r} stand at one place and look the same way: "
                     "does one of them lack its T_sensor_world?"
@@ -101,7 +101,7 @@ def _twins(session: Session) -> list[str]:
 
 
 def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
-    """Cameras nearer to each other than their lenses allow: lengths in another unit."""
+    """Warn of cameras nearer to each other than lenses allow: lengths in another unit."""
     if not (isinstance(a.sensor, Camera) and isinstance(b.sensor, Camera)):
         return []
     apart = float(np.linalg.norm(_centre(a.sensor) - _centre(b.sensor)))
@@ -114,18 +114,18 @@ def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
 
 
 def _too_large(session: Session) -> list[str]:
-    """Bodies larger than any: lengths in another unit than the session says."""
-    sizes = {one.body.name: 2 * one.body.radius for one in session.objects}
+    """Warn of bodies larger than is likely: lengths in another unit than the session says."""
+    sizes = {model.body.name: 2 * model.body.radius for model in session.objects}
     return [
-        f"the body {name!r} is {float(f'{across:.3g}'):g} {session.unit} across: is unit = "
+        f"the body {name!r} is {float(f'{width:.3g}'):g} {session.unit} across: is unit = "
         f'"{session.unit}" that of points and translations?'
-        for name, across in sizes.items()
-        if across * session.metres_per_unit > _LARGEST_M
+        for name, width in sizes.items()
+        if width * session.metres_per_unit > _LARGEST_M
     ]
 
 
 def _no_common_view(session: Session) -> list[str]:
-    """Cameras that look apart, so that no place suits all of them."""
+    """Warn of cameras that have no common view of the body."""
     cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
     blind = _blind(session, cameras)
     if len(cameras) < 2 or not blind:
@@ -141,20 +141,20 @@ def _no_common_view(session: Session) -> list[str]:
 
 
 def _sizes(session: Session, cameras: list[SensorSetup]) -> str:
-    """Two lengths to compare, lest one of them is in another unit."""
+    """Name the size of the body and the spacing of cameras, which may be in two units."""
     places = [_centre(setup.sensor) for setup in cameras if isinstance(setup.sensor, Camera)]
-    apart = max((float(np.linalg.norm(a - b)) for a, b in combinations(places, 2)), default=0.0)
-    if apart == 0:
+    spacing = max((float(np.linalg.norm(a - b)) for a, b in combinations(places, 2)), default=0.0)
+    if spacing == 0:
         return ""
-    across, away = (f"{float(f'{length:.2g}'):g}" for length in (2 * session.body.radius, apart))
+    width, apart = (f"{float(f'{x:.2g}'):g}" for x in (2 * session.body.radius, spacing))
     return (
         ", and whether points of [object] and translations are in the same unit: the body is "
-        f"{across} {session.unit} across, the sensors {away} {session.unit} apart"
+        f"{width} {session.unit} across, the sensors {apart} {session.unit} apart"
     )
 
 
 def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
-    """Cameras that see nothing of the body at a typical pose."""
+    """Return the cameras that do not see the body at a typical pose."""
     poses = typical_poses(session, 1)
     if not poses:
         return cameras
@@ -162,13 +162,13 @@ def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
 
 
 def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> list[str]:
-    """A hint where the inverse of what is written would put the body in view."""
+    """Hint at a pose in the session whose inverse would put the body in view."""
     if not unseen:
         return []
     cameras = {s.name: s.sensor for s in session.sensors if isinstance(s.sensor, Looking)}
     placed = {n: s for n, s in cameras.items() if not np.allclose(s.T_sensor_world, np.eye(4))}
     names = {setup.name for setup in unseen}
-    # only where the inverse mends every camera, chance is no likely reason
+    # a hint only if it mends every camera: for one, it may be chance
     if placed and names.issuperset(placed):
         flipped = map(_with_inverse, placed.values())
         if all(_seen(sensor, session, T_start).all() for sensor in flipped):
@@ -176,9 +176,9 @@ def _inverted(session: Session, unseen: list[SensorSetup], T_start: Floats) -> l
                 "T_sensor_world looks inverted: with its inverse the body at [start] would be in "
                 f"view of {', '.join(map(repr, placed))}; {_MAPS}"
             ]
-    back = inverse(T_start)
+    T_inverse = inverse(T_start)
     if len(unseen) == len(session.sensors) and all(
-        _seen(sensor, session, back).all() for sensor in cameras.values()
+        _seen(sensor, session, T_inverse).all() for sensor in cameras.values()
     ):
         return [
             "start.T_world_object looks inverted: with its inverse the body would be in view of "
@@ -193,6 +193,7 @@ def _with_inverse(sensor: Sensor) -> Sensor:
 
 
 def _why_unseen(sensor: Sensor, session: Session, T_start: Floats) -> str:
+    """Say where the body is that a sensor does not see, and which keys to check."""
     points = transform(T_start, session.body.means)
     if not isinstance(sensor, Looking):
         return "out of reach: check position, range_min and the unit of lengths"
@@ -209,7 +210,7 @@ def _why_unseen(sensor: Sensor, session: Session, T_start: Floats) -> str:
 
 
 def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask) -> list[str]:
-    """A body of a few pixels: mostly two units of length in one file."""
+    """Warn of a body of a few pixels: mostly two units of length in one file."""
     if not isinstance(setup.sensor, Looking) or not seen.any():
         return []
     y, _ = setup.sensor.project(transform(T_start, session.body.means))
@@ -223,9 +224,9 @@ def _too_small(setup: SensorSetup, session: Session, T_start: Floats, seen: Mask
 
 
 def expected_count(setup: SensorSetup, session: Session) -> int:
-    """Features that a sensor should see in a frame: those in view at [start], if that is most.
+    """Return how many features a sensor should see: those in view at [start], if at least half.
 
-    Without [start], of a body with normals: the median over looks straight at one of its features.
+    Without [start], for a body with normals: the median over views straight at one of its features.
     """
     count, normals = len(session.body), session.body.normals
     if session.start is None:
@@ -240,7 +241,7 @@ def expected_count(setup: SensorSetup, session: Session) -> int:
 
 
 def fewest_count(setup: SensorSetup, session: Session) -> int:
-    """Features that a sensor should see at least: as `expected_count`, of the poorest side."""
+    """Return how many features a sensor should see at least, from the side that shows fewest."""
     normals = session.body.normals
     if normals is None or session.start is not None:
         return expected_count(setup, session)
@@ -248,7 +249,7 @@ def fewest_count(setup: SensorSetup, session: Session) -> int:
 
 
 def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:
-    """Which features (N,) are inside of a sensor's view."""
+    """Return which features (N,) are inside a sensor's view."""
     return np.asarray(sensor.project(transform(T_world_object, session.body.means))[1])
 
 
@@ -258,16 +259,15 @@ def _centre(sensor: Camera) -> Floats:
 
 def _numbers(values: Floats, digits: int = 4) -> str:
     largest = float(np.abs(values).max())
-    # what is a rounding error beside the largest is zero
+    # rounding errors, by the largest value, are shown as zero
     shown = (0.0 if abs(v) <= 1e-9 * largest else float(f"{v:.{digits}g}") for v in values)
     return f"({', '.join(f'{value:g}' for value in shown)})"
 
 
 def with_image_sizes(session: Session, sizes: Mapping[str, tuple[int, int] | None]) -> Session:
-    """A session whose cameras know the size of their images, as the recordings have them by name.
+    """Return a session whose cameras have the size of their images, those of recordings by name.
 
-    Where neither the session nor the recording says, the optical axis is taken to meet the middle
-    of the image.
+    If neither has it, the optical axis is assumed to meet the middle of the image.
     """
     setups = []
     for setup in session.sensors:
@@ -290,10 +290,10 @@ def _size_by_axis(sensor: Sensor) -> tuple[int, int] | None:
 
 
 def typical_poses(session: Session, count: int, *, away: float = 1.0) -> list[Floats]:
-    """Poses T_world_object in the sensors' common view, if any, those that show most features.
+    """Return poses T_world_object in the sensors' common view, if any, that show most features.
 
-    Every camera has a resolution. One alone is `away` times as far away as where the body fills
-    half of the image's smaller side.
+    Every camera has a resolution. A single camera is `away` times as far from the body as where it
+    fills half of the image's smaller side.
     """
     rotations = Rotation.random(_TRIED, rng=np.random.default_rng(0)).as_matrix()
     pivot = pivot_of(session.body)
@@ -313,5 +313,5 @@ def typical_poses(session: Session, count: int, *, away: float = 1.0) -> list[Fl
 
 
 def depends_on_distance(session: Session) -> bool:
-    """Whether nothing but the distance from one camera says how well poses are seen."""
+    """Test whether there is one camera only, so that accuracy depends on the distance from it."""
     return len(session.sensors) == 1 and isinstance(session.sensors[0].sensor, Camera)

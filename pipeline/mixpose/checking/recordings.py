@@ -1,4 +1,4 @@
-"""Read every frame of a sensor, and count what is found in images all over the recording."""
+"""Read every frame of a sensor, and count features in images all over the recording."""
 
 from __future__ import annotations
 
@@ -22,39 +22,39 @@ from mixpose.records import Floats, Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
-LISTED = 5  # frame numbers that are named
-_TELLING = 6  # numbers of a frame: fewer are those of the frame before by chance
-_QUICK = 5  # frames that are looked at where not all are
-# images of a sensor in which features are counted: to find them takes five times as long as to read
+LISTED = 5  # frame numbers listed in a message
+_TELLING = 6  # numbers in a frame: fewer may equal those of the frame before by chance
+_QUICK = 5  # frames of a quick survey
+# images of a sensor in which features are counted: finding them takes five times as long as reading
 # an image, and the median of so many is as good as that of all
 _COUNTED = 20
 
 Damage: TypeAlias = list[tuple[int | None, str]]
-"""Numbers of frames that cannot be read, as far as known, and why."""
+"""Numbers of frames that cannot be read, if known, and why."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What the frames of one sensor hold."""
+    """Counts and oddities of the frames of one sensor."""
 
     numbers: tuple[int, ...]  # frames that could be read, ascending
-    counted: tuple[int, ...]  # those of them in which features were looked for
-    # features found in each of these; None of grey values or profiles, which are not counted
+    counted: tuple[int, ...]  # frames in which features were extracted
+    # number of features in each of these; None for grey values and profiles, which have none
     counts: tuple[int, ...] | None
-    empty: tuple[int, ...]  # those of them without any feature, or of one value all over
+    empty: tuple[int, ...]  # counted frames without any feature, or with one value all over
     size: tuple[int, int] | None = None  # width and height of the images in px
     damage: tuple[str, ...] = ()  # why a frame could not be read, a line each
-    damaged: tuple[int, ...] = ()  # their numbers, as far as known
-    is_whole: bool = True  # whether all frames were looked at
+    damaged: tuple[int, ...] = ()  # numbers of these frames, if known
+    is_whole: bool = True  # whether all frames were read
     times: Mapping[int, float] = field(default_factory=dict)  # of frames that have one, in s
-    repeated: tuple[int, ...] = ()  # frames that show something, and the same as the one before
-    doubled: tuple[int, ...] = ()  # frames of a table in which a detection stands twice or more
-    # frames that were counted, with the points found in place of an image; none where too many
-    found: Mapping[int, RawFrame] = field(default_factory=dict)
+    repeated: tuple[int, ...] = ()  # frames that are not empty and equal the one before
+    doubled: tuple[int, ...] = ()  # frames of a table with a detection twice or more
+    # counted frames, with detections in place of the image; without any if there were too many
+    features: Mapping[int, RawFrame] = field(default_factory=dict)
 
     @property
     def typical_frame(self) -> int | None:
-        """A frame with about the median number of features."""
+        """Return a frame with about the median number of features."""
         if self.counts is None:
             return None
         middle = np.argsort(self.counts, kind="stable")[len(self.counts) // 2]
@@ -67,19 +67,19 @@ def survey(
     source: Source,
     *,
     quick: bool = False,
-    looked_at: Collection[int] | None = None,
+    to_count: Collection[int] | None = None,
     done: Callable[[], None] = lambda: None,
 ) -> Survey:
     """Read the frames of a sensor as a run would, past damaged images.
 
-    `quick` looks at a few frames only, as is always done of a stream, which has no end. Features
-    are searched for in the images of frames `looked_at`, None for all. `done` is called after each
-    frame. A `SessionError` if a function of the user's that extracts features fails.
+    `quick` reads a few frames only, as is always done for a stream, which has no end. Features are
+    extracted from the images of frames `to_count`, None for all. `done` is called after each
+    frame. Raises `SessionError` if a user's function that extracts features fails.
     """
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: Damage = []
     numbers, times, size = list[int](), dict[int, float](), None
-    counted, counts, found = list[int](), list[int](), dict[int, RawFrame]()
+    counted, counts, features = list[int](), list[int](), dict[int, RawFrame]()
     empty, doubled, repeated, before = list[int](), list[int](), list[int](), None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
@@ -95,15 +95,15 @@ def survey(
             before = shown
             if isinstance(data, np.ndarray):
                 size = (data.shape[1], data.shape[0])
-            elif isinstance(data, PointPattern) and has_twins(data.points):
+            elif isinstance(data, PointPattern) and has_duplicates(data.points):
                 doubled.append(number)
-            if not isinstance(data, np.ndarray) or looked_at is None or number in looked_at:
+            if not isinstance(data, np.ndarray) or to_count is None or number in to_count:
                 counted.append(number)
                 observation = observation_of(session, setup, frame)
                 pattern = observation.pattern
                 if isinstance(pattern, PointPattern):
                     counts.append(observation.found)
-                    found[number] = replace(frame, data=pattern)
+                    features[number] = replace(frame, data=pattern)
                     is_empty = not observation.found
                 else:
                     is_empty = not np.ptp(pattern.values)
@@ -122,35 +122,35 @@ def survey(
         times=times,
         repeated=tuple(repeated),
         doubled=tuple(doubled),
-        found=found,
+        features=features,
     )
 
 
-def some_of(sources: Mapping[str, Source]) -> set[int] | None:
-    """The same frames of all sensors that are enough to count features in; None for all."""
-    known = [found for source in sources.values() if (found := numbers_of(source))]
+def frames_to_count(sources: Mapping[str, Source]) -> set[int] | None:
+    """Choose the frames, the same for all sensors, in which to count features; None for all."""
+    known = [chosen for source in sources.values() if (chosen := numbers_of(source))]
     if not known:
         return None
     numbers = sorted(set.intersection(*known) or set.union(*known))
     return set(spread_over(numbers, _COUNTED))
 
 
-def has_twins(points: Floats) -> bool:
-    """Whether any two of points (n, m) are the same, to the last digit."""
+def has_duplicates(points: Floats) -> bool:
+    """Test whether any two of points (n, m) are the same, to the last digit."""
     return len(np.unique(points, axis=0)) < len(points)
 
 
 def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
-    """Tables whose detections stand there twice, and recordings whose times go back."""
+    """Warn of tables with repeated detections, and of recordings whose times go back."""
     warnings = []
-    for name, own in surveys.items():
-        if 2 * len(own.doubled) > len(own.numbers):  # ranges to a cm are the same now and then
+    for name, survey in surveys.items():
+        if 2 * len(survey.doubled) > len(survey.numbers):  # ranges in whole cm may coincide
             warnings.append(
                 f"sensor {name!r}: the same detection stands twice or more in "
-                f"{len(own.doubled)} of {len(own.numbers)} frames, as {own.doubled[0]}: are rows "
-                "of its table repeated? Each counts as a feature of its own"
+                f"{len(survey.doubled)} of {len(survey.numbers)} frames, as {survey.doubled[0]}: "
+                "are rows of its table repeated? Each counts as a feature of its own"
             )
-        ordered = sorted(own.times.items())
+        ordered = sorted(survey.times.items())
         back = [(k, b, a) for (_, a), (k, b) in pairwise(ordered) if b < a]
         if back:
             number, later, earlier = back[0]
@@ -162,14 +162,14 @@ def order_warnings(surveys: Mapping[str, Survey]) -> list[str]:
 
 
 def numbering_warnings(sources: Mapping[str, Source]) -> list[str]:
-    """Tables of times without numbers beside recordings with numbers, which tell no moments."""
+    """Warn of tables with times only, if other recordings are paired by frame number."""
     stamped = [
-        name for name, one in sources.items() if isinstance(one, DetectionTable) and one.stamps
+        name for name, src in sources.items() if isinstance(src, DetectionTable) and src.stamps
     ]
     others = [
         name
-        for name, one in sources.items()
-        if name not in stamped and not (isinstance(one, ImageSequence) and one.is_stamped)
+        for name, src in sources.items()
+        if name not in stamped and not (isinstance(src, ImageSequence) and src.is_stamped)
     ]
     if not others:
         return []
@@ -181,8 +181,8 @@ def numbering_warnings(sources: Mapping[str, Source]) -> list[str]:
 
 
 def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
-    """Sensors whose frames are taken with frames of other moments, as their times have it."""
-    timed = [(name, each.times) for name, each in surveys.items() if len(each.times) > 1]
+    """Warn of sensors whose frames are paired with frames of other moments, by their times."""
+    timed = [(name, survey.times) for name, survey in surveys.items() if len(survey.times) > 1]
     if len(timed) < 2:
         return []
     (first, known), *others = timed  # the time of a frame is that of the first sensor
@@ -190,8 +190,8 @@ def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
     usual = float(np.median(np.diff(list(known.values())) / np.diff(numbers)))
     warnings = []
     for name, times in others:
-        apart = np.array([abs(times[k] - known[k]) for k in times.keys() & known.keys()])
-        if len(apart) and (off := float(np.median(apart))) > usual:
+        gaps = np.array([abs(times[k] - known[k]) for k in times.keys() & known.keys()])
+        if len(gaps) and (off := float(np.median(gaps))) > usual:
             warnings.append(
                 f"sensor {name!r}: its frames are {off:.3g} s from those of {first!r} with the "
                 f"same number, and {first!r} has one every {usual:.3g} s: is fps or times of one "
@@ -201,18 +201,18 @@ def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Numbers of frames for people; of many how many there are."""
+    """List frame numbers in words; of many the first, and how many there are."""
     text = ", ".join(map(str, numbers[:LISTED]))
     return text if len(numbers) <= LISTED else f"{text}, ... ({len(numbers)} frames)"
 
 
 def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:
-    """Sensors that show the same as the frame before, while others do not."""
+    """Warn of sensors that repeat the frame before while others do not."""
     warnings = []
-    for name, own in surveys.items():
-        others = [one for other, one in surveys.items() if other != name]
-        changed = {n for one in others for n in {*one.numbers} - {*one.repeated}}
-        if frozen := [number for number in own.repeated if own.is_whole and number in changed]:
+    for name, survey in surveys.items():
+        others = [other for key, other in surveys.items() if key != name]
+        changed = {n for other in others for n in {*other.numbers} - {*other.repeated}}
+        if frozen := [n for n in survey.repeated if survey.is_whole and n in changed]:
             warnings.append(
                 f"sensor {name!r} shows the same as the frame before in frames {listed(frozen)}, "
                 "while others do not: frozen, or frames doubled?"
@@ -221,14 +221,14 @@ def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:
 
 
 def image_of(source: Source, number: int) -> Image | None:
-    """One image of a recording again; None where it holds something else."""
+    """Read one image of a recording; return None if it holds something else."""
     with closing(source.frames(number, number + 1)) as frames:
         frame = next(frames, None)
     return frame.data if frame is not None and isinstance(frame.data, np.ndarray) else None
 
 
 def _frames(source: Source, damage: Damage, *, quick: bool) -> Frames:
-    """The frames that can be read; what is said of the others is put into `damage`."""
+    """Yield the frames that can be read; append the errors of others to `damage`."""
     if isinstance(source, ImageSequence):
         frames = _images(source, damage, quick=quick)
     else:
@@ -245,7 +245,7 @@ def _whole(source: Source, damage: Damage) -> Iterator[RawFrame]:
 
 
 def _images(source: ImageSequence, damage: Damage, *, quick: bool) -> Iterator[RawFrame]:
-    """Each image by itself: after a damaged one the next can be read all the same."""
+    """Yield each image by itself: after a damaged one the next can still be read."""
     numbers = source.numbers
     for number in spread_over(numbers, _QUICK) if quick else numbers:
         try:

@@ -71,14 +71,14 @@ def check_session(request: CheckRequest) -> None:
     for table in session.objects:
         _say_object(report, session, table)
     surveys: dict[str, recordings.Survey] = {}
-    sample = None if quick else recordings.some_of(opened)
+    sample = None if quick else recordings.frames_to_count(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as tick:
         for setup in session.sensors:
             source = opened[setup.name]
             surveys[setup.name] = recordings.survey(
-                session, setup, source, quick=quick, looked_at=sample, done=partial(tick, advance=1)
+                session, setup, source, quick=quick, to_count=sample, done=partial(tick, advance=1)
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
@@ -88,7 +88,7 @@ def check_session(request: CheckRequest) -> None:
     placed = _of_geometry(placement.with_image_sizes(doubts.mended or session, sizes))
     report.lines += placed.lines
     if doubts.mended is None:
-        counts = keys.told_apart(report.count_warnings, len(session.sensors))
+        counts = keys.with_own_tables(report.count_warnings, len(session.sensors))
         report.warnings = [*counts, *report.warnings, *placed.warnings, *doubts.warnings]
         if doubts.unexplained and not (report.count_warnings or doubts.warnings):
             report.warnings.append(doubts.unexplained)
