@@ -241,10 +241,15 @@ def _without_outliers(
         reversed_track = replace(track.part(slice(None, None, -1)), times=-track.times[::-1])
         kept, reversed_result = _without_outliers_after_first(reversed_track, model, rules)
         if not kept.measured[-1]:
-            kept, later = _without_outliers_after_first(track.part(slice(1, None)), model, rules)
-            poses = np.concatenate([reversed_result.poses[-1:], later.poses])
-            covariances = np.concatenate([reversed_result.covariances[-1:], later.covariances])
-            measured = np.append(False, kept.measured)
+            # the next pose begins a track; filled frames before it are predicted, too
+            first = 1 + int(track.measured[1:].argmax())
+            kept, later = _without_outliers_after_first(
+                track.part(slice(first, None)), model, rules
+            )
+            before = slice(None, -first - 1, -1)
+            poses = np.concatenate([reversed_result.poses[before], later.poses])
+            covariances = np.concatenate([reversed_result.covariances[before], later.covariances])
+            measured = np.append(np.zeros(first, bool), kept.measured)
             result = replace(later, poses=poses, covariances=covariances)
             return replace(track, measured=measured), result
     return _without_outliers_after_first(track, model, rules)
