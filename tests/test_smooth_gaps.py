@@ -133,6 +133,18 @@ def test_a_body_that_rests_and_is_put_elsewhere_is_smoothed_on_both_sides() -> N
     assert squared_errors(truth, smooth.estimates).max() < 3.7  # of 6 numbers 99.9 %
 
 
+def test_frames_filled_in_behind_a_first_pose_that_is_wrong_are_where_later_ones_lead() -> None:
+    truth, covariance = swinging(60), covariance_of(0.1, 0.001)
+    lines = lines_of(measured(truth, covariance), covariance)
+    far = np.array([300.0, 200.0, 0.0, 0.5, 0.5, 0.0])
+    lines[0] = replace(lines[0], T_world_object=rigid.perturb(truth[0], far))
+    result = smooth_body([lines[0], *lines[4:]], fill_s=1.0, rules=QUICK)
+    assert (result.filled, result.refused) == (3, (0,))
+    poses = poses_of(result.estimates)[:5]
+    away = np.linalg.norm(poses[:, :3, 3] - truth[:5, :3, 3], axis=1)
+    assert away.max() < 3.0  # of 360 mm that the first pose is off
+
+
 def test_lost_frames_are_filled_at_their_own_times() -> None:
     truth, covariance = swinging(40), covariance_of(0.1, 0.001)
     lines = lines_of(measured(truth, covariance), covariance)

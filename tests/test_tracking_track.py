@@ -106,19 +106,36 @@ def test_a_sudden_turn_is_unlikely_but_no_surprise() -> None:
     assert at - turned == pytest.approx(3 * np.log(1 + 36 / 3), rel=0.02)
 
 
-def test_a_prediction_is_no_surer_than_the_pose_that_it_starts_from() -> None:
-    resting = followed(Track(), [TRUTH], 0, 0.0)
-    data = Tracker.create(EIGHT, EstimatorOptions()).data(resting, 1, 0.1, [])
-    unsure = np.repeat([0.01, np.radians(12.0)], 3)  # a turn that the frame left open
-    (after,) = follow(data, [(Branch(TRUTH, deviation=unsure), ())]).branches
-    (sure,) = follow(data, [(Branch(TRUTH), ())]).branches
-    assert after.uncertainty[3:] == pytest.approx(unsure[3:])
-    assert (sure.uncertainty[3:] < np.radians(2.0)).all()  # it did not move
-    assert after.uncertainty[:3] == pytest.approx(sure.uncertainty[:3])
+def test_what_a_frame_leaves_open_is_as_it_was_predicted() -> None:
+    resting = followed(followed(Track(), [TRUTH], 0, 0.0), [TRUTH], 1, 0.1)
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(resting, 2, 0.2, [])
+    predicted = data.predictions[0].uncertainty
+    turned = perturb(TRUTH, np.array([0.0, 0, 0, 0.5, 0, 0]))
+
+    def after(uncertainty: Floats) -> Branch:
+        return follow(data, [(Branch(turned, uncertainty=uncertainty), ())]).branches[0]
+
+    # a turn that is open a hundred times as far as it was predicted is predicted still
+    is_open = predicted * [1.0, 1.0, 1.0, 100.0, 100.0, 100.0]
+    unsure = after(is_open)
+    assert twist_between(TRUTH, unsure.T_world_object)[3:] == pytest.approx(
+        [0.5 / (1 + 100**2), 0.0, 0.0], abs=1e-9
+    )
+    assert (unsure.uncertainty[3:] < 1.01 * predicted[3:]).all()
+    # a pose that is sure stands where it is seen
+    assert twist_between(TRUTH, after(np.zeros(6)).T_world_object)[3:] == pytest.approx(
+        [0.5, 0.0, 0.0], abs=1e-9
+    )
+
+
+def test_a_first_pose_that_is_open_is_no_surer_in_the_next_frame() -> None:
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(Track(), 0, 0.0, [])
+    open_turn = np.repeat([0.0, np.radians(40.0)], 3)
+    (branch,) = follow(data, [(Branch(TRUTH, uncertainty=open_turn), ())]).branches
+    assert branch.uncertainty[3:] == pytest.approx(open_turn[3:])
     # never as unsure as a pose of which nothing is known
-    unsure = np.repeat([1e9, 1e9], 3)
-    (after,) = follow(data, [(Branch(TRUTH, deviation=unsure), ())]).branches
-    assert np.array_equal(after.uncertainty, data.flat_prior[1])
+    (branch,) = follow(data, [(Branch(TRUTH, uncertainty=np.full(6, 1e9)), ())]).branches
+    assert np.array_equal(branch.uncertainty, data.flat_prior[1])
 
 
 def test_how_far_a_prediction_erred_over_several_frames_counts_per_frame() -> None:

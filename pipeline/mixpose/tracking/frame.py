@@ -24,7 +24,7 @@ from mixpose.judgement import (
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
-from mixpose.rigid import inverse, transform, twist_between
+from mixpose.rigid import inverse, perturb, transform, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import ExpectedVelocity, MotionFilter, RandomWalk, at_rest, per_kind
@@ -363,6 +363,17 @@ def spread_in_image(frame: Frame, T_world_object: Floats) -> float:
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 
+def _fused(expected: Branch, T_world_object: Floats, deviation: Floats) -> tuple[Floats, Floats]:
+    """Return the pose (4, 4) and deviations (6,) by a prediction and a pose with deviations (6,).
+
+    A Kalman update, coordinate by coordinate.  A pose that a frame shows well stays as it is; a
+    turn that the frame leaves open is that of the prediction.
+    """
+    variance, off = deviation**2, twist_between(expected.T_world_object, T_world_object)
+    gain = 1 / (1 + variance / np.maximum(expected.uncertainty, 1e-300) ** 2)
+    return perturb(expected.T_world_object, gain * off), deviation * np.sqrt(gain)
+
+
 def follow(
     frame: Frame, poses: Sequence[tuple[Branch, Sequence[Floats] | None]], **known: Any
 ) -> Track:
@@ -377,6 +388,7 @@ def follow(
     is_timed = track.is_timed_as(frame.time_s)
     for pose, alike in poses:
         branch, T, deviation = pose, pose.T_world_object, pose.deviation
+        open_deviation = np.minimum(pose.uncertainty, frame.flat_prior[1])
         velocity, motion_filter, uncertainty = None, None, rules.unsteady * steady
         parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
         if parent is not None:  # of poses that look the same, the nearest to the parent
@@ -387,6 +399,10 @@ def follow(
             expected = next(after for before, after in ahead if before is parent)
             moved, is_other = _twist_since(parent, expected, T, frame, alike)
             parent = replace(parent, velocity=None, motion_filter=None) if is_other else parent
+            if branch.spread is None and not frame.is_timed and not is_other:
+                T, open_deviation = _fused(expected, T, open_deviation)
+                branch = replace(branch, T_world_object=T)
+                moved = twist_between(parent.T_world_object, T)
             if branch.spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)
                 walk = walk.joined(moved, body.radius, elapsed)
@@ -401,8 +417,8 @@ def follow(
                 motion_filter = parent.motion_filter.followed(moved, deviation, elapsed)
         if frame.is_timed:
             motion_filter = motion_filter or MotionFilter.begun(deviation, body.radius, rules)
-        # a prediction is no surer than the pose that it starts from, whose errors are in the change
-        uncertainty = np.minimum(np.maximum(uncertainty, deviation), frame.flat_prior[1])
+        # a prediction is no surer than the pose that it starts from
+        uncertainty = np.maximum(uncertainty, open_deviation)
         branch = replace(branch, velocity=velocity, uncertainty=uncertainty)
         branches.append(replace(branch, motion_filter=motion_filter))
     return replace(

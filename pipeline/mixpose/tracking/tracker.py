@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
+from mixpose.judgement import APART, LEAST_BELIEF, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
 from mixpose.rigid import from_parts
@@ -383,12 +383,15 @@ def _branches(
     Of single ranges, where frames are fused, unlikely poses too.
     """
     branches, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
+    # the share of explanations without a pose: then it is anywhere within its covariance
+    weights = [weight for pose, weight in verdict.kept if pose is best]
+    open_share = max(1 - verdict.confidence / max(sum(weights), LEAST_BELIEF), 0.0)
     unlikely = sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])
     for pose, weight in (*verdict.kept, *unlikely[: data.rules.ranges.modes]):
         # a pose that may be clutter counts as little in the next frame
         belief = weight * float(expit(pose.log_evidence))
         # a persistent error is that of the next frame too
-        variances = (pose.covariance - pose.persistent).diagonal()
+        variances = np.maximum((pose.covariance - pose.persistent).diagonal(), 0.0)
         spread = pose.spread if fuse else None
         T, second = pose.T_world_object, verdict.second
         other = data.log_odds_other_at(T)
@@ -399,8 +402,9 @@ def _branches(
         branch = Branch(
             T,
             belief,
+            np.sqrt(open_share * variances),
             spread=spread,
-            deviation=np.sqrt(np.maximum(variances, 0.0)),
+            deviation=np.sqrt(variances),
             log_odds_other=other,
         )
         is_new = pose.proposer == SECOND_POSE
