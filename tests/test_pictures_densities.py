@@ -18,7 +18,7 @@ from mixpose.frames import pair
 from mixpose.objective import ObjectiveName, View
 from mixpose.pictures.finding import find
 from mixpose.pictures.overlay import Part
-from mixpose.pictures.plots import objective_around, ranges_picture
+from mixpose.pictures.plots import Slice, objective_around, objective_picture, ranges_picture
 from mixpose.pictures.sheet import _heading, fitted_blurs
 from mixpose.pictures.stages import densities_picture, panels_of, shown_box
 from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame
@@ -53,6 +53,15 @@ def test_the_objective_peaks_at_the_pose_in_every_slice_and_map(
         row, column = np.unravel_index(surface.values.argmax(), surface.values.shape)
         assert abs(row - 20) <= 1  # of 41, half a blur apart at most
         assert abs(column - 20) <= 1
+
+
+def test_slices_of_a_single_free_direction_are_not_covered_by_empty_axes() -> None:
+    offsets = np.linspace(-1, 1, 241)
+    line = Slice(0, offsets, np.exp(-(offsets**2) / 0.02)[None])
+    picture = objective_picture([line], [], [1.0], None, "mm", 800)
+    # the curve of the last blur in viridis' dark end, drawn over some 100 px
+    dark = (np.abs(picture.astype(int) - picture.min(axis=2, keepdims=True)) > 40).any(axis=2)
+    assert np.count_nonzero(dark) > 100
 
 
 @pytest.mark.parametrize("objective", ["matched", "paper"])

@@ -94,6 +94,13 @@ def test_an_astertrack_target_has_a_marker_for_each_face_of_its_groups(tmp_path:
     np.testing.assert_allclose(markers.normals, [[0, 0, 1], [1, 0, 0]], atol=1e-12)
 
 
+def test_negative_corners_of_a_face_count_back_from_its_own_line(tmp_path: Path) -> None:
+    square = "v 0 {z} 0\nv 0 {z} 0.01\nv 0.01 {z} 0.01\nv 0.01 {z} 0\nf -4 -3 -2 -1\n"
+    content = "g FlatMarkers\n" + square.format(z=0) + square.format(z=0.05)
+    markers = read(tmp_path, "target.obj", content)
+    np.testing.assert_allclose(markers.points, [[5, 0, 5], [5, 50, 5]], atol=1e-9)
+
+
 WRONG = [
     ("a.rom", b"NID\0" + bytes(748), "not an NDI .rom file"),
     ("a.rom", rom(POINTS)[:300], "found 300 bytes; an NDI .rom file has 752"),

@@ -106,8 +106,9 @@ def objective_picture(
             axes.legend(fontsize=7, title="blur", title_fontsize=7, loc="upper right")
         else:
             axes.set_yticklabels([])
-    for axes, plane in zip(parts[-1].subplots(1, max(len(maps), 1), squeeze=False)[0], maps):
-        _plot_map(axes, plane, covariance, unit)
+    if maps:
+        for axes, plane in zip(parts[-1].subplots(1, len(maps), squeeze=False)[0], maps):
+            _plot_map(axes, plane, covariance, unit)
     return _raster(figure)
 
 

@@ -133,7 +133,9 @@ def read_astertrack(content: bytes) -> Markers:
         elif word in ("g", "o"):
             group = " ".join(cells)
         elif word == "f":
-            faces.append((group, number, _corners(cells, number)))
+            # negative corners count back from the face, behind which further vertices may come
+            corners = [k if k > 0 else len(vertices) + k + 1 for k in _corners(cells, number)]
+            faces.append((group, number, corners))
     if not vertices or not faces:
         raise BadKeyError("found no vertices (v) and faces (f), as a Wavefront .obj has them")
     groups = list(dict.fromkeys(group for group, *_ in faces))
@@ -163,7 +165,7 @@ def _corners(cells: list[str], line: int) -> list[int]:
 
 def _centre_and_normal(vertices: Floats, line: int, corners: list[int]) -> tuple[Floats, Floats]:
     count = len(vertices)
-    places = [corner - 1 if corner > 0 else count + corner for corner in corners]
+    places = [corner - 1 for corner in corners]
     if not all(0 <= place < count for place in places):
         raise BadKeyError(f"line {line}: names a vertex that is not there; the file has {count}")
     ring = vertices[places]
