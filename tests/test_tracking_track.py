@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bodies_in_view import TOOL, at, body, views_of
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 from rounding import rounding
@@ -24,7 +25,7 @@ from mixpose.rigid import from_rotation_vector, inverse, perturb, transform, twi
 from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker, predict
-from mixpose.tracking.frame import follow
+from mixpose.tracking.following import follow
 from mixpose.tracking.motion import MotionFilter, MotionRules, RandomWalk
 from mixpose.tracking.track import Branch
 
@@ -126,6 +127,20 @@ def test_what_a_frame_leaves_open_is_as_it_was_predicted() -> None:
     assert twist_between(TRUTH, after(np.zeros(6)).T_world_object)[3:] == pytest.approx(
         [0.5, 0.0, 0.0], abs=1e-9
     )
+
+
+def test_a_turn_that_a_frame_leaves_open_is_open_in_the_next_one() -> None:
+    bar = body("bar", np.array([[-50.0, 0, 0], [0, 0, 0], [60, 0, 0]]))  # turns about itself
+    solid = body("solid", TOOL)
+    for tracked, is_open in ((bar, True), (solid, False)):
+        tracker = Tracker.create(tracked, EstimatorOptions())
+        track = tracker.begin()
+        for frame in range(2):
+            views = views_of([tracked], [at(0.0)], frame)
+            track, found = tracker.advance(track, frame, None, views)
+        assert (found.status == "ok") != is_open
+        turns = track.branches[0].uncertainty[3:]
+        assert (np.degrees(turns.max()) > 15.0) == is_open
 
 
 def test_a_first_pose_that_is_open_is_no_surer_in_the_next_frame() -> None:

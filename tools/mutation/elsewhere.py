@@ -130,7 +130,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-the-least-motion-is-right",
-        "tracking/frame.py",
+        "tracking/following.py",
         "logs[1:] += math.log(rules.motion.surprise) if is_unsure else rules.acceptance.log_doubt",
         "logs[0] -= 1e9",
         "a board that moves by two squares is expected one square on",

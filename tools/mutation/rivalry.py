@@ -49,7 +49,7 @@ MUTANTS = (
     ),
     Mutant(
         "tracking-symmetric-rivals-turn-by-half-a-turn",
-        "tracking/frame.py",
+        "tracking/following.py",
         "T = nearest_alike(T, body, parent.T_world_object)",
         "T = T.copy()",
         "a rival of a symmetric board turns by half a turn from frame to frame",

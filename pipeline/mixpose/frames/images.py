@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import stat
 import struct
@@ -239,13 +240,14 @@ def _fault_of(data: bytes) -> str | None:
 
 def _pages(data: bytes) -> int:
     """Count the images of a TIFF file, without thumbnails; 1 if it is damaged."""
-    from tifffile import TiffFile, TiffFileError  # noqa: PLC0415 - takes 50 ms, for TIFF alone
+    from tifffile import TiffFile, TiffFileError, logger  # noqa: PLC0415 - slow, for TIFF alone
 
+    logger().setLevel(logging.CRITICAL)  # the decoder says what is wrong
     try:
         with TiffFile(io.BytesIO(data)) as file:
             return len(file.pages) - sum(bool(page.aspage().is_reduced) for page in file.pages)
     except (TiffFileError, ValueError, struct.error, IndexError):
-        return 1  # the decoder says what is wrong
+        return 1
 
 
 def _png_fault(data: bytes) -> str | None:

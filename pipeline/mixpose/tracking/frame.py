@@ -24,10 +24,10 @@ from mixpose.judgement import (
 from mixpose.matching import Matches, NoiseEstimate, log_likelihood, pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
-from mixpose.rigid import inverse, perturb, transform, twist_between
+from mixpose.rigid import transform, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
-from mixpose.tracking.motion import ExpectedVelocity, MotionFilter, RandomWalk, at_rest, per_kind
+from mixpose.tracking.motion import ExpectedVelocity, at_rest
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, mixed_prior
 
@@ -333,26 +333,6 @@ class Frame(Setup):
         return branch.motion_filter.expected(moved if seen else None, elapsed)
 
 
-def _twist_since(
-    parent: Branch, expected: Branch, T_world_object: Floats, frame: Frame, alike: Sequence[Floats]
-) -> tuple[Floats, bool]:
-    """Return the twist (6,) to a pose from the one before, and whether that was a look-alike.
-
-    The look-alike is chosen where the prediction makes it likelier, with the chance that it was
-    followed: `surprise`, or after an ok frame that of a wrong ok.
-    """
-    T_before, chosen = parent.T_world_object, 0
-    if alike:
-        like = np.concatenate([T_world_object[None], T_world_object @ np.array(alike)])
-        logs = expected.log_density(like, frame.free, frame.rules.motion)
-        is_unsure = frame.track.doubted or not frame.track.ok_count
-        rules = frame.rules
-        logs[1:] += math.log(rules.motion.surprise) if is_unsure else rules.acceptance.log_doubt
-        if chosen := int(logs.argmax()):
-            T_before = T_before @ inverse(alike[chosen - 1])
-    return twist_between(T_before, T_world_object), chosen > 0
-
-
 def spread_in_image(frame: Frame, T_world_object: Floats) -> float:
     """Return the largest deviation of features in view by the body's spread, in σ_ε."""
     projection = frame.finest.projection
@@ -361,73 +341,3 @@ def spread_in_image(frame: Frame, T_world_object: Floats) -> float:
     shares = (2 / projection.dimensions)[:, None] * images.seen[:, 0]
     variances = shares * in_image(frame.body.node_spreads(T_world_object), images.J[:, 0])
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
-
-
-def _fused(expected: Branch, T_world_object: Floats, deviation: Floats) -> tuple[Floats, Floats]:
-    """Return the pose (4, 4) and deviations (6,) by a prediction and a pose with deviations (6,).
-
-    A Kalman update, coordinate by coordinate.  A pose that a frame shows well stays as it is; a
-    turn that the frame leaves open is that of the prediction.
-    """
-    variance, off = deviation**2, twist_between(expected.T_world_object, T_world_object)
-    gain = 1 / (1 + variance / np.maximum(expected.uncertainty, 1e-300) ** 2)
-    return perturb(expected.T_world_object, gain * off), deviation * np.sqrt(gain)
-
-
-def follow(
-    frame: Frame, poses: Sequence[tuple[Branch, Sequence[Floats] | None]], **known: Any
-) -> Track:
-    """Return the track after a frame with poses, the best first, and further fields `known`.
-
-    With each pose come its look-alikes, motions (4, 4) of the body, one of which may have been
-    followed; None where the pose does not go on from the frame before.
-    """
-    track, body, rules = frame.track, frame.body, frame.rules.motion
-    elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
-    steady, branches = per_kind(body.radius, rules.steady), list[Branch]()
-    is_timed = track.is_timed_as(frame.time_s)
-    for pose, alike in poses:
-        branch, T, deviation = pose, pose.T_world_object, pose.deviation
-        open_deviation = np.minimum(pose.uncertainty, frame.flat_prior[1])
-        velocity, motion_filter, uncertainty = None, None, rules.unsteady * steady
-        parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
-        if parent is not None:  # of poses that look the same, the nearest to the parent
-            T = nearest_alike(T, body, parent.T_world_object)
-            branch = replace(branch, T_world_object=T)
-        if parent is not None and alike is not None:
-            ahead = zip(track.branches, frame.predictions, strict=True)
-            expected = next(after for before, after in ahead if before is parent)
-            moved, is_other = _twist_since(parent, expected, T, frame, alike)
-            parent = replace(parent, velocity=None, motion_filter=None) if is_other else parent
-            if branch.spread is None and not frame.is_timed and not is_other:
-                T, open_deviation = _fused(expected, T, open_deviation)
-                branch = replace(branch, T_world_object=T)
-                moved = twist_between(parent.T_world_object, T)
-            if branch.spread is not None and not branches:
-                walk = walk or RandomWalk.unknown(body, elapsed, rules)
-                walk = walk.joined(moved, body.radius, elapsed)
-            elif branch.spread is None and track.misses <= rules.coasting and is_timed:
-                velocity = moved / elapsed
-                last = parent.velocity
-                change = moved / 2 if last is None else moved - last * elapsed
-                # per frame, where the change was seen over several
-                change = np.abs(change / (1 + track.misses)).reshape(2, 3)
-                uncertainty = np.maximum(change.max(axis=1).repeat(3), steady)
-            if frame.is_timed and parent.motion_filter and elapsed <= rules.longest_s:
-                motion_filter = parent.motion_filter.followed(moved, deviation, elapsed)
-        if frame.is_timed:
-            motion_filter = motion_filter or MotionFilter.begun(deviation, body.radius, rules)
-        # a prediction is no surer than the pose that it starts from
-        uncertainty = np.maximum(uncertainty, open_deviation)
-        branch = replace(branch, velocity=velocity, uncertainty=uncertainty)
-        branches.append(replace(branch, motion_filter=motion_filter))
-    return replace(
-        track,
-        branches=tuple(branches),
-        frame=frame.frame,
-        time_s=frame.time_s,
-        misses=0,
-        walk=walk,
-        search=Track.search,
-        **known,
-    )

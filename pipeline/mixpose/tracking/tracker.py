@@ -22,7 +22,8 @@ from mixpose.search import is_pointlike
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.arguments import require_valid, start_pose
 from mixpose.tracking.doubt import decide_frame, log_odds_other
-from mixpose.tracking.frame import Frame, Setup, Start, follow
+from mixpose.tracking.following import follow
+from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, likelihood_of
 from mixpose.tracking.motion import per_kind
