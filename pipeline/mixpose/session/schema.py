@@ -161,9 +161,9 @@ class EstimatorTable(Table):
     0.999: one of a thousand may be wrong.
     Example: `confidence = 0.99`"""
     mirrors: bool = False
-    """Whether windows, polished tables or screens show the body as in a mirror.  A flat body looks
-    the same there, and is not `ok` until it is seen beside its image; of others the mirror image is
-    as likely as the body.
+    """Whether windows, polished tables or screens show the body as in a mirror.  A flat body whose
+    `normals` do not say which side is seen looks the same there, and is not `ok` until it is seen
+    beside its image; of others the mirror image is as likely as the body.
     Example: `mirrors = true`"""
 
 
