@@ -113,20 +113,25 @@ def test_what_a_frame_leaves_open_is_as_it_was_predicted() -> None:
     predicted = data.predictions[0].uncertainty
     turned = perturb(TRUTH, np.array([0.0, 0, 0, 0.5, 0, 0]))
 
-    def after(uncertainty: Floats) -> Branch:
-        return follow(data, [(Branch(turned, uncertainty=uncertainty), ())]).branches[0]
+    def after(left_open: Floats) -> Branch:
+        return follow(data, [(Branch(turned, left_open=left_open), ())]).branches[0]
 
     # a turn that is open a hundred times as far as it was predicted is predicted still
-    is_open = predicted * [1.0, 1.0, 1.0, 100.0, 100.0, 100.0]
-    unsure = after(is_open)
+    unsure = after(np.diag((predicted * [0.0, 0.0, 0.0, 100.0, 100.0, 100.0]) ** 2))
     assert twist_between(TRUTH, unsure.T_world_object)[3:] == pytest.approx(
         [0.5 / (1 + 100**2), 0.0, 0.0], abs=1e-9
     )
     assert (unsure.uncertainty[3:] < 1.01 * predicted[3:]).all()
     # a pose that is sure stands where it is seen
-    assert twist_between(TRUTH, after(np.zeros(6)).T_world_object)[3:] == pytest.approx(
-        [0.5, 0.0, 0.0], abs=1e-9
-    )
+    seen = after(np.zeros((6, 6))).T_world_object
+    assert twist_between(TRUTH, seen)[3:] == pytest.approx([0.5, 0.0, 0.0], abs=1e-9)
+    # one that is open along a line of sight alone goes on across it
+    line, shift = np.array([0.6, 0.0, 0.8]), np.array([8.0, 3.0, -6.0])  # at right angles
+    along = np.zeros((6, 6))
+    along[:3, :3] = 1e12 * np.outer(line, line)
+    away = Branch(perturb(TRUTH, np.array([*(shift + 500.0 * line), 0, 0, 0])), left_open=along)
+    (across,) = follow(data, [(away, ())]).branches
+    assert twist_between(TRUTH, across.T_world_object)[:3] == pytest.approx(shift, abs=1e-3)
 
 
 def test_a_turn_that_a_frame_leaves_open_is_open_in_the_next_one() -> None:
@@ -146,10 +151,10 @@ def test_a_turn_that_a_frame_leaves_open_is_open_in_the_next_one() -> None:
 def test_a_first_pose_that_is_open_is_no_surer_in_the_next_frame() -> None:
     data = Tracker.create(EIGHT, EstimatorOptions()).data(Track(), 0, 0.0, [])
     open_turn = np.repeat([0.0, np.radians(40.0)], 3)
-    (branch,) = follow(data, [(Branch(TRUTH, uncertainty=open_turn), ())]).branches
+    (branch,) = follow(data, [(Branch(TRUTH, left_open=np.diag(open_turn**2)), ())]).branches
     assert branch.uncertainty[3:] == pytest.approx(open_turn[3:])
     # never as unsure as a pose of which nothing is known
-    (branch,) = follow(data, [(Branch(TRUTH, uncertainty=np.full(6, 1e9)), ())]).branches
+    (branch,) = follow(data, [(Branch(TRUTH, left_open=1e18 * np.eye(6)), ())]).branches
     assert np.array_equal(branch.uncertainty, data.flat_prior[1])
 
 

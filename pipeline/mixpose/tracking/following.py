@@ -49,13 +49,12 @@ def _continued(
 ) -> tuple[Branch, Floats | None]:
     """Return the branch of a pose for the next frame, and the twist (6,) that led to the pose.
 
-    The deviations `pose.uncertainty` are of what the frame leaves open.  The twist is None where
-    the pose does not go on from the frame before.
+    The twist is None where the pose does not go on from the frame before.
     """
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, is_timed = track.elapsed(frame.frame, frame.time_s), track.is_timed_as(frame.time_s)
     steady, T, moved = per_kind(body.radius, rules.steady), pose.T_world_object, None
-    open_deviation = np.minimum(pose.uncertainty, frame.flat_prior[1])
+    left_open = np.minimum(np.sqrt(pose.left_open.diagonal().clip(0.0)), frame.flat_prior[1])
     velocity, motion_filter, uncertainty = None, None, rules.unsteady * steady
     parent = track.nearest(T, body) if track.frame is not None and elapsed > 0 else None
     if parent is not None:  # of poses that look the same, the nearest to the parent
@@ -66,7 +65,7 @@ def _continued(
         moved, is_other = _twist_since(parent, expected, T, frame, alike)
         parent = replace(parent, velocity=None, motion_filter=None) if is_other else parent
         if pose.spread is None and not frame.is_timed and not is_other:
-            T, open_deviation = _fused(expected, T, open_deviation)
+            T, left_open = _fused(expected, T, pose.left_open)
             moved = twist_between(parent.T_world_object, T)
         if pose.spread is None and track.misses <= rules.coasting and is_timed:
             velocity = moved / elapsed
@@ -84,7 +83,7 @@ def _continued(
         T_world_object=T,
         velocity=velocity,
         # a prediction is no surer than the pose that it starts from
-        uncertainty=np.maximum(uncertainty, open_deviation),
+        uncertainty=np.maximum(uncertainty, left_open),
         motion_filter=motion_filter,
     )
     return branch, moved
@@ -110,12 +109,15 @@ def _twist_since(
     return twist_between(T_before, T_world_object), chosen > 0
 
 
-def _fused(expected: Branch, T_world_object: Floats, deviation: Floats) -> tuple[Floats, Floats]:
-    """Return the pose (4, 4) and deviations (6,) by a prediction and a pose with deviations (6,).
+def _fused(expected: Branch, T_world_object: Floats, left_open: Floats) -> tuple[Floats, Floats]:
+    """Return the pose (4, 4) and deviations (6,) by a prediction and a pose of a covariance (6, 6).
 
-    A Kalman update, coordinate by coordinate.  A pose that a frame shows well stays as it is; a
-    turn that the frame leaves open is that of the prediction.
+    A Kalman update.  Directions that a frame shows well are as they are seen; a turn that it leaves
+    open is that of the prediction.
     """
-    variance, off = deviation**2, twist_between(expected.T_world_object, T_world_object)
-    gain = 1 / (1 + variance / np.maximum(expected.uncertainty, 1e-300) ** 2)
-    return perturb(expected.T_world_object, gain * off), deviation * np.sqrt(gain)
+    scale = np.maximum(expected.uncertainty, 1e-300)
+    variances, axes = np.linalg.eigh(left_open / scale / scale[:, None])
+    gains = 1 / (1 + variances.clip(0.0))  # in units of the prediction's uncertainty
+    off = twist_between(expected.T_world_object, T_world_object) / scale
+    twist = scale * (axes @ (gains * (off @ axes)))
+    return perturb(expected.T_world_object, twist), scale * np.sqrt(axes**2 @ (1 - gains))

@@ -41,6 +41,8 @@ class Branch:
     # (6,), of the pose itself, if as uncertain as its motion: the next frame takes the pose
     # as a prior, and no velocity is believed
     spread: Floats | None = None
+    # (6, 6), covariance of the pose by what its frame leaves open
+    left_open: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     # (6,), standard deviations of the pose itself, but for persistent errors
     deviation: Floats = field(default_factory=lambda: np.zeros(6))
     motion_filter: MotionFilter | None = None  # then gives the velocity at a moment

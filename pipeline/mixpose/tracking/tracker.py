@@ -392,7 +392,7 @@ def _branches(
         # a pose that may be clutter counts as little in the next frame
         belief = weight * float(expit(pose.log_evidence))
         # a persistent error is that of the next frame too
-        variances = np.maximum((pose.covariance - pose.persistent).diagonal(), 0.0)
+        momentary = pose.covariance - pose.persistent
         spread = pose.spread if fuse else None
         T, second = pose.T_world_object, verdict.second
         other = data.log_odds_other_at(T)
@@ -403,9 +403,9 @@ def _branches(
         branch = Branch(
             T,
             belief,
-            np.sqrt(open_share * variances),
             spread=spread,
-            deviation=np.sqrt(variances),
+            left_open=open_share * momentary,
+            deviation=np.sqrt(np.maximum(momentary.diagonal(), 0.0)),
             log_odds_other=other,
         )
         is_new = pose.proposer == SECOND_POSE
