@@ -333,13 +333,7 @@ def _observations(
     available = [(setup, frames[setup.name].data) for setup in setups if setup.name in frames]
     for setup, data in available:
         if isinstance(data, np.ndarray):
-            # a session file comes from anywhere: what it names is run only where that was allowed
-            if ":" in (method := setup.extract.method) and not session.allow_code:
-                raise SessionError(
-                    f'{session.path}: extract.method: "{method}" runs code of a module that the '
-                    "session names; if you trust it, add --allow-code (in Python: "
-                    "load_session(..., allow_code=True))"
-                )
+            _refuse_code(session, setup.extract.method)
             images[setup.name] = data, setup.extract, windows.get(setup.name)
     patterns = extract_together(images, base=session.folder)
     for setup, data in available:

@@ -142,7 +142,7 @@ _PREDICTION = (
     Mutant(
         "tracking-a-turn-left-open-is-known",
         "tracking/tracker.py",
-        "left_open=open_share * momentary,",
+        "left_open=verdict.open_share * momentary,",
         "left_open=0 * momentary,",
         "a turn that a frame left open is believed in the next one",
         (_TRACK,),

@@ -90,6 +90,12 @@ class Verdict:
         """Probability that the best pose is right and none of the alternatives."""
         return 0.0 if self.best is None else float(expit(-self._log_odds))
 
+    @property
+    def open_share(self) -> float:
+        """Share of the explanations that have no pose; then the best is within its covariance."""
+        weight = sum(weight for pose, weight in self.kept if pose is self.best)
+        return max(1 - self.confidence / max(weight, LEAST_BELIEF), 0.0)
+
     @cached_property
     def _log_odds(self) -> float:
         return float(np.logaddexp.reduce([other.log_odds for other in self.against]))

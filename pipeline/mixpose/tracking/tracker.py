@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import APART, LEAST_BELIEF, ClutterRates, ScoredPose, Verdict, insert
+from mixpose.judgement import APART, ClutterRates, ScoredPose, Verdict, insert
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, SensorReport, label_of
 from mixpose.rigid import from_parts
@@ -384,9 +384,6 @@ def _branches(
     Of single ranges, where frames are fused, unlikely poses too.
     """
     branches, fuse = list[tuple[Branch, list[Floats] | None]](), data.options.fuse
-    # the share of explanations without a pose: then it is anywhere within its covariance
-    weights = [weight for pose, weight in verdict.kept if pose is best]
-    open_share = max(1 - verdict.confidence / max(sum(weights), LEAST_BELIEF), 0.0)
     unlikely = sorted(verdict.faint if fuse else (), key=lambda pair: -pair[1])
     for pose, weight in (*verdict.kept, *unlikely[: data.rules.ranges.modes]):
         # a pose that may be clutter counts as little in the next frame
@@ -404,7 +401,7 @@ def _branches(
             T,
             belief,
             spread=spread,
-            left_open=open_share * momentary,
+            left_open=verdict.open_share * momentary,
             deviation=np.sqrt(np.maximum(momentary.diagonal(), 0.0)),
             log_odds_other=other,
         )
