@@ -64,7 +64,7 @@ def _continued(
         expected = next(after for before, after in ahead if before is parent)
         moved, is_other = _twist_since(parent, expected, T, frame, alike)
         parent = replace(parent, velocity=None, motion_filter=None) if is_other else parent
-        if pose.spread is None and not frame.is_timed and not is_other:
+        if pose.spread is None and not is_other:
             T, left_open = _fused(expected, T, pose.left_open)
             moved = twist_between(parent.T_world_object, T)
         if pose.spread is None and track.misses <= rules.coasting and is_timed:
