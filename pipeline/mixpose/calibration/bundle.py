@@ -101,7 +101,8 @@ def rows_of(bundle: Bundle, state: State, sensor: int, pairs: Pairs) -> Rows:
                 J = J * clock.elapsed[sensor, frame][:, None, None]
             by_rig[:, :, block.place] = J
         else:
-            by_rig[:, :, block.place] = parameter_jacobian(geometry, block.kind, world, by_world)
+            J = parameter_jacobian(geometry, block.kind, world, by_world)
+            by_rig[:, :, block.place] = J * (frame >= block.since)[:, None, None]
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
         by_held = calibration_shifts(perturbed(geometry, bundle.errors[sensor]), world)

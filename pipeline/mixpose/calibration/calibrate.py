@@ -12,13 +12,18 @@ from mixpose.calibration.adjust import Adjusted, adjust, deviations_by_held, fit
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.gauge import gauge_rows
 from mixpose.calibration.latecomers import place_camera
-from mixpose.calibration.profile import Contradiction, find_contradiction, with_profiled_lenses
+from mixpose.calibration.profile import (
+    FEWEST,
+    Contradiction,
+    find_contradiction,
+    with_profiled_lenses,
+)
 from mixpose.calibration.recorded import folds_of
 from mixpose.calibration.rig import Block, Kind, Rig, State, blocks_of, centre_of, kinds_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.searching import posed_frames, search_cameras
 from mixpose.calibration.start import Start, start_from_cameras, starts_together
-from mixpose.calibration.task import Known, Progress, Task, silent
+from mixpose.calibration.task import Known, Progress, SeenFrame, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
 from mixpose.sensors import CalibrationError, CloudSensor
@@ -229,20 +234,44 @@ class _Run:
         }
 
     def contradicted(self) -> Contradiction | None:
-        """Return the held parameters that the recording contradicts most."""
+        """Return what the recording contradicts most: what is held, or that no sensor moved."""
         sizes = {"length": self._length, "interval": self._interval}
-        return find_contradiction(self._bundle(self._last_start), self._adjustment, **sizes)
+        held = find_contradiction(self._bundle(self._last_start), self._adjustment, **sizes)
+        return held if held is not None and held.frames else self._elsewhere() or held
+
+    def _elsewhere(self) -> Contradiction | None:
+        """Return the camera that stands elsewhere in frames in which it meets little, if any."""
+        start, best, rules = self._last_start, self._adjustment, self._rules
+        unmet = result.unmet_frames(best, start.frames, self._task, rules.least_met)
+        for s in self._linked():
+            rows = np.flatnonzero(unmet[:, s])
+            frames = [start.frames[row] for row in rows]
+            state = best.state._replace(poses=best.state.poses[rows])
+            if len(frames) >= FEWEST and self._place(s, state, frames, best.noise) is not None:
+                name, numbers = self._task.rig.names[s], (frames[0].number, frames[-1].number)
+                return Contradiction((name,), frames=numbers)
+        return None
+
+    def _linked(self) -> list[int]:
+        """Return the cameras whose poses are known."""
+        return [s for s in self._task.cameras if s not in self._unlinked]
+
+    def _place(
+        self, sensor: int, state: State, frames: Sequence[SeenFrame], noise: Floats
+    ) -> Floats | None:
+        """Place a camera by poses of the body; a cloud, without lines of sight, is not placed."""
+        if isinstance(state.rig.sensors[sensor], CloudSensor):
+            return None
+        linked = self._linked()
+        return place_camera(self._task, state, sensor, linked, frames, noise, self._rules)
 
     def _with_latecomers(self, start: Start, noise: Floats) -> Start:
         """Return the start with unlinked cameras placed, as far as possible, by its poses."""
         numbers = {frame.number: frame for frame in self._task.frames}
         frames = tuple(numbers[frame.number] for frame in start.frames)  # with all detections
-        linked = [s for s in self._task.cameras if s not in self._unlinked]
         rig, unplaced = start.state.rig, list[int]()
         for s in self._unlinked:
-            T = None
-            if not isinstance(rig.sensors[s], CloudSensor):  # a cloud has no lines of sight
-                T = place_camera(self._task, start.state, s, linked, frames, noise, self._rules)
+            T = self._place(s, start.state, frames, noise)
             if T is None:
                 unplaced.append(s)
             else:

@@ -5,24 +5,32 @@ length.  So a parameter is held some of its deviations off, poses and all other 
 fitted again, and the fall of the likelihood is compared with what a deviation means (S. S. Wilks,
 Ann. Math. Statist. 9 (1938) 60).
 
-Whether the recording contradicts held parameters (the body, lenses, delays, biases of ranges) is a
-score test: at the maximum the gradient by held parameters is 0 but for errors of detections.
+Whether the recording contradicts held parameters (the body, lenses, delays, biases of ranges), or
+that each sensor stands where it stood in the first frame, is a score test: at the maximum the
+gradient by held parameters, or by a pose from some frame on, is 0 but for errors of detections.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from mixpose.calibration.adjust import Adjusted, final_weights, fit_pairs, variance_ratio
-from mixpose.calibration.bundle import Bundle, normal_equations
+from mixpose.calibration.bundle import Bundle, Weighted, normal_equations, rows_of
 from mixpose.calibration.rig import Block, Kind, Rig, blocks_of, kinds_of, moved
+from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
 
 _LENSES = ("focal", "principal_point", "distortion")
 _WIDER, _TIMES = 10.0, 4  # largest factor of one widening, and number of widenings
+FEWEST = 4  # frames in which a sensor stands elsewhere: fewer are bad ones
+_MOMENTS = 9  # frames from which a change of a sensor is tried, before the best of them is refined
+_LEFT = 0.1  # of a change's evidence: what it leaves of others, else it is not the only change
+_CHANCE = float(chi2.isf(1e-3, 6))  # what changes of any pose have by chance: a hundred are tried
+_ALIKE = 2 * np.log(1e6)  # of chi-square: changes that explain as much as the likeliest
 
 
 def with_profiled_lenses(bundle: Bundle, adjusted: Adjusted) -> Adjusted:
@@ -65,33 +73,90 @@ def _misfit_at(bundle: Bundle, adjusted: Adjusted, k: int, step: Floats) -> tupl
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Held parameters that the recording contradicts."""
+    """What a calibration takes for right, and the recording contradicts."""
 
-    name: str  # as of --free
-    parameter: str  # with the most significant score by itself
-    deviations: float  # standard deviations by which freeing it moves free parameters
+    # kind of held parameters, as of --free; or sensors one of which changed its pose, none if no
+    # single change explains what differs
+    names: tuple[str, ...]
+    parameter: str = ""  # with the most significant score by itself
+    deviations: float = 0.0  # standard deviations by which freeing it moves free parameters
+    frames: tuple[int, int] | None = None  # first and last number of those with another pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Score:
+    """The score of a block of parameters that are not free."""
+
+    block: Block
+    squared: float  # chi-square distributed if the parameters are right
+    freedom: int
+    moves: float  # standard deviations by which a step of the block moves free parameters
+    parameter: str
+
+    @property
+    def worth(self) -> float:
+        """Return Akaike's measure of what freeing the block explains."""
+        return self.squared - 2 * self.freedom
+
+    def contradicts(self, rules: CalibrationRules) -> bool:
+        """Test whether the block is not right, by more than deviations of free parameters tell."""
+        by_chance = chi2.sf(self.squared, max(self.freedom, 1))
+        return bool(by_chance < rules.by_chance and self.moves > 1)
 
 
 def find_contradiction(
     bundle: Bundle, adjusted: Adjusted, *, length: float, interval: float
 ) -> Contradiction | None:
-    """Return the kind of held parameters, tested one by one, that the recording contradicts most.
+    """Return what the recording contradicts most: held parameters, or that no sensor moved.
 
     None if no contradiction is significant and moves a parameter by more than its deviation.
-    Sensors whose errors are stated are not tested. `length` and `interval` are as of `blocks_of`.
+    Held parameters of sensors whose errors are stated are not tested. `length` and `interval` are
+    as of `blocks_of`.
     """
-    rules, count, state = bundle.rules, bundle.count, adjusted.state
+    state, rules = adjusted.state, bundle.rules
+    known = replace(bundle, errors={})
+    weighted, _ = final_weights(known, state, adjusted.noise)
     held = _blocks_held(bundle, adjusted, length, interval)
-    wide = replace(bundle, blocks=(*bundle.blocks, *held), errors={})
-    weighted, _ = final_weights(wide, state, adjusted.noise)
-    S, _, b, _ = normal_equations(wide, weighted, 0.0)
+    poses = _pose_blocks(adjusted, length)
+    changes = _likeliest_changes(known, adjusted, weighted, poses)
+    scores = [s for s in _scores(known, adjusted, weighted, held) if s.contradicts(rules)]
+    changes = [s for s in changes if s.contradicts(rules)]
+    if not scores and not changes:
+        return None
+    worst = max([*scores, *changes], key=lambda score: score.worth)
+    block = worst.block
+    if not block.since:
+        sensor_name = "" if block.sensor is None else f"{state.rig.names[block.sensor]}:"
+        return Contradiction((f"{sensor_name}{block.kind}",), worst.parameter, worst.moves)
+    frames = bundle.frames[block.since].number, bundle.frames[-1].number
+    freed = replace(known, blocks=(*known.blocks, replace(block, start=bundle.count)))
+    others = _likeliest_changes(freed, adjusted, weighted, poses)
+    if max(score.squared for score in others) > max(_LEFT * worst.squared, _CHANCE):
+        return Contradiction((), worst.parameter, worst.moves, frames)
+    alike = [s.block.sensor for s in changes if s.worth > worst.worth - _ALIKE]
+    names = tuple(state.rig.names[s] for s in alike if s is not None)
+    return Contradiction(names, worst.parameter, worst.moves, frames)
+
+
+def _scores(
+    bundle: Bundle, adjusted: Adjusted, weighted: Sequence[Weighted], blocks: Sequence[Block]
+) -> list[_Score]:
+    """Return the scores of blocks which follow the free ones."""
+    rules, count, rig = bundle.rules, bundle.count, adjusted.state.rig
+    wide = replace(bundle, blocks=(*bundle.blocks, *blocks))
+    rows = [
+        (rows_of(wide, adjusted.state, s, known.pairs), weight)
+        for s, (known, weight) in enumerate(weighted)
+    ]
+    S, _, b, _ = normal_equations(wide, rows, 0.0)
     scales = wide.scales
     S, b = S * np.outer(scales, scales), b * scales
     inverse = np.linalg.pinv(S[:count, :count], rcond=1e-10, hermitian=True)
-    deviations = np.sqrt(np.diag(adjusted.covariance)) / scales[:count]
-    ratio = variance_ratio(state.rig, rules) * adjusted.inflation
-    largest, worst = 0.0, None
-    for block in held:
+    free = len(adjusted.covariance)
+    deviations = np.sqrt(np.diag(adjusted.covariance)) / scales[:free]
+    ratio = variance_ratio(rig, rules) * adjusted.inflation
+    scores = []
+    for block in blocks:
         along = inverse @ S[:count, block.place]
         information = S[block.place, block.place] - S[block.place, :count] @ along
         values, vectors = np.linalg.eigh(information)
@@ -99,16 +164,48 @@ def find_contradiction(
         V = vectors[:, kept]
         score = b[block.place] - along.T @ b[:count]
         step = V @ ((V.T @ score) / values[kept])
-        squared = float(score @ step) / ratio
-        shares = np.abs(along @ step)[deviations > 0] / deviations[deviations > 0]
-        moves = float(shares.max(initial=0.0))
-        is_significant = chi2.sf(squared, V.shape[1]) < rules.by_chance if V.size else False
-        if is_significant and moves > 1 and squared > largest:
-            scores = score**2 / np.maximum(np.diag(information), 1e-300)
-            name = "" if block.sensor is None else f"{state.rig.names[block.sensor]}:"
-            parameter = block.names[int(np.argmax(scores))]
-            largest, worst = squared, Contradiction(f"{name}{block.kind}", parameter, moves)
-    return worst
+        shares = np.abs(along[:free] @ step)[deviations > 0] / deviations[deviations > 0]
+        likeliest = np.argmax(score**2 / np.maximum(np.diag(information), 1e-300))
+        squared, moves = float(score @ step) / ratio, float(shares.max(initial=0.0))
+        scores.append(_Score(block, squared, V.shape[1], moves, block.names[int(likeliest)]))
+    return scores
+
+
+def _likeliest_changes(
+    bundle: Bundle, adjusted: Adjusted, weighted: Sequence[Weighted], poses: Sequence[Block]
+) -> list[_Score]:
+    """Return the score of each pose from the frame on in which it changed most likely.
+
+    None of a recording with too few frames before or after any.
+    """
+    changes = []
+    for pose in poses:
+        first, last, width = FEWEST, len(bundle.frames) - FEWEST, len(pose.names)
+        while first <= last:
+            moments = np.unique(np.linspace(first, last, _MOMENTS).astype(int))
+            starts = bundle.count + width * np.arange(len(moments))
+            blocks = [
+                replace(pose, start=int(start), since=int(moment))
+                for start, moment in zip(starts, moments, strict=True)
+            ]
+            best = max(_scores(bundle, adjusted, weighted, blocks), key=lambda s: s.squared)
+            apart = int(np.diff(moments).max(initial=1)) - 1
+            if not apart:
+                changes.append(best)
+                break
+            moment = best.block.since
+            first, last = max(first, moment - apart), min(last, moment + apart)
+    return changes
+
+
+def _pose_blocks(adjusted: Adjusted, length: float) -> tuple[Block, ...]:
+    """Return blocks of the poses, or positions, of all sensors that meet anything."""
+    kinds: dict[int, tuple[Kind, ...]] = {
+        s: tuple(kind for kind in kinds_of(sensor) if kind in ("pose", "position"))
+        for s, sensor in enumerate(adjusted.state.rig.sensors)
+        if len(adjusted.weighted[s][1])
+    }
+    return blocks_of(adjusted.state.rig, kinds, body=False, length=length, interval=1.0)
 
 
 def _blocks_held(bundle: Bundle, adjusted: Adjusted, length: float, interval: float) -> list[Block]:

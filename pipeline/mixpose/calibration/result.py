@@ -20,7 +20,7 @@ from mixpose.calibration.profile import Contradiction
 from mixpose.calibration.rig import Block, Rig, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import SeenFrame, Task
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError
 
@@ -105,10 +105,21 @@ def _matchable_counts(frames: Sequence[SeenFrame], task: Task) -> Floats:
     return np.array([[min(len(f.points.get(s, ())), features) for s in sensors] for f in frames])
 
 
+def _met_counts(adjusted: Adjusted, frames: Sequence[SeenFrame]) -> Floats:
+    """Count met detections (K, L) by frame and sensor."""
+    rows = [np.bincount(r.pairs.frame, w > MET, len(frames)) for r, w in adjusted.weighted]
+    return np.array(rows, dtype=np.float64).T
+
+
 def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
     """Return the share (K,) of matchable detections met in each frame, by all sensors together."""
-    met = sum(np.bincount(r.pairs.frame, w > MET, len(frames)) for r, w in adjusted.weighted)
+    met = _met_counts(adjusted, frames).sum(axis=1)
     return np.asarray(met / np.maximum(_matchable_counts(frames, task).sum(axis=1), 1))
+
+
+def unmet_frames(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task, least: float) -> Mask:
+    """Test (K, L) in which frames a sensor meets a smaller share than `least` of what it could."""
+    return np.asarray(_met_counts(adjusted, frames) < least * _matchable_counts(frames, task))
 
 
 def explained_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:

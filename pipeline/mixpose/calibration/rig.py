@@ -104,6 +104,7 @@ class Block:
     names: tuple[str, ...]
     units: tuple[str, ...]  # of "length", "rad", "px", "s" and ""
     scales: tuple[float, ...]  # sizes, in `units`, to which standard deviations are compared
+    since: int = 0  # index of the first frame in which they act
 
     @property
     def place(self) -> slice:

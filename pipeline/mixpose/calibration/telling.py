@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mixpose.calibration import result
+from mixpose.calibration.profile import Contradiction
 from mixpose.calibration.result import HELD_LENS, Calibration, Displacement
 from mixpose.calibration.rig import Block, Rig, centre_of, values_of
 from mixpose.calibration.rules import CalibrationRules
@@ -101,13 +102,8 @@ def doubts_of(calibration: Calibration, unit: str) -> list[str]:
             f"by the length that is known the body is {scale:.3g} times as large as the session "
             "has it: is it the distance of these two, in the session's unit?"
         )
-    held = calibration.contradicted
-    if held is not None:
-        doubts.append(
-            f"the recording contradicts what is held of {held.name}, most of all {held.parameter}: "
-            f"freed, it would move what was found by {held.deviations:.2g} deviations, which do "
-            f"not know of it; add --free {held.name} to what is free"
-        )
+    if calibration.contradicted is not None:
+        doubts.append(_contradiction(calibration.contradicted))
     for sensor in calibration.doubtful(rules):
         doubts.append(
             f"{rig.names[sensor]}: {100 * calibration.explained[sensor]:.0f} % of its detections "
@@ -122,6 +118,30 @@ def doubts_of(calibration: Calibration, unit: str) -> list[str]:
                 "or too alike; record more"
             )
     return doubts + _doubt_of_size(calibration)
+
+
+def _contradiction(contradicted: Contradiction) -> str:
+    """Say what the recording contradicts, and what to do."""
+    name, deviations = " or ".join(contradicted.names), f"{contradicted.deviations:.2g} deviations"
+    if contradicted.frames is not None:
+        first, last = contradicted.frames
+        if not name:
+            return (
+                "what frames tell changes in the course of the recording by more than deviations "
+                f"know of, most of all with frame {first}: a body that bends, a lens that is off, "
+                "sensors that drift or were bumped more than once"
+            )
+        off = f"What was found is off by {deviations} or so, which do not know of it. "
+        return (
+            f"{name} stands elsewhere in frames {first} to {last} than in the others: was it "
+            f"bumped? {off * bool(contradicted.deviations)}Record anew, or calibrate from those "
+            "frames or the others alone"
+        )
+    return (
+        f"the recording contradicts what is held of {name}, most of all {contradicted.parameter}: "
+        f"freed, it would move what was found by {deviations}, which do not know of it; add --free "
+        f"{name} to what is free"
+    )
 
 
 def _doubt_of_size(calibration: Calibration) -> list[str]:
