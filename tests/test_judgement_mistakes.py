@@ -218,3 +218,28 @@ def test_a_camera_that_a_pose_does_not_follow_tells_of_no_lenses(
         track, found = tracker.advance(track, 1, None, views)
         assert found.status == "ok"
         assert LENS not in track.mistaken
+
+
+@pytest.mark.parametrize(("degrees", "noise"), [(0.08, 0.05), (0.15, 0.1)])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_turned_by_little_amid_a_recording_is_told_by_a_few_frames(
+    pinhole_cameras: list[PinholeCamera], degrees: float, noise: float, seed: int
+) -> None:
+    """Larger noise would explain each frame, but not that all of them ask for the same turn."""
+    exact, since, rng = pinhole_cameras[:2], 12, np.random.default_rng(seed)
+    turn = np.radians(degrees) * rng.choice([-1.0, 1.0], 3) / np.sqrt(3)
+    T_turned = from_rotation_vector(turn, [0.1, -0.1, 0.0]) @ exact[1].T_sensor_world
+    turned_by_little = [exact[0], replace(exact[1], T_sensor_world=T_turned)]
+    tracker = Tracker.create(body(), EstimatorOptions())
+    track, phases, estimates = tracker.begin(), rng.uniform(0, 2 * np.pi, 6), list[Estimate]()
+    for frame in range(3 * since):
+        step = np.array([15.0, 15.0, 15.0, 0.3, 0.3, 0.3]) * np.sin(0.15 * frame + phases)
+        T = TRUTH @ from_rotation_vector(step[3:], step[:3])
+        seen_by = turned_by_little if frame >= since else exact
+        views = detect(seen_by, body(), T, noise=noise, seed=100 * seed + frame)
+        views = [replace(view, sensor=camera) for view, camera in zip(views, exact, strict=True)]
+        track, estimate = tracker.advance(track, frame, frame / 30, views)
+        estimates.append(estimate)
+    assert {estimate.status for estimate in estimates[:since]} == {"ok"}
+    assert {estimate.status for estimate in estimates[since + 2 :]} == {"ambiguous"}
+    assert sum(estimate.doubt == APART for estimate in estimates[since + 2 :]) >= 3

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature, thickness
 from mixpose.fit import EstimatorOptions
+from mixpose.judgement import Mistake
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
@@ -153,12 +154,12 @@ def test_what_frames_say_against_a_mirrored_body_holds_in_those_that_say_nothing
         views = detect(pinhole_cameras, body, TRUTH, noise=0.2, seed=frame)
         track, estimate = tracker.advance(track, frame, None, views)
         assert estimate.status == "ok"
-        told.append(track.mistaken[MIRROR_IMAGE])
+        told.append(track.mistaken[MIRROR_IMAGE].log_odds)
     # as sure as one session in 2e-4² may be, at the most
     assert told == pytest.approx([2 * np.log(2e-4)] * 5)
     # and four markers in a plane, which are their own mirror image, are not asked any more
     views = detect(pinhole_cameras, plane, TRUTH, noise=0.2, seed=5)
-    doubted = replace(track, mistaken={MIRROR_IMAGE: 1.0})
+    doubted = replace(track, mistaken={MIRROR_IMAGE: Mistake(MIRROR_IMAGE, MIRROR_IMAGE, 1.0, 0.0)})
     odds = 1.0 + np.log(2e-4)
     for known, share in ((track, 0.0), (doubted, 1 / (1 + np.exp(-odds)))):
         _, estimate = tracker.advance(known, 5, None, views)

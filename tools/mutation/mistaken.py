@@ -32,9 +32,25 @@ MUTANTS = (
     Mutant(
         "judgement-what-frames-told-of-a-session-is-forgotten",
         "judgement/mistakes.py",
-        "before.get(name, 0.0)",
-        "0.0 * before.get(name, 0.0)",
+        "log_mistaken + max(known.log_odds, 0.0)",
+        "log_mistaken",
         "a body known to be too large is ok where one camera alone sees it",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-sensors-stand-otherwise-in-each-frame",
+        "judgement/mistakes.py",
+        "if log_mistaken > alone[0] or pose.residual_ratio > 1:",
+        "if False:",
+        "a camera turned by a tenth of a degree is believed once its residuals pass for noise",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-turns-of-sensors-are-about-the-body",
+        "judgement/mistakes.py",
+        "to_origin[:3, 3:] = np.cross(np.eye(3), centre)",
+        "to_origin[:3, 3:] = 0",
+        "what a body tells of a turned camera is not found again where it has gone",
         ("test_judgement_mistakes.py",),
     ),
     Mutant(

@@ -98,7 +98,7 @@ MUTANTS = (
     Mutant(
         "tracking-contradictions-are-forgotten",
         "tracking/doubt.py",
-        "before = track.mistaken.get(CONTRADICTION, 0.0)",
+        "before = track.log_odds_mistaken(CONTRADICTION)",
         "before = 0.0",
         "of two cameras that contradicted each other one alone is believed in the next frame",
         (_RIVALS,),
@@ -106,7 +106,7 @@ MUTANTS = (
     Mutant(
         "tracking-contradictions-of-second-poses-are-forgotten",
         "tracking/doubt.py",
-        "mistaken = {**mistaken, CONTRADICTION: _even_odds(data)}",
+        "mistaken = {**mistaken, CONTRADICTION: mistake}",
         "mistaken = {**mistaken}",
         "the same, where the other camera was asked alone",
         (_RIVALS,),

@@ -15,6 +15,7 @@ from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.judge import ScoredPose
+from mixpose.judgement.mistakes import Mistake
 from mixpose.judgement.noise import NoiseModel
 from mixpose.judgement.shape import Shape
 from mixpose.matching import LEAST_VARIANCE, Matches
@@ -81,8 +82,8 @@ class Verdict:
     # by sensor: unclaimed detections among which the body was searched a second time
     tried: Mapping[str, int] = field(default_factory=dict)
     second: Second | None = None  # None where it was not searched
-    # log odds of mistakes in the session, by name; None where they were not computed
-    mistaken: Mapping[str, float] | None = None
+    # mistakes in the session, by name; None where they were not computed
+    mistaken: Mapping[str, Mistake] | None = None
     shape: Shape | None = None  # evidence of the body's shape so far, while no frame was ok
 
     @cached_property

@@ -16,14 +16,17 @@ of a kind, which may leave the pose in place.
 
 What one frame shows of a session holds in later ones, which may not show it: log odds add up from
 frame to frame, and never fall below those of a session of which nothing is known (E. S. Page,
-Continuous inspection schemes, Biometrika 41, 1954).
+Continuous inspection schemes, Biometrika 41, 1954).  From a frame on whose residuals are larger
+than chance makes, a sensor that stands otherwise stays so: the posterior of its γ is the prior of
+the next frame.  A camera that was turned by a tenth of a degree is so told by two or three frames,
+where noise explains each alone as well.  What was wrong before belongs to the usual residuals.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -43,6 +46,25 @@ SIZE = "the body seems to be of another size"
 LENS = "lenses seem to be others than the session tells"
 
 
+Noise: TypeAlias = tuple[Floats, float, Floats]
+"""Residuals (R,), their degrees of freedom, and variances of noise that are tried."""
+
+
+class Sizes(NamedTuple):
+    """The sizes of a mistake: of a sensor a twist of the world, as it sees it."""
+
+    mean: Floats  # (w,)
+    covariance: Floats  # (w, w)
+
+    def times(self, M: Floats) -> Sizes:
+        """Return the sizes in other coordinates, by a matrix (w, w)."""
+        return Sizes(M @ self.mean, M @ self.covariance @ M.T)
+
+    def first(self, count: int) -> Sizes:
+        """Return the first of the sizes."""
+        return Sizes(self.mean[:count], self.covariance[:count, :count])
+
+
 class Mistake(NamedTuple):
     """Something in the session that may be wrong."""
 
@@ -50,6 +72,11 @@ class Mistake(NamedTuple):
     what: str  # in words
     log_odds: float  # for it, by the frames so far
     log_harm: float  # log probability that it puts this pose outside its ellipsoid
+    lasting: Sizes | None = None  # of a sensor since some frame; about the world's origin
+
+
+NOTHING = Mistake("", "", 0.0, -math.inf)
+"""What is known of a mistake before any frame."""
 
 
 def odds_of_mistakes(mistakes: Sequence[Mistake], likely: Sequence[float]) -> list[float]:
@@ -71,11 +98,11 @@ def possible_mistakes(
     free: Mask,
     model: NoiseModel,
     sensors: Mapping[str, Sensor],
-    before: Mapping[str, float],
+    before: Mapping[str, Mistake],
 ) -> Iterator[Mistake]:
     """Yield mistakes that frames make likelier than they were before any frame.
 
-    `sensors` are by name, without motion; `before` are log odds by `Mistake.name`, above zero.
+    `sensors` are by name, without motion; `before` are those of the frames before by name.
     """
     matches, (chosen,) = pose.used, free.nonzero()
     # one sensor shows neither where it stands nor how large a body is
@@ -83,7 +110,7 @@ def possible_mistakes(
         return
     names = _names_of(matches)
     for name in before.keys() - {*names}:
-        yield Mistake(name, APART, before[name], -math.inf)
+        yield before[name]._replace(log_harm=-math.inf)
     noise = pose.variances[:, None]
     shares = matches.shares * matches.coordinate_weight[:, None] * noise / (noise + matches.extra)
     is_off = model.errors.are_off(matches, noise + matches.extra)
@@ -103,7 +130,7 @@ def _mistakes(
     chosen: Indices,  # directions that are free
     model: NoiseModel,
     sensors: Mapping[str, Sensor],
-    before: Mapping[str, float],
+    before: Mapping[str, Mistake],
     asked: Sequence[str],  # names of mistakes
     shares: Floats,  # (L, N) weights of features
 ) -> Iterator[Mistake]:
@@ -117,16 +144,20 @@ def _mistakes(
     # noise from a hundredth of σ_ε to twice that
     s2 = np.asarray(1e-4 * 1.6 ** np.arange(24))
     noise = r, float(met @ matches.dimensions) - len(chosen), s2
-    columns, stated = _columns(pose, body, rows, met, model), _stated(pose, body, roots, rows)
+    deviations = _deviations(pose, rows, met, model)
     lenses = roots * _by_lenses(pose, body, model, sensors)
-    columns = _widened(columns, lenses)
+    columns = _widened(_columns(pose, body, rows, deviations, model), lenses)
+    stated = _stated(pose, body, roots, rows)
     remaining, stated = columns - J @ (to_pose @ columns), stated - J @ (to_pose @ stated)
     numbers = [k for k, name in enumerate(names) if name in asked]
     columns_of_asked = remaining[[0, *(k + 1 for k in numbers)]]
     log_usual, *mistaken = evidence_of(_joined(columns_of_asked, stated), *noise)[0].tolist()
-    known = [before.get(name, 0.0) for name in names]
     # a mistake that is not likelier by itself is not likelier together with fields
-    likelier = [k for k, log in zip(numbers, mistaken, strict=True) if log + known[k] > log_usual]
+    likelier = [
+        k
+        for k, log in zip(numbers, mistaken, strict=True)
+        if log + (known := before.get(names[k], NOTHING)).log_odds > log_usual or known.lasting
+    ]
     if not likelier:
         return
     fields = _fields(matches, shares, columns[1, :, :1])
@@ -141,17 +172,67 @@ def _mistakes(
     shift, moves = pulled @ residuals, to_pose @ columns
     moves[2:-1] = pulled @ columns[2:-1]
     for k in likelier:
+        known, is_sensor = before.get(names[k], NOTHING), names[k] not in (SIZE, LENS)
         # a sensor that stands otherwise absorbs the usual errors of its lens
-        is_sensor = names[k] not in (SIZE, LENS)
         layers = slice(len(usual) // 2 if is_sensor else None)
-        logs, means, spreads = evidence_of(_joined(usual[layers], remaining[k + 1]), *noise)
-        best, moved, width = logs.argmax(), moves[k + 1], columns.shape[2]
-        off = is_sensor * shift - moved @ means[best, -width:]
-        by_mistake = moved @ spreads[best, -width:, -width:] @ moved.T + np.outer(off, off)
-        gained = float(np.logaddexp.reduce(logs) - np.logaddexp.reduce(logs_usual[layers]))
+        X, explained = remaining[k + 1], usual[layers]
+        log_mistaken, sizes = _fitted(X, explained, noise)
+        log_mistaken, lasting = log_mistaken + max(known.log_odds, 0.0), None
+        if is_sensor:
+            to_origin = _about_origin(pose.T_world_object[:3, 3]) * deviations[k - 1]
+            alone = log_mistaken, sizes.first(6)
+            log_mistaken, sizes = _lasting(X[:, :6], explained, noise, known, to_origin, alone)
+            if log_mistaken > alone[0] or pose.residual_ratio > 1:
+                lasting = sizes.times(to_origin)
+        moved = moves[k + 1][:, : len(sizes.mean)]
+        off = is_sensor * shift - moved @ sizes.mean
+        by_mistake = moved @ sizes.covariance @ moved.T + np.outer(off, off)
         outside = _outside(float(np.vdot(inverse, by_mistake)), len(chosen), 1 - model.by_chance)
+        log_odds = log_mistaken - float(np.logaddexp.reduce(logs_usual[layers]))
         what = APART if is_sensor else names[k]
-        yield Mistake(names[k], what, known[k] + gained, outside[is_sensor])
+        yield Mistake(names[k], what, log_odds, outside[is_sensor], lasting)
+
+
+def _lasting(
+    X: Floats,
+    usual: Floats,
+    noise: Noise,
+    known: Mistake,
+    to_origin: Floats,  # (6, 6): from sizes to a twist about the world's origin
+    alone: tuple[float, Sizes],
+) -> tuple[float, Sizes]:
+    """Return `alone`, or evidence and sizes of a sensor that stays as frames before tell it."""
+    if known.lasting is None:
+        return alone
+    prior = known.lasting.times(np.asarray(np.linalg.inv(to_origin)))
+    log_mistaken, sizes = _fitted(X, usual, noise, prior)
+    return max(alone, (known.log_odds + log_mistaken, sizes), key=lambda pair: pair[0])
+
+
+def _fitted(
+    X: Floats, usual: Floats, noise: Noise, prior: Sizes | None = None
+) -> tuple[float, Sizes]:
+    """Return the log evidence of a mistake (R, w) beside usual errors (K, R, p), and its sizes.
+
+    The prior of its sizes has deviations of 1 if left out.
+    """
+    r, degrees, s2 = noise
+    width, root = X.shape[1], np.eye(X.shape[1])
+    if prior is not None:
+        values, axes = np.linalg.eigh(prior.covariance)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+    prior = prior or Sizes(np.zeros(width), root)
+    logs, means, spreads = evidence_of(_joined(usual, X @ root), r - X @ prior.mean, degrees, s2)
+    best = logs.argmax()
+    more = Sizes(means[best, -width:], spreads[best, -width:, -width:]).times(root)
+    return float(np.logaddexp.reduce(logs)), Sizes(prior.mean + more.mean, more.covariance)
+
+
+def _about_origin(centre: Floats) -> Floats:
+    """Return the matrix (6, 6) from twists about a place (3,) to those about the origin."""
+    to_origin = np.eye(6)
+    to_origin[:3, 3:] = np.cross(np.eye(3), centre)
+    return to_origin
 
 
 def _names_of(matches: Matches) -> list[str]:
@@ -172,23 +253,32 @@ def _outside(squared: float, directions: int, chance: float) -> tuple[float, flo
     return math.log(max(often, 1e-300)), 0.0 if is_likely else -math.inf
 
 
-def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: NoiseModel) -> Floats:
+def _deviations(pose: ScoredPose, rows: Floats, met: Floats, model: NoiseModel) -> Floats:
+    """Return prior deviations (S, 6) of the twist of the body as each moved sensor sees it."""
+    used, by_sensor = pose.used, rows.reshape(len(met), -1, 2, 6)
+    S = len(used.images)
+    squares = used.summed(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)))
+    moved = np.sqrt(squares / np.maximum(used.summed(met), 1e-9))
+    deviations = np.full((S, 6), model.turned)
+    deviations[:, :3] = (model.shifted / np.maximum(moved, 1e-9))[:, None]
+    return deviations
+
+
+def _columns(
+    pose: ScoredPose, body: Body, rows: Floats, deviations: Floats, model: NoiseModel
+) -> Floats:
     """Return how residuals change with mistakes (S + 2, R, 6), weighted as rows (R, 6).
 
     Times their deviations: of none; of the body's size, in the first column; of each moved sensor.
     """
     used, T = pose.used, pose.T_world_object
-    S, L = len(used.images), len(met)
+    S, L = len(deviations), len(used.names)
     columns, by_sensor = np.zeros((S + 2, *rows.shape)), rows.reshape(L, -1, 2, 6)
     away = (body.nodes.points @ T[:3, :3].T)[..., None]
     columns[1, :, 0] = model.turned * (by_sensor[..., :3] @ away).ravel()
-    squares = used.summed(np.square(by_sensor[..., :3]).sum(axis=(1, 2, 3)))
-    moved = np.sqrt(squares / np.maximum(used.summed(met), 1e-9))
-    deviations = np.full((S, 1, 6), model.turned)
-    deviations[..., :3] = (model.shifted / np.maximum(moved, 1e-9))[:, None, None]
-    deviations *= S > 1  # a single sensor does not show where it stands
-    by_twist = rows.reshape(L, -1, 6) * deviations[used.owner]
-    columns[2:].reshape(S, L, -1, 6)[used.owner, range(L)] = by_twist
+    if S > 1:  # a single sensor does not show where it stands
+        by_twist = rows.reshape(L, -1, 6) * deviations[used.owner][:, None]
+        columns[2:].reshape(S, L, -1, 6)[used.owner, range(L)] = by_twist
     return columns
 
 

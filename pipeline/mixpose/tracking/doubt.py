@@ -77,20 +77,34 @@ def decide_frame(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     rules, views = data.rules, data.static_views or data.views
     tracked = _contradiction_mistake(data, best), reflection_mistake(data, best)
     names = {mistake.name for mistake in tracked}
-    before = {name: odds for name, odds in data.track.mistaken.items() if name not in names}
+    before = {name: mistake for name, mistake in data.track.mistaken.items() if name not in names}
     known = rules.judgement.noise, {view.name: view.sensor for view in views}, before
     mistakes = [*possible_mistakes(best, data.body, data.free, *known), *tracked]
-    # a single frame may mislead as rarely as a session is mistaken
-    most = _largest_log_odds(data)
-    mistaken = {
-        mistake.name: max(min(mistake.log_odds, most), -most)
-        for mistake in mistakes
-        if mistake.log_odds > 0 or mistake.name == MIRRORED
-    }
     against = _alternatives(data, best, mistakes, evidence)
-    # lasting mistakes show in usual frames; an unusual frame may be a doubled image, for example
-    is_usual = best.residual_ratio <= rules.acceptance.changed
-    return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
+    return replace(verdict, mistaken=_mistaken_after(data, best, mistakes)).doubted(against)
+
+
+def _mistaken_after(
+    data: Frame, best: ScoredPose, mistakes: Sequence[Mistake]
+) -> dict[str, Mistake]:
+    """Return what is known of mistakes in the session after a frame, by name."""
+    before = data.track.mistaken
+    if best.residual_ratio > data.rules.acceptance.changed:
+        # an unusual frame, which may be a doubled image, for example, tells sizes alone
+        sizes = {mistake.name: mistake for mistake in mistakes if mistake.lasting}
+        known = {
+            name: min(sizes[name].log_odds, data.track.log_odds_mistaken(name)) for name in sizes
+        }
+        return {**before, **{name: sizes[name]._replace(log_odds=known[name]) for name in sizes}}
+    # a single frame may mislead as rarely as a session is mistaken
+    most, least = _largest_log_odds(data), -_even_odds(data)
+    return {
+        mistake.name: mistake._replace(log_odds=max(min(mistake.log_odds, most), -most))
+        for mistake in mistakes
+        if mistake.log_odds > 0
+        or mistake.name == MIRRORED
+        or (mistake.lasting and mistake.log_odds > least)
+    }
 
 
 def _contrast(a: ScoredPose, b: ScoredPose) -> str:
@@ -214,7 +228,7 @@ def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     elsewhere, and lasts until two agree.  A pose between them is farther off than by chance.
     """
     track, rules = data.track, (data.rules.acceptance, data.rules.judgement.noise)
-    before = track.mistaken.get(CONTRADICTION, 0.0)
+    before = track.log_odds_mistaken(CONTRADICTION)
     if is_seen_elsewhere(judged, _noise_before(data, judged), track.sensors_agreed, *rules):
         before = _even_odds(data)
     elif before and has_two_agreeing(judged, *rules):
@@ -225,7 +239,8 @@ def _contradiction_mistake(data: Frame, judged: ScoredPose) -> Mistake:
 def contradicted(data: Frame, verdict: Verdict) -> Verdict:
     """Return the verdict, doubted because a sensor sees the body elsewhere than the best pose."""
     mistaken = data.track.mistaken if verdict.mistaken is None else verdict.mistaken
-    mistaken = {**mistaken, CONTRADICTION: _even_odds(data)}
+    mistake = Mistake(CONTRADICTION, APART, _even_odds(data), 0.0)
+    mistaken = {**mistaken, CONTRADICTION: mistake}
     return replace(verdict, mistaken=mistaken).doubted([Alternative(APART)])
 
 
@@ -241,7 +256,7 @@ def reflection_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     mirror in the scene shows it in one frame and not in another.
     """
     track, lasts = data.track, not data.options.mirrors
-    before = track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
+    before = track.log_odds_mistaken(MIRRORED) if lasts else 0.0
     is_early = track.ok_count < data.rules.proposals.believed
     is_asked = before > 0 or (lasts and is_early and before > -_largest_log_odds(data))
     odds = _log_odds_reflected(data, judged, is_asked, before)

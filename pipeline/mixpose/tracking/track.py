@@ -15,6 +15,7 @@ from mixpose.constants import constant
 from mixpose.judgement import (
     LEAST_BELIEF,
     ClutterRates,
+    Mistake,
     Prior,
     RememberedNoise,
     Shape,
@@ -170,8 +171,8 @@ class Track:
     # number of unclaimed detections by sensor when a search for a second pose failed
     tried: Mapping[str, int] = field(default_factory=dict)
     log_odds_twice: float = -math.inf  # that the body is in view again, beside `branches[0]`
-    # log odds of mistakes in the session, by name; none for mistakes without evidence
-    mistaken: Mapping[str, float] = field(default_factory=dict)
+    # mistakes in the session, by name; none for mistakes without evidence
+    mistaken: Mapping[str, Mistake] = field(default_factory=dict)
     # log odds that another body, or this one turned, is followed, by reason
     confused: Mapping[str, float] = field(default_factory=dict)
     rates: ClutterRates = ClutterRates()  # of clutter, since the last frame that was not ok
@@ -183,6 +184,10 @@ class Track:
     def cached_predictions(self) -> dict[tuple[int, float | None], list[Branch]]:
         """Return the cache of predictions by frame number and time, see `predict`."""
         return {}
+
+    def log_odds_mistaken(self, name: str) -> float:
+        """Return the log odds of a mistake in the session; 0 if there is no evidence."""
+        return self.mistaken[name].log_odds if name in self.mistaken else 0.0
 
     def seconds_until(self, time_s: float | None) -> float | None:
         """Return seconds since the last pose: None without times, 0 if the clock went back."""

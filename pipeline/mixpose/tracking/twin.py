@@ -97,7 +97,8 @@ def _decide_for(second: ScoredPose, data: Frame, leftover: SeenTogether, is_imag
 
     Evidence of a mirror image was of the first one; with `is_image` the second one is in no mirror.
     """
-    mistaken = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
+    before = data.track.mistaken
+    mistaken = {name: mistake for name, mistake in before.items() if name != MIRRORED}
     track = replace(data.track, mistaken=mistaken)
     seen = data.changed(views=leftover.views, static_views=(), starts=(), track=track)
     verdict = decide_frame(seen, [second])
