@@ -233,7 +233,7 @@ def test_a_camera_turned_by_little_amid_a_recording_is_told_by_a_few_frames(
     tracker = Tracker.create(body(), EstimatorOptions())
     track, phases, estimates = tracker.begin(), rng.uniform(0, 2 * np.pi, 6), list[Estimate]()
     for frame in range(3 * since):
-        step = np.array([15.0, 15.0, 15.0, 0.3, 0.3, 0.3]) * np.sin(0.15 * frame + phases)
+        step = np.array([90.0, 60.0, 60.0, 0.3, 0.3, 0.3]) * np.sin(0.15 * frame + phases)
         T = TRUTH @ from_rotation_vector(step[3:], step[:3])
         seen_by = turned_by_little if frame >= since else exact
         views = detect(seen_by, body(), T, noise=noise, seed=100 * seed + frame)

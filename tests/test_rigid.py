@@ -19,6 +19,7 @@ from mixpose.rigid import (
     rotation_angle_deg,
     transform,
     twist_between,
+    twists_at,
 )
 
 RNG = np.random.default_rng(0)
@@ -101,6 +102,16 @@ def test_one_pose_has_the_twist_that_it_has_among_many() -> None:
     for T, twist, T_moved in zip(POSES, twists, moved, strict=False):
         np.testing.assert_allclose(perturb(T, twist), T_moved, rtol=0, atol=rounding(T_moved))
         np.testing.assert_allclose(twist_between(T, T_moved), twist, atol=1e-9)
+
+
+def test_a_twist_about_a_pose_is_another_about_the_origin_and_moves_all_points_alike() -> None:
+    twists = 1e-6 * np.random.default_rng(6).normal(size=(50, 6))
+    about_origin = (twists_at(-POSES[:, :3, 3]) @ twists[..., None])[..., 0]
+    moved = transform(perturb(POSES, twists), np.eye(3))
+    also = transform(
+        perturb(np.tile(np.eye(4), (50, 1, 1)), about_origin), transform(POSES, np.eye(3))
+    )
+    np.testing.assert_allclose(also, moved, rtol=0, atol=1e-9)  # to first order
 
 
 def test_a_shift_is_no_turn() -> None:

@@ -116,13 +116,19 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 def covariance_at(covariance: Floats, arm: Floats) -> Floats:
     """Move a pose's covariance (..., 6, 6) from its origin by an arm (..., 3) in world axes."""
+    J = twists_at(arm)
+    return np.asarray(J @ covariance @ J.swapaxes(-1, -2))
+
+
+def twists_at(arm: Floats) -> Floats:
+    """Return matrices (..., 6, 6) by which twists move what is an arm (..., 3) from their origin."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
     J[..., range(6), range(6)] = 1.0
     x, y, z = np.asarray(arm).T
     # a turn w moves the point by w × arm
     J[..., 0, 4], J[..., 0, 5], J[..., 1, 5] = z.T, -y.T, x.T
     J[..., 1, 3], J[..., 2, 3], J[..., 2, 4] = -z.T, y.T, -x.T
-    return np.asarray(J @ covariance @ J.swapaxes(-1, -2))
+    return J
 
 
 def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:

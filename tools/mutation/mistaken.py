@@ -46,14 +46,6 @@ MUTANTS = (
         ("test_judgement_mistakes.py",),
     ),
     Mutant(
-        "judgement-turns-of-sensors-are-about-the-body",
-        "judgement/mistakes.py",
-        "to_origin[:3, 3:] = np.cross(np.eye(3), centre)",
-        "to_origin[:3, 3:] = 0",
-        "what a body tells of a turned camera is not found again where it has gone",
-        ("test_judgement_mistakes.py",),
-    ),
-    Mutant(
         "judgement-mistakes-cost-nothing",
         "judgement/mistakes.py",
         "np.log(wide / s2).sum(axis=1)",

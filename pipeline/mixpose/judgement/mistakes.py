@@ -38,7 +38,7 @@ from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import Matches
 from mixpose.records import Floats, Indices, Mask
-from mixpose.rigid import transform
+from mixpose.rigid import transform, twists_at
 from mixpose.sensors import Sensor, lens_shifts
 
 APART = "sensors contradict each other"
@@ -179,7 +179,7 @@ def _mistakes(
         log_mistaken, sizes = _fitted(X, explained, noise)
         log_mistaken, lasting = log_mistaken + max(known.log_odds, 0.0), None
         if is_sensor:
-            to_origin = _about_origin(pose.T_world_object[:3, 3]) * deviations[k - 1]
+            to_origin = twists_at(-pose.T_world_object[:3, 3]) * deviations[k - 1]
             alone = log_mistaken, sizes.first(6)
             log_mistaken, sizes = _lasting(X[:, :6], explained, noise, known, to_origin, alone)
             if log_mistaken > alone[0] or pose.residual_ratio > 1:
@@ -226,13 +226,6 @@ def _fitted(
     best = logs.argmax()
     more = Sizes(means[best, -width:], spreads[best, -width:, -width:]).times(root)
     return float(np.logaddexp.reduce(logs)), Sizes(prior.mean + more.mean, more.covariance)
-
-
-def _about_origin(centre: Floats) -> Floats:
-    """Return the matrix (6, 6) from twists about a place (3,) to those about the origin."""
-    to_origin = np.eye(6)
-    to_origin[:3, 3:] = np.cross(np.eye(3), centre)
-    return to_origin
 
 
 def _names_of(matches: Matches) -> list[str]:
