@@ -121,7 +121,7 @@ def covariance_at(covariance: Floats, arm: Floats) -> Floats:
 
 
 def twists_at(arm: Floats) -> Floats:
-    """Return matrices (..., 6, 6) by which twists move what is an arm (..., 3) from their origin."""
+    """Return matrices (..., 6, 6) to the twists of what is arms (..., 3) from the origin."""
     J = np.zeros((*np.shape(arm)[:-1], 6, 6))
     J[..., range(6), range(6)] = 1.0
     x, y, z = np.asarray(arm).T
