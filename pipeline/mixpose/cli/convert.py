@@ -16,9 +16,9 @@ from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
 from mixpose.poses import estimates
-from mixpose.poses.formats import ONE_TRAJECTORY
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.poses.writers import ONE_TRAJECTORY
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
 from mixpose.units import UNITS_PER_METRE

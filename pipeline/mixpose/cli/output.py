@@ -14,15 +14,15 @@ from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.errors import SessionError, reporting
 from mixpose.naming import distinct
-from mixpose.poses import benchmarks, csvtable, formats, jsonl, writing
+from mixpose.poses import jsonl, writers, writing
 from mixpose.poses.header import Header
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
 _HEADER = '{"type": "header"'
-_WHOLE_LINES = map(re.escape, (benchmarks.BOP_COLUMNS, benchmarks.TUM_COLUMNS, writing.NO_TIMES))
+_WHOLE_LINES = map(re.escape, (writers.BOP_COLUMNS, writers.TUM_COLUMNS, writing.NO_TIMES))
 _FIRST_LINES = re.compile(
-    rf"{re.escape(_HEADER)}.*|{','.join(csvtable.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
+    rf"{re.escape(_HEADER)}.*|{','.join(writers.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
     r"|# frame -?\d+, (ok|ambiguous)"
 )
 """First lines of files of poses that mixpose wrote."""
@@ -105,7 +105,7 @@ class Output(ExitStack):
             self.file = LineFile(self._path, shown=self._named)
         # writers of poses call only write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
-        self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
+        self._writer = writers.FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
@@ -117,7 +117,7 @@ def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
 
 def _are_separate(format_name: str, labels: Sequence[str]) -> bool:
     """Test whether a format needs a file for each of several bodies."""
-    return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
+    return format_name in writers.ONE_TRAJECTORY and len(labels) > 1
 
 
 def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:

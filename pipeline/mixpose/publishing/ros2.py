@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mixpose.poses.header import Header
-from mixpose.poses.ros import pose_message
+from mixpose.poses.writers import pose_message
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import Address, Message, Sender, path_word, path_words
 from mixpose.publishing.sockets import connected, force_down
