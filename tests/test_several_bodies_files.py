@@ -13,7 +13,7 @@ import pytest
 
 import mixpose
 from mixpose import rigid
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.convert import convert_poses
 from mixpose.cli.output import written_paths
 from mixpose.errors import SessionError

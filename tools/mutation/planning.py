@@ -157,7 +157,7 @@ _DESIGN = (
     ),
     Mutant(
         "cli-evaluate-takes-units-in-silence",
-        "cli/app_after.py",
+        "cli/report.py",
         "if file.unit is None and errors.unit is not None:",
         "if file.unit is not None and errors.unit is None:",
         "a truth in metres without a header is compared as millimetres, and nothing says so",

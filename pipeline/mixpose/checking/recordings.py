@@ -14,8 +14,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source, numbers_of, spread_over
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
-from mixpose.frames.repeated import is_same, shown_by
-from mixpose.frames.source import Frames
+from mixpose.frames.source import Frames, is_same, shown_by
 from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
 from mixpose.records import Floats, Image, PointPattern, RawFrame

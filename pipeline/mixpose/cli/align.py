@@ -11,7 +11,7 @@ import numpy as np
 
 from mixpose import __version__, rigid
 from mixpose.calibration.rig import centre_of
-from mixpose.cli.app_after import AlignRequest
+from mixpose.cli.app import AlignRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_suffix, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources

@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from mixpose.cli import app_after
 from mixpose.cli.help import Command, Commands
 from mixpose.cli.request import RunRequest, Sources
-from mixpose.cli.words import AllowCode, Recordings, SessionFile, command_for, option
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    PosesFile,
+    Recordings,
+    SessionFile,
+    command_for,
+    option,
+)
 from mixpose.units import Unit
 
 MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
 IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
 """Groups of the options of ``mixpose simulate``."""
+
+_TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 
 app = typer.Typer(
     name="mixpose",
@@ -250,21 +259,117 @@ class SimulateRequest:
     overwrite: bool = option("Replace a recording in the folder.", False)
 
 
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """Errors of poses against the truth, modulo the object's symmetries."""
+
+    poses: PosesFile
+    truth: Annotated[Path, _TRUTH]
+    json: bool = option("Print JSON instead of a table.", False)
+
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+
+    poses: PosesFile
+    output: Path = option("The page, as report.html; or stdout (-).", ...)
+    truth: Annotated[Path | None, _TRUTH] = None
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """Write poses in the format of another program."""
+
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
+    output: Path | None = option("Write here, not to stdout (-).")
+    format: ConvertFormat | None = option(
+        "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
+    )
+    unit: str | None = option("Unit of lengths where POSES does not say: m, cm, mm, um.")
+    object: str | None = option("Only the poses of this object.")
+    only_ok: bool = option("Leave out ambiguous frames too.", False)
+    scene_id: int | None = option("bop: the scene; 0.", min=0)
+    obj_id: int | None = option("bop: the object; 1.", min=0)
+    relative_to: str | None = option(
+        "bop, csv, ros, tum: relative to a camera, or another body of POSES, not the world.",
+        metavar="NAME",
+    )
+    session: Path | None = option("The session of the poses, where they do not lead to it.")
+    source: list[str] | None = option(
+        "rerun: as for run, else that of the run.", metavar="NAME=PATH"
+    )
+    measured: bool = option(
+        "c3d, trc: leave gaps where a marker was not measured by itself.", False
+    )
+    fps: float | None = option("c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6)
+    allow_code: AllowCode = False
+
+
+@dataclass(frozen=True)
+class SmoothRequest:
+    """Smooth the poses of a recording, each by all that came before and after."""
+
+    poses: PosesFile
+    output: Path | None = option("Write here, not to stdout (-).", metavar="SMOOTH.jsonl")
+    fill: float = option(
+        "Fill gaps of at most so long, marked; else none.", 0.0, min=0, metavar="SECONDS"
+    )
+    motion: Literal["acceleration", "jerk", "snap", "crackle"] | None = option(
+        "Which derivative of the motion takes white noise; else the likeliest."
+    )
+
+
+@dataclass(frozen=True)
+class PivotRequest:
+    """The tip of a tool, from poses while it turns about its tip."""
+
+    poses: PosesFile
+    object: str | None = option("The tool, where there are several bodies.", metavar="OBJECT")
+    reference: str | None = option(
+        "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
+    )
+    into: Path | None = option("Write the tip into this session.", metavar="SESSION.toml")
+
+
+@dataclass(frozen=True)
+class AlignRequest:
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
+
+    session: SessionFile
+    floor: list[str] = option(
+        "What lies on the floor: poses, or a body in a frame. Repeatable.",
+        ...,
+        metavar="POSES.jsonl|OBJECT@FRAME",
+    )
+    output: Path = option("The aligned session; or stdout (-).", ..., metavar="ALIGNED.toml")
+    up: Literal["x", "y", "z"] = option("The axis that points up.", "z")
+    source: Recordings = None
+    allow_code: AllowCode = False
+
+
+def _schema() -> None:
+    """Print the JSON Schema of pose lines."""
+    from mixpose.poses.schema import schema_text  # noqa: PLC0415
+
+    typer.echo(schema_text(), nl=False)
+
+
 _COMMANDS: dict[str, Callable[..., None]] = {
     "run": command_for(RunRequest, "several:run"),
     "check": command_for(CheckRequest, "check:check_session"),
     "inspect": command_for(InspectRequest, "inspect:inspect_frame"),
     "import": command_for(ImportRequest, "importing:import_files"),
     "simulate": command_for(SimulateRequest, "simulate:simulate_session"),
-    "evaluate": app_after.evaluate,
-    "convert": command_for(app_after.ConvertRequest, "convert:convert_poses"),
-    "schema": app_after.schema,
-    "report": command_for(app_after.ReportRequest, "report:write_report"),
+    "evaluate": command_for(EvaluateRequest, "report:evaluate_poses"),
+    "convert": command_for(ConvertRequest, "convert:convert_poses"),
+    "schema": _schema,
+    "report": command_for(ReportRequest, "report:write_report"),
     "calibrate": command_for(CalibrateRequest, "calibrate:calibrate_session"),
     "design": command_for(DesignRequest, "design:design_sessions"),
-    "pivot": command_for(app_after.PivotRequest, "pivot:pivot_poses"),
-    "align": command_for(app_after.AlignRequest, "align:align_session"),
-    "smooth": command_for(app_after.SmoothRequest, "smooth:smooth_poses"),
+    "pivot": command_for(PivotRequest, "pivot:pivot_poses"),
+    "align": command_for(AlignRequest, "align:align_session"),
+    "smooth": command_for(SmoothRequest, "smooth:smooth_poses"),
     "learn": command_for(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():

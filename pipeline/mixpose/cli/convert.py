@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import Output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of

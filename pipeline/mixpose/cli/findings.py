@@ -19,7 +19,7 @@ from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli import marker_offsets as offsets
 from mixpose.cli.marker_offsets import BodySize, Marker
-from mixpose.frames.repeated import is_same, shown_by
+from mixpose.frames.source import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, FrameSet

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mixpose.cli.app_after import PivotRequest
+from mixpose.cli.app import PivotRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import print_lines, write_text
 from mixpose.errors import RecordingError, SessionError

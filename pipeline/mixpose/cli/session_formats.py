@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError, require_package

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.app_after import SmoothRequest
+from mixpose.cli.app import SmoothRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import Output, refuse_suffix, refuse_to_overwrite
 from mixpose.cli.request import output_of

@@ -13,8 +13,8 @@ from mixpose.fit import EstimatorOptions
 from mixpose.limits import MOST_SAMPLES
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.features import build_body
+from mixpose.session.geometry import read_motion
 from mixpose.session.messages import BadKeyError, one_line, one_of, under
-from mixpose.session.motion import read_motion
 from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
 from mixpose.session.setup import ObjectSetup, Session, Start

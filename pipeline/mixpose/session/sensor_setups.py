@@ -16,9 +16,8 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import Intrinsics, read_camera_matrix, read_distortion
+from mixpose.session.geometry import Intrinsics, read_camera_matrix, read_distortion, read_motion
 from mixpose.session.messages import BadKeyError, under
-from mixpose.session.motion import read_motion
 from mixpose.session.schema_sensors import (
     AnySensorTable,
     CameraTable,

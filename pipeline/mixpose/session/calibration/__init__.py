@@ -9,10 +9,9 @@ from mixpose.session.calibration.camera import CalibratedCamera, Content, Format
 from mixpose.session.calibration.colmap import COLMAP
 from mixpose.session.calibration.kalibr import KALIBR
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
-from mixpose.session.calibration.pycalib import PYCALIB
 from mixpose.session.calibration.ros import ROS, ROS_INI
-from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
-from mixpose.session.intrinsics import CameraModel
+from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE, PYCALIB
+from mixpose.session.geometry import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
 

@@ -15,11 +15,10 @@ import numpy as np
 
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session import intrinsics as pieces
+from mixpose.session import geometry as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics
+from mixpose.session.geometry import CameraModel, Intrinsics, rigid
 from mixpose.session.messages import BadKeyError, mismatch, under
-from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
 
 _MATRIX = "a 4x4 matrix, four rows of four numbers"

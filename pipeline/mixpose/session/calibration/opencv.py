@@ -20,11 +20,10 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session import intrinsics as pieces
+from mixpose.session import geometry as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics
+from mixpose.session.geometry import CameraModel, Intrinsics, rigid
 from mixpose.session.messages import BadKeyError, nearest, under
-from mixpose.session.motion import rigid
 from mixpose.session.values import numbers
 
 # Names of nodes in files of OpenCV's samples and common calibration programs, tried in order.

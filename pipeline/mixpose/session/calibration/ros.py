@@ -8,9 +8,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from mixpose.session import intrinsics as pieces
+from mixpose.session import geometry as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics
+from mixpose.session.geometry import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 
 _INI_WORDS = ("camera matrix", "distortion", "rectification", "projection", "width", "height")
