@@ -68,24 +68,27 @@ _FORMATS = (
 _IMPORTING = (
     Mutant(
         "importing-translations-keep-their-unit",
-        "importing.py",
+        "cli/importing.py",
         "from_parts(T[:3, :3], factor * T[:3, 3])",
         "from_parts(T[:3, :3], T[:3, 3])",
         "a rig in metres is written as millimetres",
+        ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
         "importing-copies-pass",
-        "importing.py",
+        "cli/importing.py",
         "if _are_same(a, b):",
         "if False:",
         "a camera that was copied by mistake is not noticed",
+        ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
         "importing-worlds-mixed",
-        "importing.py",
+        "cli/importing.py",
         "if len(placed) > 1:",
         "if len(placed) > 2:",
         "cameras of two rigs are put into one world",
+        ("test_import.py", "test_import_command.py"),
     ),
 )
 

@@ -167,7 +167,7 @@ MUTANTS = (
     ),
     Mutant(
         "importing-lengths-of-tables-in-silence",
-        "importing.py",
+        "cli/importing.py",
         "    if lengths in (None, unit):",
         "    if True:",
         "a body in metres is a thousand times too small, though its unit was said",
