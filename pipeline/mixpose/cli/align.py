@@ -27,11 +27,7 @@ MARK = "# Aligned by mixpose"
 
 
 def align_session(request: AlignRequest) -> None:
-    """Write the session in the frame of the floor.
-
-    Raises SessionError if it holds directions of the world, and RecordingError if the poses
-    determine no floor.
-    """
+    """Write the session in the frame of the floor."""
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
     rewriting.refuse_held_directions(session)
@@ -75,7 +71,6 @@ def _floor_poses(text: str, session: Session, sources: Sequence[str]) -> list[Es
 
 
 def _places(session: Session) -> Floats:
-    """Return the places of sensors; for parallel beams the origins of their frames."""
     return np.stack([centre_of(setup.sensor) for setup in session.sensors])
 
 

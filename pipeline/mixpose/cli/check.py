@@ -56,11 +56,7 @@ class _Report:
 
 
 def check_session(request: CheckRequest) -> None:
-    """Print sensors, recordings, the object's symmetries and the expected accuracy.
-
-    Raises RecordingError if a table of times lacks rows or, after all has been printed, if a frame
-    is damaged.
-    """
+    """Print what a session and its recording hold and let expect; raise if a frame is damaged."""
     session, quick = load_session(request.session, allow_code=request.allow_code), request.quick
     replaced = named_sources(request.source or ())
     opened = open_sources(session, replaced)

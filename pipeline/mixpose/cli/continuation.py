@@ -46,10 +46,7 @@ class Note:
 
 
 class Notes:
-    """Save the state of a run at intervals; the note is removed when the recording is finished.
-
-    A context manager; nothing is written if the output cannot be resumed.
-    """
+    """Save the state of a run at intervals if it can be resumed, and remove it at the end."""
 
     def __init__(self, request: RunRequest) -> None:
         poses, format_name = request.poses, request.format_name
@@ -172,7 +169,6 @@ def _after(selection: Selection, last: int) -> Selection:
 
 
 def _note(poses: Path) -> Note | None:
-    """Return the note about a poses file, if one exists and fits it."""
     try:
         note = decode(Note, json.loads(note_path(poses).read_bytes()))
     except (OSError, ValueError, RecursionError):

@@ -27,10 +27,7 @@ _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 
 
 def convert_poses(request: ConvertRequest) -> None:
-    """Write the poses of a file in another format.
-
-    Raises RecordingError if it holds what the format cannot express.
-    """
+    """Write the poses of a file in another format."""
     request = replace(request, output=output_of(request.output))
     path, name = request.poses, _format(request)
     _refuse_options_of_other_formats(name, request)
@@ -83,7 +80,6 @@ def _write(
 
 
 def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
-    """Raise SessionError for options that need poses relative to a camera, not to a body."""
     if name == "bop":
         raise SessionError(
             f"--relative-to {request.relative_to}: is a body, and --format bop holds poses "
@@ -170,7 +166,6 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
 
 
 def _unit(poses: PoseFile, request: ConvertRequest) -> str:
-    """Return the unit of lengths in the poses file."""
     allowed = ", ".join(UNITS_PER_METRE)
     if request.unit is not None and request.unit not in UNITS_PER_METRE:
         raise SessionError(f"--unit {request.unit}: allowed are {allowed}")

@@ -127,7 +127,6 @@ class Findings:
             self._frames.append((frame_set.number, planes))
 
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
-        """Return the numbers of features of sensors that found far more than expected."""
         counts = {
             view.name: view.observation.found
             for view in views
@@ -260,7 +259,6 @@ class Findings:
 
     @property
     def _repeat_count(self) -> int:
-        """Number of repeated frames of sensors that contradict others."""
         return sum(frames.count for frames in self._repeated.values())
 
     @property

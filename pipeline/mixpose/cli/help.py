@@ -166,7 +166,6 @@ def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
 
 
 def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
-    """Return the value of an option as it was typed, the last if there are several."""
     for i in reversed(range(len(arguments))):
         option, equals, value = arguments[i].partition("=")
         if option in names:

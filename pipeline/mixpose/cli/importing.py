@@ -81,11 +81,7 @@ def _written(imported: Imported, output: Path) -> Session:
 
 
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
-    """Read calibration files, and files of bodies, which are recognised by their ending.
-
-    Lengths are converted to `unit`; `lengths` is the unit of translations in files whose format
-    does not fix it. Raises SessionError for unreadable files and for several worlds.
-    """
+    """Read calibrations and bodies in `unit`; `lengths` is that of translations of unknown unit."""
     bodies = [path for path in paths if path.suffix.lower() in _TABLES]
     try:
         for body in bodies:
@@ -160,7 +156,7 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
 
 
 def _with_valid_names(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
-    """Return cameras with unique names that are valid in NAME=PATH."""
+    """Make names unique and valid in NAME=PATH."""
 
     def plain(name: str) -> str:
         characters = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
@@ -171,7 +167,6 @@ def _with_valid_names(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]
 
 
 def _camera_warnings(cameras: list[CalibratedCamera]) -> list[str]:
-    """Return warnings about missing poses and sizes, unclear models, odd centres and copies."""
     warnings = []
     unplaced = [camera.name for camera in cameras if camera.T_camera_rig is None]
     if unplaced and len(cameras) > 1:
@@ -245,7 +240,6 @@ def _quoted(text: str) -> str:
 
 
 def _relative(path: Path, output: Path) -> str:
-    """Return a path relative to the folder of the session file; absolute on another drive."""
     try:
         return Path(os.path.relpath(path.resolve(), output.resolve().parent)).as_posix()
     except ValueError:  # on another drive

@@ -239,7 +239,6 @@ class Summary:
 
 @contextmanager
 def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
-    """Yield a display of rich on standard error if that is a terminal; else None."""
     if not shown or not sys.stderr.isatty():
         yield None
         return
@@ -256,10 +255,7 @@ def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
 def bar(
     title: str, total: int | None, *, shown: bool = True, spins: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """Yield a function that advances a progress bar, which only a terminal shows.
-
-    A bar that `spins` does not show how much remains.
-    """
+    """Yield a function that advances a progress bar, or a spinner, which only a terminal shows."""
     with _display(shown=shown, spins=spins) as display:
         if display is None:
             yield lambda **changes: None

@@ -116,7 +116,6 @@ def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
 
 
 def _are_separate(format_name: str, labels: Sequence[str]) -> bool:
-    """Test whether a format needs a file for each of several bodies."""
     return format_name in writers.ONE_TRAJECTORY and len(labels) > 1
 
 
@@ -141,10 +140,7 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
-    """Raise SessionError unless a file to be written is new, empty, or has `mark` in its beginning.
-
-    It has to start with `begins`; `option` is the option that named the file.
-    """
+    """Raise SessionError unless a file is new, empty, or `begins` as told and has `mark` in it."""
     if is_stdout(path):
         return
     beginning = _beginning(path, inputs, option)

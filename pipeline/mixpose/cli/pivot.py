@@ -23,10 +23,7 @@ _SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few pe
 
 
 def pivot_poses(request: PivotRequest) -> None:
-    """Find the tip of a tool, print it, and write it into a session.
-
-    Raises RecordingError if the poses do not determine the tip.
-    """
+    """Find the tip of a tool, print it, and write it into a session."""
     path = request.poses
     poses = read_poses(path)
     tool = _tool(poses, request)

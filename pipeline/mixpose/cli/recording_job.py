@@ -130,7 +130,7 @@ def finished(job: Job) -> Outcome | None:
 
 
 def _is_of(outcome: Outcome, job: Job) -> bool:
-    """Test whether an outcome is of the same session, options and version as a job."""
+    """Test whether an outcome is of the session, options and version of a job."""
     key = (outcome.session_sha256, outcome.options, outcome.mixpose)
     return key == (job.session_sha256, job.options, job.mixpose)
 
@@ -220,10 +220,7 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
-    """Rename a complete folder to its final name, unless another worker was faster.
-
-    Existing poses are not replaced by a run that failed.
-    """
+    """Rename a complete folder to its final name; poses that are done already stay."""
     place = Path(job.folder) / job.name
     while True:
         earlier, existing = finished(job), outcome_in(place)

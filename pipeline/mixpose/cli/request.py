@@ -104,11 +104,7 @@ class RunRequest:
 
     @property
     def format_name(self) -> str:
-        """The format of poses: of --format, else of the file's suffix, else JSON lines.
-
-        Raises SessionError if the suffix belongs to no format, or to one that cannot be written
-        while poses are estimated.
-        """
+        """The format of poses: of --format, else of the file's suffix, else JSON lines."""
         return self.format or ("jsonl" if self.are_many else _format_by_suffix(self.poses))
 
     @property
@@ -126,7 +122,7 @@ class RunRequest:
 
     @property
     def options(self) -> dict[str, int | bool]:
-        """Options that differ from their defaults and must be the same for all lines of a file."""
+        """Options unlike their defaults that must be the same for all lines of a file."""
         step = {"step": self.step} if self.step != 1 else {}
         return step | ({"labels": True} if self.labels else {})
 

@@ -28,10 +28,7 @@ from mixpose.tracking.proposers import predicted
 
 
 def run_session(request: RunRequest) -> None:
-    """Estimate every frame of a session's recording and write the poses.
-
-    Whatever is raised, frames already estimated stay written.
-    """
+    """Write the poses of a recording; whatever is raised, those estimated already stay written."""
     with ExitStack() as pages:  # closed after the poses
         _run_session(request, pages)
 
@@ -144,7 +141,6 @@ def _call_watches(
     views: Sequence[View],
     estimate: Estimate,
 ) -> None:
-    """Pass a new estimate and its frame to all watches."""
     for watch in watches if is_new(estimate) else ():
         watch(frame_set, views, estimate)
 
@@ -168,9 +164,7 @@ def header_of(
     sources: Mapping[str, str] | None = None,
     options: Mapping[str, int | bool] | None = None,
 ) -> Header:
-    """Return the header of a session's poses, with `sources` that replace the session's and those
-    `options` that change pose lines.
-    """
+    """Return the header of poses; `sources` replace the session's, `options` change pose lines."""
     return Header(
         unit=session.unit,
         session=str(session.path),
@@ -187,10 +181,7 @@ def header_of(
 
 
 def named_sources(named: Iterable[str]) -> dict[str, str]:
-    """Return recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
-
-    Raises SessionError if a text is not of this form.
-    """
+    """Return recordings by sensor, from texts like ``left=frames/``; ``left=0`` is camera 0."""
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")

@@ -59,10 +59,7 @@ def run(request: RunRequest) -> None:
 
 
 def sessions_of(named: Sequence[str]) -> list[Path]:
-    """Return the sessions that arguments name: files, patterns, or text files with one per line.
-
-    Raises SessionError if a pattern matches nothing, or a list cannot be read or is empty.
-    """
+    """Return the sessions that files, patterns, or text files with one per line name."""
     sessions: dict[Path, None] = {}
     for text in named:
         path = Path(text)
@@ -114,11 +111,7 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
-    """Run all recordings that are not done yet; report each, and return the highest exit status.
-
-    The number of workers has no effect on a cluster that is not local. Raises SessionError if there
-    is no folder for the poses, or an option is for a single recording.
-    """
+    """Run all recordings that are not done yet; report each, and return the highest exit status."""
     _refuse_alone(sessions, request)
     folder = _folder(request.poses, len(sessions))
     jobs = _jobs(sessions, folder, request)
@@ -163,7 +156,6 @@ def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
 
 
 def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
-    """Return the outcome of a job, a failure if its workers were lost repeatedly."""
     if isinstance(result, Outcome):
         return result
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
@@ -209,7 +201,6 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 
 
 def _options(request: RunRequest) -> tuple[str, ...]:
-    """Return the options for the run of one session."""
     values = {"format": request.format_name, "step": request.step}
     values |= {"start": request.start, "stop": request.stop}
     flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
@@ -259,7 +250,6 @@ def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
 
 
 def _line(outcome: Outcome) -> str:
-    """Return the result of a recording in words."""
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
     text = frames_text(outcome.frames, outcome.bodies)

@@ -21,10 +21,7 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 
 
 def smooth_poses(request: SmoothRequest) -> None:
-    """Smooth the poses of a file and write them.
-
-    Raises RecordingError if they were smoothed before, are predictions, or lack what is needed.
-    """
+    """Smooth the poses of a file and write them."""
     path, output, fill_s = request.poses, output_of(request.output), request.fill
     poses = read_poses(path)
     if poses.header.get("smoothed"):

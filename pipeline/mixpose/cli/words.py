@@ -36,11 +36,7 @@ def option(
     panel: str | None = None,
     **more: Any,
 ) -> Any:
-    """Return a field of a record that is an option of a command, required if the default is `...`.
-
-    The name of the option is that of the field unless given. `panel` is the title of its group in
-    the help; `more` goes to typer.
-    """
+    """Return a field that is an option, required if the default is `...`; `more` goes to typer."""
     settings = {"help": meaning, "rich_help_panel": panel, **more}
     metadata = {"name": name, "settings": settings}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
@@ -57,7 +53,7 @@ def command_for(request: type, work: str) -> Callable[..., None]:
     The record is passed to the ``module:function`` `work` of this package, imported when called.
     All raise SessionError if the session or an option is wrong, or an output would overwrite
     something else, and RecordingError if a recording or poses cannot be read. A field `debug` takes
-    the value of ``--debug``, which any command has.
+    the value of ``--debug``.
     """
     hints: dict[str, Any] = get_type_hints(request, include_extras=True)
     for entry in fields(request):

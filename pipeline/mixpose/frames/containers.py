@@ -32,10 +32,7 @@ def container_of(path: Path) -> Container | None:
 
 
 def missing_bytes(path: Path) -> int:
-    """Return how many bytes of its outermost parts a video file lacks; 0 if they are unknown.
-
-    Raises OSError if it cannot be read.
-    """
+    """Return how many bytes a video file lacks, 0 if unknown; OSError if it cannot be read."""
     container = container_of(path)
     if container is None:
         return 0
@@ -61,7 +58,7 @@ def _riff_end(file: BinaryIO, size: int) -> int:
 
 
 def _mp4_end(file: BinaryIO, size: int) -> int:
-    """Return the end of the last box (ISO/IEC 14496-12, section 4.2); the rest is padding."""
+    """Return the end of the last box (ISO/IEC 14496-12, section 4.2); what follows is padding."""
     offset = 0
     while offset + 8 <= size:
         file.seek(offset)

@@ -148,7 +148,6 @@ def _nearest_known(numbers: Sequence[int], known: Sequence[int], reach: float) -
 
 
 def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
-    """Give the frames of a source other numbers; they keep their times."""
     if isinstance(source, DetectionTable):
         return replace(source, places=numbers)
     assert isinstance(source, ImageSequence), "what has stamps"

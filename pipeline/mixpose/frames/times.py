@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NoReturn, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from mixpose.errors import RecordingError, SessionError, reporting
-from mixpose.frames.source import SourceSpec
+
+if TYPE_CHECKING:
+    from mixpose.frames.source import SourceSpec
 
 Clock: TypeAlias = Callable[[int], float]
 
@@ -39,12 +41,24 @@ class FrameTimes:
             )
         return self.seconds[number]
 
+    def missing(self, numbers: Iterable[int]) -> list[int]:
+        """Return the frame numbers without a row."""
+        return [number for number in numbers if number not in self.seconds]
+
+    def require(self, numbers: Iterable[int]) -> None:
+        """Raise a RecordingError if the table lacks a row of these frames."""
+        if not (missing := self.missing(numbers)):
+            return
+        named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
+        more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
+        raise RecordingError(
+            f"{self.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
+            "table with a row for each frame of the recording, or fps in place of times"
+        )
+
 
 def read_times(path: Path) -> FrameTimes:
-    """Read a table with the header ``frame,time_s``, rows in any order.
-
-    Raises RecordingError if it cannot be read, a cell is no finite number or a frame comes twice.
-    """
+    """Read a table ``frame,time_s``, rows in any order; RecordingError if a row is wrong."""
     times: dict[int, float] = {}
     rows = csv_rows(path)
     _, cells = next(rows, (0, []))
@@ -61,33 +75,8 @@ def read_times(path: Path) -> FrameTimes:
     return FrameTimes(path, times)
 
 
-def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
-    """Return the frame numbers without a row in a table of times; none with a rate."""
-    if not isinstance(clock, FrameTimes):
-        return []
-    return [number for number in numbers if number not in clock.seconds]
-
-
-def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Raise a RecordingError if a table of times lacks a row of these frames."""
-    missing = untimed(clock, numbers)
-    if not missing:
-        return
-    assert isinstance(clock, FrameTimes), "rates lack nothing"
-    named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
-    more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
-    raise RecordingError(
-        f"{clock.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
-        "table with a row for each frame of the recording, or fps in place of times"
-    )
-
-
 def clock_of(spec: SourceSpec) -> Clock | None:
-    """Return the clock for the frames of a source; None if the session states none.
-
-    Raises SessionError if both `times` and `fps` are given, or `fps` is not positive, and
-    RecordingError if the table of times cannot be read.
-    """
+    """Return the clock of a source, if stated; SessionError or RecordingError if it is wrong."""
     if spec.times is not None and spec.fps is not None:
         raise SessionError(f"sensor {spec.sensor!r}: found times and fps, only one is allowed")
     if spec.times is not None:

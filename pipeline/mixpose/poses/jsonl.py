@@ -101,12 +101,10 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
 
 
 def _if_any(key: str, value: Any) -> dict[str, Any]:
-    """Return a key with its value, or nothing if the value is empty."""
     return {key: value} if value else {}
 
 
 def _tip_of(estimate: Estimate) -> dict[str, Any]:
-    """Return the tip and its covariance, of a body that has one."""
     if estimate.tip_object is None:
         return {}
     if estimate.status == "lost":
@@ -115,12 +113,10 @@ def _tip_of(estimate: Estimate) -> dict[str, Any]:
 
 
 def _rounded(residual: float | None) -> float | None:
-    """Round to four significant digits."""
     return None if residual is None else float(f"{residual:.4g}")
 
 
 def _label(label: Label) -> dict[str, Any]:
-    """Return the detection of a feature, unrounded."""
     place = {"at": plain(label.at)}
     return place if label.detection is None else {**place, "detection": label.detection}
 
@@ -162,10 +158,7 @@ def read_poses(path: str | Path) -> PoseFile:
 
 
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
-    """Read a poses file that a run may still be writing, and tell whether its last line is cut off.
-
-    That line is left out. Raises RecordingError for any other line, as `read_poses`.
-    """
+    """Read poses that may still be written, without a last line that is cut; tell if one was."""
     path = Path(path)
     data = _read_bytes(path)
     whole = data.rfind(b"\n") + 1
@@ -282,7 +275,6 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _parse(path: Path, data: bytes) -> PoseFile:
-    """Parse a poses file; errors name the line."""
     header: Mapping[str, Any] = {}
     unit: str | None = None
     symmetries: Mapping[str, Floats] = {}

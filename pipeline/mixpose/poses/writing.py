@@ -52,10 +52,7 @@ def pose_of(estimate: Estimate) -> Floats | None:
 
 
 def require_finite(estimate: Estimate) -> None:
-    """Raise a ValueError, naming frame and field, if an estimate holds a NaN or an infinity.
-
-    No format can hold these; such an estimate is a fault of the program.
-    """
+    """Raise a ValueError, with frame and field, for a NaN or an infinity: a fault of mixpose."""
     values: dict[str, Floats | float | None] = {
         "time_s": estimate.time_s,
         "T_world_object": estimate.T_world_object,

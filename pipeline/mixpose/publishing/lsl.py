@@ -71,7 +71,6 @@ class LslSender(Sender):
 
 
 def _info(pylsl: Any, name: str, header: Header) -> Any:
-    """Return the description of an outlet's stream."""
     info = pylsl.StreamInfo(
         name, "MoCap", len(_CHANNELS), pylsl.IRREGULAR_RATE, pylsl.cf_double64, f"mixpose-{name}"
     )

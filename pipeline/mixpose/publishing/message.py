@@ -39,10 +39,7 @@ class Address:
     def place(
         self, example: str, port: int | None = None, *, bare: bool = False
     ) -> tuple[str, int]:
-        """Return host and port, by default `port`; raise an error with an example if none is known.
-
-        `bare` allows no path.
-        """
+        """Return host and port, else `port`, `bare` without a path; or raise with an example."""
         written = self.port or port
         if bare and self.path:
             raise self.error(f"found {self.path!r} behind host and port; allowed: {example}")

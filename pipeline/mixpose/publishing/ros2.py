@@ -120,7 +120,6 @@ class RosNodeSender(Sender):
 
 
 def _type(kind: str) -> Any:
-    """Return the class of a message, ``package/msg/Name``."""
     package, _, name = kind.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), name)
 

@@ -36,16 +36,16 @@ def refuse_lost_code(session: Session, target: Path) -> None:
     for setup in session.sensors:
         module, colon, _ = setup.extract.method.partition(":")
         name = module.partition(".")[0]
-        if colon and _has_module(session.folder, name) and not _has_module(target.parent, name):
+        has_module = [
+            (folder / f"{name}.py").is_file() or (folder / name).is_dir()
+            for folder in (session.folder, target.parent)
+        ]
+        if colon and has_module == [True, False]:
             raise SessionError(
                 f'{session.path}: extract.method: "{setup.extract.method}" is looked for beside '
                 f"the session, and {target.parent.absolute()} has no {name}; allowed: -o in "
                 f"{session.folder.absolute()}, or {name} copied there"
             )
-
-
-def _has_module(folder: Path, name: str) -> bool:
-    return (folder / f"{name}.py").is_file() or (folder / name).is_dir()
 
 
 def text_of(document: Any, session: Session, head: str = "") -> str:
@@ -57,7 +57,6 @@ def text_of(document: Any, session: Session, head: str = "") -> str:
 
 
 def _text(session: Session) -> str:
-    """Return the text of the session file with its byte order mark and line ends."""
     return session.path.read_bytes().decode("utf-8")
 
 

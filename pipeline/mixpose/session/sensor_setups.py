@@ -39,10 +39,7 @@ _KEPT = {"name", "model", "source", "fps", "range_min", "bin_size", "delay", "re
 def build_sensors(
     tables: list[AnySensorTable], defaults: ExtractTable, folder: Path, unit: Unit
 ) -> tuple[SensorSetup, ...]:
-    """Build all sensors of a session, `defaults` being its ``[extract]``.
-
-    Paths are relative to `folder`; lengths of calibration files are converted into `unit`.
-    """
+    """Build all sensors; `defaults` is ``[extract]``, paths are of `folder`, lengths in `unit`."""
     with under("extract"):
         merge_extract(defaults, None)
     setups: list[SensorSetup] = []

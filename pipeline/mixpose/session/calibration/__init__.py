@@ -24,10 +24,7 @@ FORMATS = (KALIBR, OPENCV, PYCALIB, ROS, ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP)
 def read_calibration(
     wanted: CalibrationTable, folder: Path, model: CameraModel
 ) -> CalibratedCamera:
-    """Read the camera that a session names, by its file, relative to `folder`, and names in it.
-
-    Raises BadKeyError if the file has no known format, lacks the camera, or has another model.
-    """
+    """Read the camera that a session names, in a file relative to `folder`; else BadKeyError."""
     content = read_content(folder / wanted.file, wanted.file)
     with in_file(wanted.file):
         camera = _read(content, wanted, model)

@@ -42,6 +42,7 @@ _SIZE_NODES = (
     ("image_Width", "image_Height"),
     ("img_width", "img_height"),
 )
+_STARTS = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
 _DASH = re.compile(r"-(?:\s|$)")
 _NUMBERED = re.compile(rf"({'|'.join(MATRIX_NODES)})_?(\d+|left|right)")
 
@@ -53,11 +54,6 @@ class _Nodes:
     nodes: dict[str, cv2.FileNode]
     # nodes point into their storages, which must live as long as they
     storages: list[cv2.FileStorage] = field(default_factory=list)
-
-
-def _recognises(content: Content) -> bool:
-    starts = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
-    return content.text.lstrip().startswith(starts) or "opencv-matrix" in content.text
 
 
 def _open(group: Iterable[Content]) -> _Nodes:
@@ -255,4 +251,12 @@ def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     return None
 
 
-OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _cameras, _groups)
+OPENCV = Format(
+    "an OpenCV file",
+    "OpenCV FileStorage",
+    recognises=lambda content: (
+        content.text.lstrip().startswith(_STARTS) or "opencv-matrix" in content.text
+    ),
+    cameras=_cameras,
+    groups=_groups,
+)

@@ -93,7 +93,6 @@ def _read_ini(content: Content, name: str, _: CameraModel) -> CalibratedCamera:
 
 
 def _ini_values(content: Content) -> dict[str, list[float]]:
-    """Return the numbers below each heading."""
     values: dict[str, list[float]] = {}
     word = ""
     for line in content.lines:
