@@ -67,7 +67,7 @@ _FORMATS = (
 
 _IMPORTING = (
     Mutant(
-        "importing-translations-keep-their-unit",
+        "cli-import-translations-keep-their-unit",
         "cli/importing.py",
         "from_parts(T[:3, :3], factor * T[:3, 3])",
         "from_parts(T[:3, :3], T[:3, 3])",
@@ -75,7 +75,7 @@ _IMPORTING = (
         ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
-        "importing-copies-pass",
+        "cli-import-copies-pass",
         "cli/importing.py",
         "if _are_same(a, b):",
         "if False:",
@@ -83,7 +83,7 @@ _IMPORTING = (
         ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
-        "importing-worlds-mixed",
+        "cli-import-worlds-mixed",
         "cli/importing.py",
         "if len(placed) > 1:",
         "if len(placed) > 2:",

@@ -166,7 +166,7 @@ MUTANTS = (
         ("test_session_files.py",),
     ),
     Mutant(
-        "importing-lengths-of-tables-in-silence",
+        "cli-import-lengths-of-tables-in-silence",
         "cli/importing.py",
         "    if lengths in (None, unit):",
         "    if True:",

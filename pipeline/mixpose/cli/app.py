@@ -10,13 +10,14 @@ from typing import Annotated, Literal
 import typer
 
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.request import RunRequest, Sources
-from mixpose.cli.words import (
+from mixpose.cli.request import (
     AllowCode,
     ConvertFormat,
     PosesFile,
     Recordings,
+    RunRequest,
     SessionFile,
+    Sources,
     command_for,
     option,
 )

@@ -66,16 +66,13 @@ def check_session(request: CheckRequest) -> None:
     report.say("session", f"{session.path}, lengths in {session.unit}")
     for table in session.objects:
         _say_object(report, session, table)
-    surveys: dict[str, recordings.Survey] = {}
     sample = None if quick else recordings.frames_to_count(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as tick:
-        for setup in session.sensors:
-            source = opened[setup.name]
-            surveys[setup.name] = recordings.survey(
-                session, setup, source, quick=quick, to_count=sample, done=partial(tick, advance=1)
-            )
+        tell = partial(tick, advance=1)
+        read = partial(recordings.survey, quick=quick, to_count=sample, done=tell)
+        surveys = {s.name: read(session, s, opened[s.name]) for s in session.sensors}
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     shared = keys.shared_source_warnings(session, replaced)
@@ -175,12 +172,9 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
         other_numbers = set().union(*(numbers[other] for other in numbers if other != name))
         pairs = len(frames & other_numbers)
         if other_numbers and pairs < 0.5 * min(len(frames), len(other_numbers)):
-            is_table = isinstance(sources[name], DetectionTable)
-            hint = (
-                "in the column frame; count all tables alike"
-                if is_table
-                else "that their names end in; rename the files"
-            )
+            hint = "that their names end in; rename the files"
+            if isinstance(sources[name], DetectionTable):
+                hint = "in the column frame; count all tables alike"
             warnings.append(
                 f"sensor {name!r}: {pairs} of its {len(frames)} frames pair with those of other "
                 f"sensors: frames are paired by the number {hint}"

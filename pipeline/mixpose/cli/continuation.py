@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ from mixpose.frames.capture import is_pipe
 from mixpose.frames.video import Video
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import ResumePoint, resume_point
+from mixpose.records import Estimate
 from mixpose.runner import Memory
 from mixpose.selection import Selection
 from mixpose.whole_files import appearing_whole
@@ -99,13 +101,20 @@ class Continuation:
     last_written: ResumePoint | None = None
     is_done: bool = False  # whether no frame remains to be estimated
 
+    def is_new(self, estimate: Estimate, labels: Sequence[str]) -> bool:
+        """Test whether an estimate of one of the bodies comes after the last line in the file."""
+        last, line = self.last_written, labels.index(estimate.label) + 1  # of the frame
+        return last is None or (estimate.frame, line) > (last.frame, last.lines)
+
 
 def resume(request: RunRequest, header: Header, opened: dict[str, Source]) -> Continuation:
-    """Find where a run resumes in its file of poses.
+    """Find where a run begins or, by --resume, goes on in its file of poses.
 
     Raises SessionError if no file is named, it belongs to another run, another run writes to it,
     or a sensor is live; RecordingError if it holds no poses, or the recording cannot be read.
     """
+    if not request.resume:
+        return Continuation(None, request.selection)
     for name, source in opened.items():
         if source.kind == "live" or (isinstance(source, Video) and is_pipe(source.address)):
             raise SessionError(

@@ -52,7 +52,7 @@ def convert_poses(request: ConvertRequest) -> None:
         write_markers(poses, lines, _unit(poses, request), name, request)
         return
     else:
-        _write(poses, lines, name, T_sensor_world, request)
+        _write(poses, lines, name, labels, T_sensor_world, request)
     if request.output is not None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
@@ -64,6 +64,7 @@ def _write(
     poses: PoseFile,
     lines: Sequence[PoseLine],
     name: str,
+    labels: Sequence[str],
     T_sensor_world: Floats,
     request: ConvertRequest,
 ) -> None:
@@ -73,7 +74,6 @@ def _write(
     header = estimates.header_of(poses, _unit(poses, request), __version__)
     if name != "bop" or (request.object is not None and request.obj_id is not None):
         header = replace(header, objects=estimates.objects_of(lines))
-    labels = tuple(dict.fromkeys(line.label for line in lines))
     with Output(request.output, name, header, labels, options=options, whole=True) as output:
         for line in lines:
             output.write(estimates.relative_to(T_sensor_world, line))

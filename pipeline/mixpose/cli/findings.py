@@ -186,13 +186,13 @@ class Findings:
 
     def sensor_lines(self) -> list[str]:
         """Return lines about missing, repeated or odd frames and features of sensors."""
-        total, lines = self._places + 1, []
-        for what, by_sensor in (("no frame", self._no_frame), ("no feature", self._no_feature)):
-            lines += [
-                f"sensor {name!r} had {what} in {frames.count} of {total} frames: {frames.text()}"
-                for name, frames in by_sensor.items()
-                if frames.are_no_accident(total)
-            ]
+        total = self._places + 1
+        lines = [
+            f"sensor {name!r} had {what} in {frames.count} of {total} frames: {frames.text()}"
+            for what, by_sensor in (("no frame", self._no_frame), ("no feature", self._no_feature))
+            for name, frames in by_sensor.items()
+            if frames.are_no_accident(total)
+        ]
         lines += [
             f"sensor {name!r} found up to {self._most[name]} features, where {self._expected} are "
             f"expected, in {frames.count} of {total} frames, none of them ok: {frames.text()}; "

@@ -112,7 +112,8 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
             T = camera.T_camera_rig
             scaled = None if T is None else from_parts(T[:3, :3], factor * T[:3, 3])
             cameras.append(replace(camera, T_camera_rig=scaled))
-    cameras = _with_valid_names(cameras)
+    names = distinct([camera.name for camera in cameras], _plain)
+    cameras = [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
     return Imported(
         unit,
         tuple(cameras),
@@ -155,15 +156,10 @@ def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str,
     return unit, guess, hint
 
 
-def _with_valid_names(cameras: list[CalibratedCamera]) -> list[CalibratedCamera]:
-    """Make names unique and valid in NAME=PATH."""
-
-    def plain(name: str) -> str:
-        characters = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
-        return "".join(characters).strip() or "camera"
-
-    names = distinct([camera.name for camera in cameras], plain)
-    return [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
+def _plain(name: str) -> str:
+    """Return a name that is valid in NAME=PATH."""
+    characters = ("_" if c in '=/\\"' or not c.isprintable() else c for c in name)
+    return "".join(characters).strip() or "camera"
 
 
 def _camera_warnings(cameras: list[CalibratedCamera]) -> list[str]:

@@ -24,7 +24,12 @@ def learn_session(request: LearnRequest) -> None:
     inputs = path, request.like
     output.refuse_to_overwrite_but(request.output, inputs, MARK)
     output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
-    older = None if request.like is None else _older(request.like, session)
+    older = None
+    if request.like is not None:
+        try:
+            older = read_marker_file(request.like, session.unit)
+        except BadKeyError as problem:
+            raise SessionError(f"--like {request.like}: {problem.text}") from problem
     if others := [setup.name for setup in session.sensors if setup.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
     with shown_progress() as progress:
@@ -41,13 +46,6 @@ def learn_session(request: LearnRequest) -> None:
         output.refuse_to_overwrite_but(file, inputs, MARK)
         output.write_text(file, table_text(body), "-o")
     _report(lesson, bodies, files, session)
-
-
-def _older(path: Path, session: Session) -> Markers:
-    try:
-        return read_marker_file(path, session.unit)
-    except BadKeyError as problem:
-        raise SessionError(f"--like {path}: {problem.text}") from problem
 
 
 def _in_frames(

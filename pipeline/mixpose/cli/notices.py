@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # not needed to print a message
     from mixpose.calibration.task import Progress
-    from mixpose.frames import Source
     from mixpose.records import DelayEstimate, Estimate
     from mixpose.session import Session
 
@@ -48,19 +47,6 @@ def say(message: str) -> None:
 def warn(message: str) -> None:
     """Print a warning on one line."""
     say(f"warning: {' '.join(message.split())}")
-
-
-def warn_of_sources(
-    session: Session, sources: Mapping[str, Source], replaced: Mapping[str, str]
-) -> None:
-    """Warn of oddities of the recordings; those in `replaced` replace the session's."""
-    from mixpose.checking import shared_source_warnings  # noqa: PLC0415 - only a run needs it
-
-    for warning in shared_source_warnings(session, replaced):
-        warn(warning)
-    for name, source in sources.items():
-        if caution := source.caution():
-            warn(f"sensor {name!r}: {caution}")
 
 
 def counted(count: int, noun: str) -> str:
@@ -279,8 +265,8 @@ def shown_progress() -> Iterator[Progress]:
             return
         steps.append(step)
         if len(steps) == _TIMED:
-            remaining, mean_s = total - done, sum(steps) / _TIMED
-            seconds = mean_s * remaining
+            remaining = total - done
+            seconds = sum(steps) / _TIMED * remaining
             about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
             say(f"{remaining} frames of cameras left to search, about {about}")
 

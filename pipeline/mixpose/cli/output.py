@@ -27,6 +27,8 @@ _FIRST_LINES = re.compile(
 )
 """First lines of files of poses that mixpose wrote."""
 
+_FOREIGN = "{} {}: holds something that mixpose did not write; name another file"
+
 
 class Output(ExitStack):
     """Write poses; the first pose opens the file, so that an earlier failure does not empty it.
@@ -58,14 +60,14 @@ class Output(ExitStack):
         if resumed is not None:
             self._writer = jsonl.JsonlWriter(cast(TextIO, resumed), header, resume=True)
         self._by_label: dict[str, Output] = {}  # if bodies have separate files
-        if not _are_separate(format_name, labels):
+        if format_name not in writers.ONE_TRAJECTORY or len(labels) < 2:
             return
         if path is None:
             raise SessionError(
                 f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
                 "with -o: each body gets one with its own name in it"
             )
-        for label, file in zip(labels, _body_paths(path, labels), strict=True):
+        for label, file in zip(labels, written_paths(path, format_name, labels), strict=True):
             self._by_label[label] = Output(file, format_name, header, options=options, whole=whole)
 
     def __enter__(self) -> Self:
@@ -109,21 +111,12 @@ class Output(ExitStack):
         return self._writer
 
 
-def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
-    """Return distinct files for the poses of bodies: ``poses.tum`` → ``poses.tool.tum``."""
+def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
+    """Return the files that poses go to; of several bodies perhaps ``poses.<body>.tum``."""
+    if path is None or format_name not in writers.ONE_TRAJECTORY or len(labels) < 2:
+        return [] if path is None else [path]
     words = distinct(labels, partial(re.sub, r"[^\w\- ]", "_"), str.casefold)
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
-
-
-def _are_separate(format_name: str, labels: Sequence[str]) -> bool:
-    return format_name in writers.ONE_TRAJECTORY and len(labels) > 1
-
-
-def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
-    """Return the files that poses go to; none for standard output."""
-    if path is None:
-        return []
-    return _body_paths(path, labels) if _are_separate(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
@@ -132,7 +125,7 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
     if beginning and not (_FIRST_LINES.fullmatch(first) or is_rerun):
-        raise _foreign(path)
+        raise SessionError(_FOREIGN.format("-o", path))
     if first.startswith(_HEADER) and '"mixpose": ' not in first:
         raise SessionError(f"-o {path}: holds poses of another origin; name another file")
 
@@ -145,7 +138,7 @@ def refuse_to_overwrite_but(
         return
     beginning = _beginning(path, inputs, option)
     if beginning and not (beginning.startswith(begins) and mark in beginning):
-        raise _foreign(path, option)
+        raise SessionError(_FOREIGN.format(option, path))
 
 
 def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") -> str:
@@ -160,12 +153,6 @@ def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") ->
         raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")
-
-
-def _foreign(path: Path, option: str = "-o") -> SessionError:
-    return SessionError(
-        f"{option} {path}: holds something that mixpose did not write; name another file"
-    )
 
 
 def is_stdout(named: Path | None) -> bool:

@@ -176,9 +176,10 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
     parsed = [counts for line in lines if (counts := parsed_frames(line))]
     frames, bodies = parsed[-1] if parsed else ({}, 1)
-    if resumes and state != FAILED:
-        with suppress(OSError, ValueError, KeyError):
-            frames = _statuses_in(poses)
+    if resumes and state != FAILED:  # interrupted runs have poses in the file, too
+        with suppress(OSError, ValueError, KeyError), poses.open(encoding="ascii") as stream:
+            whole = [json.loads(line) for line in stream if line.endswith("\n")]
+            frames = dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
     last_line = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
     reason = None if status == 0 else last_line
     outcome = replace(
@@ -204,13 +205,6 @@ def _can_resume(part: Path, job: Job) -> bool:
     for path in part.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     return False
-
-
-def _statuses_in(poses: Path) -> dict[str, int]:
-    """Count the poses of each status in a file, which interrupted runs contributed to."""
-    with poses.open(encoding="ascii") as lines:
-        whole = [json.loads(line) for line in lines if line.endswith("\n")]
-    return dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -13,7 +13,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -158,15 +158,13 @@ def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
 def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
     if isinstance(result, Outcome):
         return result
+    # its workers were lost repeatedly
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
     return replace(recording_job.outcome_of(job, FAILED, 3, reason), host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
-    names = names_of(sessions)
-    suffix = next(
-        end for end, format_name in SUFFIXES.items() if format_name == request.format_name
-    )
+    suffix = next(end for end, name in SUFFIXES.items() if name == request.format_name)
     return [
         Job(
             session=str(session.absolute()),
@@ -178,7 +176,7 @@ def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[J
             mixpose=__version__,
             shared=request.scheduler is not None,
         )
-        for session, name in zip(sessions, names, strict=True)
+        for session, name in zip(sessions, names_of(sessions), strict=True)
     ]
 
 
@@ -209,10 +207,9 @@ def _options(request: RunRequest) -> tuple[str, ...]:
 
 
 def _sha256(session: Path) -> str:
-    try:
+    with suppress(OSError):
         return hashlib.sha256(_beginning(session)).hexdigest()
-    except OSError:
-        return ""
+    return ""
 
 
 def _beginning(path: Path) -> bytes:

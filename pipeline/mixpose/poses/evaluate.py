@@ -195,14 +195,11 @@ def _check_comparable(poses: PoseFile, truth: PoseFile, true_objects: set[str]) 
         raise RecordingError(f"{truth.path}: holds no pose, so there is nothing to compare with")
     objects = {line.label for line in poses.poses}
     if objects and not objects & true_objects:
+        names, true = (", ".join(map(repr, sorted(group))) for group in (objects, true_objects))
         raise RecordingError(
-            f"{poses.path}: holds poses of {_names(objects)}, but {truth.path} of "
-            f"{_names(true_objects)}; the object's name must be the same in both"
+            f"{poses.path}: holds poses of {names}, but {truth.path} of {true}; the object's name "
+            "must be the same in both"
         )
-
-
-def _names(objects: set[str]) -> str:
-    return ", ".join(repr(name) for name in sorted(objects))
 
 
 def _right_answers(truths: Sequence[Floats], symmetries: Floats | None) -> Floats:

@@ -162,16 +162,12 @@ def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
     path = Path(path)
     data = _read_bytes(path)
     whole = data.rfind(b"\n") + 1
-    cut = whole > 0 and not _is_json(data[whole:])
-    return _parse(path, data[:whole] if cut else data), cut
-
-
-def _is_json(line: bytes) -> bool:
+    cut = False
     try:
-        json.loads(line.strip() or b"{}")
+        json.loads(data[whole:].strip() or b"{}")
     except (ValueError, RecursionError):
-        return False
-    return True
+        cut = whole > 0
+    return _parse(path, data[:whole] if cut else data), cut
 
 
 @dataclass(frozen=True)

@@ -78,13 +78,16 @@ class CsvWriter(PoseWriter):
             "status": estimate.status,
             "unit": self._header.unit,
             **_pose_cells(estimate),
-            **(_tip_cells(estimate) if self._header.tips else {}),
             "confidence": plain(estimate.confidence),
             "score": plain(1.0 if estimate.score is None else estimate.score),
             "latency_ms": plain(estimate.latency_ms or 0.0),
         }
         if self._numbered:
             row["instance"] = estimate.instance
+        if self._header.tips and estimate.tip is not None:
+            C = estimate.tip_covariance
+            upper = [] if C is None else plain(C[np.triu_indices(3)])
+            row |= zip(TIP_COLUMNS, [*plain(estimate.tip), *upper])
         for name, report in estimate.sensors.items():
             row[f"{name}_used"] = "true" if report.used else "false"
             row[f"{name}_explained"] = plain(report.explained)
@@ -112,12 +115,6 @@ def _pose_cells(estimate: Estimate) -> dict[str, Any]:
         upper = plain(estimate.covariance[np.triu_indices(6)])
         cells |= zip(COVARIANCE_COLUMNS, upper, strict=True)
     return cells
-
-
-def _tip_cells(estimate: Estimate) -> dict[str, Any]:
-    tip, C = estimate.tip, estimate.tip_covariance
-    upper = [] if C is None else plain(C[np.triu_indices(3)])
-    return {} if tip is None else dict(zip(TIP_COLUMNS, [*plain(tip), *upper]))
 
 
 class TumWriter(PoseWriter):
