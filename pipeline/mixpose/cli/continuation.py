@@ -11,10 +11,9 @@ import json
 import time
 import zlib
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 from mixpose import __version__
 from mixpose.cli.lines import LineFile, note_path
@@ -47,7 +46,7 @@ class Note:
     memory: Memory
 
 
-class Notes:
+class Notes(AbstractContextManager["Notes"]):
     """Save the state of a run at intervals if it can be resumed, and remove it at the end."""
 
     def __init__(self, request: RunRequest) -> None:
@@ -57,9 +56,6 @@ class Notes:
         self._reaches_end = request.stop is None
         self._last: tuple[int, LineFile, Memory] | None = None
         self._written_at = -INTERVAL_S
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: object, *_: object) -> None:
         if kind is not None or not self._reaches_end:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -43,40 +42,29 @@ def convert_poses(request: ConvertRequest) -> None:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
     labels = tuple(dict.fromkeys(line.label for line in lines))
     outputs = written_paths(request.output, name, labels)
-    for output in outputs if name not in MARKER_FORMATS else ():
-        if output.is_file() | (not output.exists()):
-            refuse_to_overwrite(output, [path])
+    for target in outputs if name not in MARKER_FORMATS else ():
+        if target.is_file() | (not target.exists()):
+            refuse_to_overwrite(target, [path])
     if name == "rerun":
         write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
         write_markers(poses, lines, _unit(poses, request), name, request)
         return
     else:
-        _write(poses, lines, name, labels, T_sensor_world, request)
+        frame_id = request.relative_to if name == "ros" else None
+        values = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
+        options = {key: value for key, value in values.items() if value is not None}
+        header = estimates.header_of(poses, _unit(poses, request), __version__)
+        if name != "bop" or (request.object is not None and request.obj_id is not None):
+            header = replace(header, objects=estimates.objects_of(lines))
+        with Output(request.output, name, header, labels, options=options, whole=True) as output:
+            for line in lines:
+                output.write(estimates.relative_to(T_sensor_world, line))
     if request.output is not None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
         count = len(lines) if name in ("jsonl", "csv", "rerun") else posed
         say(f"{counted(count, 'pose')} -> {', '.join(map(str, outputs))}")
-
-
-def _write(
-    poses: PoseFile,
-    lines: Sequence[PoseLine],
-    name: str,
-    labels: Sequence[str],
-    T_sensor_world: Floats,
-    request: ConvertRequest,
-) -> None:
-    frame_id = request.relative_to if name == "ros" else None
-    values = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
-    options = {key: value for key, value in values.items() if value is not None}
-    header = estimates.header_of(poses, _unit(poses, request), __version__)
-    if name != "bop" or (request.object is not None and request.obj_id is not None):
-        header = replace(header, objects=estimates.objects_of(lines))
-    with Output(request.output, name, header, labels, options=options, whole=True) as output:
-        for line in lines:
-            output.write(estimates.relative_to(T_sensor_world, line))
 
 
 def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:

@@ -27,9 +27,27 @@ def prefetch(
     for _ in range(max(depth, 1)):
         room.put(None)
     stop = threading.Event()
-    worker = threading.Thread(
-        target=_fetch, args=(items, waiting, room, stop, more), name="mixpose-prefetch", daemon=True
-    )
+
+    def fetch() -> None:
+        """Move items to the queue as there is room, until they end, fail or are stopped."""
+        # two unbounded queues cost less than a bounded one, as their locks are not in Python
+        error: BaseException | None = None
+        try:
+            with contextlib.ExitStack() as closing:
+                closing.callback(getattr(items, "close", lambda: None))
+                for k, item in enumerate(items):
+                    for _ in range(more(item) if more and not k else 0):
+                        room.put(None)
+                    room.get()
+                    if stop.is_set():
+                        break
+                    waiting.put((item,))
+        except BaseException as caught:  # the consumer raises it
+            error = caught
+        if not stop.is_set():
+            waiting.put(error)
+
+    worker = threading.Thread(target=fetch, name="mixpose-prefetch", daemon=True)
     worker.start()
     try:
         while isinstance(entry := waiting.get(), tuple):
@@ -43,30 +61,3 @@ def prefetch(
         # the garbage collector may close this generator in the thread of the worker
         if worker is not threading.current_thread():
             worker.join()
-
-
-def _fetch(
-    items: Iterator[T],
-    waiting: SimpleQueue[tuple[T] | BaseException | None],
-    room: SimpleQueue[None],
-    stop: threading.Event,
-    more: Callable[[T], int] | None,
-) -> None:
-    """Move items to the queue as there is room, until they end, fail or are stopped."""
-    # two unbounded queues cost less than a bounded one, as their locks are not in Python
-    error: BaseException | None = None
-    try:
-        with contextlib.ExitStack() as closing:
-            closing.callback(getattr(items, "close", lambda: None))
-            for item in items:
-                for _ in range(more(item) if more else 0):
-                    room.put(None)
-                more = None
-                room.get()
-                if stop.is_set():
-                    break
-                waiting.put((item,))
-    except BaseException as caught:  # the consumer raises it
-        error = caught
-    if not stop.is_set():
-        waiting.put(error)

@@ -61,11 +61,10 @@ class Video(Source):
 
     def _frames(self, wanted: range) -> Frames:
         """Decode the frames; the last of a file cut short may be incomplete and is left out."""
+        expected, room = self.resolution or self.size, captures.ColourRoom()
+        number, time_s = 0, None
+        pending: RawFrame | None = None
         with _opened(self.address) as capture:
-            number = 0
-            time_s = None
-            pending: RawFrame | None = None
-            room = captures.ColourRoom()
             while number < wanted.stop or pending is not None:
                 if not captures.grab(capture, self.address):
                     self._check_end(capture, number, time_s)
@@ -75,25 +74,15 @@ class Video(Source):
                     pending = None
                 time_s = _time_of(capture, number, time_s)
                 if number in wanted:
-                    frame = self._frame(capture, number, time_s, room)
+                    moment = Moment(time.monotonic(), "arrival") if self.size is None else None
+                    image = captures.retrieve(capture, self.address, number, expected, room)
+                    seconds = time_s if self.clock is None else self.clock(number)
+                    frame = RawFrame(number, seconds, image, moment)
                     if self.missing:
                         pending = frame
                     else:
                         yield frame
                 number += 1
-
-    def _frame(
-        self,
-        capture: cv2.VideoCapture,
-        number: int,
-        time_s: float | None,
-        room: captures.ColourRoom,
-    ) -> RawFrame:
-        moment = Moment(time.monotonic(), "arrival") if self.size is None else None
-        image = captures.retrieve(capture, self.address, number, self.resolution or self.size, room)
-        if self.clock is not None:
-            time_s = self.clock(number)
-        return RawFrame(number, time_s, image, moment)
 
     def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
         """Raise a RecordingError if the video should not end after `count` frames."""

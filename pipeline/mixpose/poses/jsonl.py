@@ -29,12 +29,16 @@ class JsonlWriter(PoseWriter):
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
-        first_line = "" if resume else json.dumps(header_line(header), allow_nan=False)
-        super().__init__(stream, header, first_line)
+        super().__init__(stream, header, "" if resume else header_text(header))
 
     def _write(self, estimate: Estimate) -> None:
         # a single call for the whole line, so that an interruption rarely leaves half of it
         self._stream.write(json.dumps(pose_line(estimate), allow_nan=False) + "\n")
+
+
+def header_text(header: Header) -> str:
+    """Return the first line of a poses file, without a line end."""
+    return json.dumps(header_line(header), allow_nan=False)
 
 
 def header_line(header: Header) -> dict[str, Any]:

@@ -115,12 +115,9 @@ class Channel(threading.Thread):
         if message.estimate.status == "ok" or self._address.options.get("only") != "ok":
             self._backlog.put(message)
 
-    def end(self) -> None:
-        """Announce that no further messages come."""
-        self._backlog.end()
-
     def close(self) -> None:
-        """After the end, send the remaining messages for a limited time, and disconnect."""
+        """Take no further messages, send the remaining ones for a limited time, and disconnect."""
+        self._backlog.end()
         began, rules = self._began, self._rules
         is_stuck = began is not None and time.monotonic() - began > rules.stuck_s
         self.join(0.0 if is_stuck else rules.farewell_s)
@@ -223,8 +220,6 @@ class Publishing:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for channel in self._channels:
-            channel.end()
         closing = [threading.Thread(target=channel.close) for channel in self._channels]
         for thread in closing:
             thread.start()

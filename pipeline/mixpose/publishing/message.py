@@ -14,7 +14,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from mixpose.errors import SessionError, require_package
 from mixpose.naming import distinct
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import header_line, pose_line
+from mixpose.poses.jsonl import pose_line
 from mixpose.records import Estimate, Moment
 
 
@@ -135,11 +135,6 @@ class Message:
         if self.ahead_s:
             line["ahead_s"] = self.ahead_s
         return json.dumps(line, allow_nan=False)
-
-
-def header_text(header: Header) -> str:
-    """Return the header line without a line end."""
-    return json.dumps(header_line(header), allow_nan=False)
 
 
 def path_word(label: str) -> str:
