@@ -123,10 +123,7 @@ def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
 
 @dataclass
 class ColourRoom:
-    """The image that is reused for all coloured frames of a capture.
-
-    To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
-    """
+    """The image reused for coloured frames: to allocate one, OpenCV waits for the interpreter."""
 
     image: cv2.typing.MatLike | None = None  # (H, W, 3 or 4), the last coloured frame
 

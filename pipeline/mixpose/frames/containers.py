@@ -1,8 +1,7 @@
-"""Test whether a video file is whole, by its outermost structure.
+"""Test whether a video file is whole: the sizes that its outermost parts state must fit into it.
 
 A decoder reports the end of a truncated file like any other, and the number of frames in a
-container may be an estimate.  But AVI, MP4 and Matroska files state the sizes of their outermost
-parts, and these must fit into the file.
+container may be an estimate.
 """
 
 from __future__ import annotations

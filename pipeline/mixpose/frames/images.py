@@ -133,10 +133,7 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
-    """Return frame numbers of images: those at the ends of names, if all have different ones.
-
-    Else they are numbered by their place in `paths`, from 0.
-    """
+    """Return frame numbers: those at the ends of names, if all differ, else places in `paths`."""
     numbers = [number for number in _end_numbers(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
 

@@ -96,10 +96,7 @@ class Source:
 
 
 def selection(start: int | None, stop: int | None, step: int, first: int | None) -> range:
-    """Return frame numbers to read, as `range`; without `start` from `first`, without `stop` all.
-
-    Raises SessionError if an argument is not a whole number, or `step` is less than 1.
-    """
+    """Return frame numbers as `range`, by default all from `first`; or raise SessionError."""
     given: dict[str, Any] = {"start": start, "stop": stop, "step": step}
     for name, value in given.items():
         if value is not None and not isinstance(value, Integral):

@@ -1,7 +1,4 @@
-"""Give frames their times, by a table or a rate; read CSV files row by row.
-
-Errors about a cell name the file and the line.
-"""
+"""Give frames their times, by a table or a rate; read CSV files, with errors that name the line."""
 
 from __future__ import annotations
 
@@ -90,10 +87,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers, from 1, and cells of the rows of a CSV file; blank lines are skipped.
-
-    Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
-    """
+    """Yield line numbers, from 1, and cells of a CSV file's rows that are not blank, or raise."""
     width = None
     cannot = reporting(RecordingError, f"{path}: cannot be read")
     try:

@@ -36,10 +36,7 @@ class Swaps:
 def renumbered(
     poses: Sequence[PoseLine], truth: Sequence[PoseLine], symmetries: Mapping[str, Floats]
 ) -> tuple[tuple[PoseLine, ...], Swaps]:
-    """Give identical bodies of the poses the numbers of the truth, and count their swaps.
-
-    Poses and truth are in one unit; symmetries (n, 4, 4) are by name of the object.
-    """
+    """Number identical bodies as in the truth, and count swaps; symmetries (n, 4, 4) by name."""
     swaps, numbers = Swaps(), dict[tuple[str, int | None], int | None]()
     for name in dict.fromkeys(line.object for line in truth if line.instance is not None):
         true_lines = [line for line in truth if line.object == name]

@@ -25,14 +25,11 @@ class _Place(NamedTuple):
 
 
 def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
-    """Return the validated table of the whole file.
-
-    Raises BadKeyError for the first error, unknown keys first: a misspelt key is often the reason
-    why another one is missing.
-    """
+    """Return the validated table of the whole file, or raise BadKeyError for its first error."""
     try:
         return root.model_validate(data)
     except ValidationError as error:
+        # unknown keys first: a misspelt one is often the reason why another one is missing
         findings = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     problem = _problem(root, findings[0])
     if len(findings) > 1:

@@ -38,10 +38,7 @@ def read_calibration(
 
 
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
-    """Read all cameras of several files, and group the files that belong together into rigs.
-
-    `also` ends the list of what is allowed in the message about a file of no known format.
-    """
+    """Read all cameras of files, grouped into rigs; `also` ends the list of allowed formats."""
     by_format: dict[str, tuple[Format, list[Content]]] = {}
     for path in paths:
         content = read_content(path, str(path))
