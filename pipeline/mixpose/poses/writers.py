@@ -26,7 +26,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
-from mixpose.poses.writing import PoseWriter, Stamps, plain, pose_of
+from mixpose.poses.writing import PoseWriter, plain, pose_of
 from mixpose.records import Estimate
 from mixpose.units import UNITS_PER_METRE
 
@@ -122,13 +122,12 @@ class TumWriter(PoseWriter):
 
     def __init__(self, stream: TextIO, header: Header) -> None:
         super().__init__(stream, header, TUM_COLUMNS)
-        self._stamps = Stamps(stream, "tum")
 
     def _write(self, estimate: Estimate) -> None:
         T = pose_of(estimate)
         if T is None:
             return
-        time = self._stamps.time_of(estimate)
+        time = self._time_of(estimate, "tum")
         position = plain(T[:3, 3] / UNITS_PER_METRE[self._header.unit])
         turn = plain(rigid.quaternion_xyzw(T))
         self._stream.write(" ".join(repr(value) for value in [time, *position, *turn]) + "\n")
@@ -184,13 +183,12 @@ class RosWriter(PoseWriter):
         super().__init__(stream, header)
         dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the former is four times as fast
         self._yaml_of = partial(yaml.dump, Dumper=dumper, sort_keys=False)
-        self._stamps = Stamps(stream, "ros")
         self._frame_id = frame_id
 
     def _write(self, estimate: Estimate) -> None:
         if pose_of(estimate) is None:
             return
-        seconds = self._stamps.time_of(estimate)
+        seconds = self._time_of(estimate, "ros")
         message = pose_message(estimate, self._header.unit, seconds, self._frame_id)
         header, pose = message["header"], {"pose": message["pose"]}
         self._stream.write(

@@ -13,9 +13,13 @@ from mixpose.errors import RecordingError
 from mixpose.poses.header import Header
 from mixpose.records import Estimate, Floats
 
+NO_TIMES = "# time is the frame number: the recording has no times"
+
 
 class PoseWriter(ABC):
     """Writes estimates to a text stream as they come; the stream stays open."""
+
+    _has_times: bool | None = None  # the first frame decides
 
     def __init__(self, stream: TextIO, header: Header, first_line: str = "") -> None:
         self._stream, self._header = stream, header
@@ -36,6 +40,21 @@ class PoseWriter(ABC):
     @abstractmethod
     def _write(self, estimate: Estimate) -> None:
         """Write a frame."""
+
+    def _time_of(self, estimate: Estimate, format_name: str) -> float:
+        """Return the time in s, or the frame number; RecordingError if earlier frames differ."""
+        has_time = estimate.time_s is not None
+        if self._has_times is None and not has_time:
+            self._stream.write(f"{NO_TIMES}\n")
+        if self._has_times not in (None, has_time):
+            text = "a time" if has_time else "no time"
+            raise RecordingError(
+                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
+                f"{format_name!r} needs times for all frames or for none; give the sensors times, "
+                "or write jsonl"
+            )
+        self._has_times = has_time
+        return float(plain(estimate.frame if estimate.time_s is None else estimate.time_s))
 
 
 def plain(values: ArrayLike | None) -> Any:
@@ -76,30 +95,3 @@ def _is_finite(value: Floats | float) -> bool:
     if not isinstance(value, np.ndarray):
         return math.isfinite(value)  # ten times as fast as NumPy for a single number
     return bool(np.isfinite(value).all())
-
-
-NO_TIMES = "# time is the frame number: the recording has no times"
-
-
-class Stamps:
-    """Times of poses; frame numbers if the recording has no times, as a comment then states."""
-
-    def __init__(self, stream: TextIO, format_name: str) -> None:
-        self._stream, self._format = stream, format_name
-        self._has_times: bool | None = None  # the first frame decides
-
-    def time_of(self, estimate: Estimate) -> float:
-        """Return the time in s, or the frame number; RecordingError if earlier frames differ."""
-        has_time = estimate.time_s is not None
-        if self._has_times is None:
-            self._has_times = has_time
-            if not has_time:
-                self._stream.write(f"{NO_TIMES}\n")
-        if has_time != self._has_times:
-            text = "a time" if has_time else "no time"
-            raise RecordingError(
-                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
-                f"{self._format!r} needs times for all frames or for none; give the sensors "
-                "times, or write jsonl"
-            )
-        return float(plain(estimate.frame if estimate.time_s is None else estimate.time_s))
