@@ -137,7 +137,7 @@ _SETUPS = (
 _CALIBRATIONS = (
     Mutant(
         "session-kalibr-order",
-        "session/calibration/kalibr.py",
+        "session/calibration/mappings.py",
         "fu, fv, pu, pv = intrinsics",
         "fu, pu, fv, pv = intrinsics",
         "focal lengths and principal points of Kalibr are mixed up",
@@ -151,14 +151,14 @@ _CALIBRATIONS = (
     ),
     Mutant(
         "session-ros-height-by-width",
-        "session/calibration/ros.py",
+        "session/calibration/mappings.py",
         "size_of([width, height])",
         "size_of([height, width])",
         "features at the sides of the image are not seen",
     ),
     Mutant(
         "session-binned-images-pass",
-        "session/calibration/ros.py",
+        "session/calibration/mappings.py",
         "if table.get(key, 0) not in whole:",
         'if kind == "cropped" and table.get(key, 0) not in whole:',
         "the camera matrix of the whole image is used for binned ones",

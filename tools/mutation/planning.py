@@ -9,7 +9,7 @@ _IMPORTS = ("test_import.py",)
 _FORMATS = (
     Mutant(
         "session-kalibr-chain-from-the-wrong-end",
-        "session/calibration/kalibr.py",
+        "session/calibration/mappings.py",
         "T = step @ T",
         "T = T @ step",
         "the third camera of a chain stands elsewhere",
@@ -17,7 +17,7 @@ _FORMATS = (
     ),
     Mutant(
         "session-kalibr-imu-the-wrong-way-round",
-        "session/calibration/kalibr.py",
+        "session/calibration/mappings.py",
         "return None if T_imu_cam is None else inverse(T_imu_cam)",
         "return T_imu_cam",
         "cameras of OpenVINS stand elsewhere",

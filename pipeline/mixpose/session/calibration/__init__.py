@@ -1,4 +1,4 @@
-"""Read calibration files, whose format is recognised by content; each format has a module."""
+"""Read calibration files, whose format is recognised by content."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from pathlib import Path
 
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Rig, read_content
 from mixpose.session.calibration.colmap import COLMAP
-from mixpose.session.calibration.kalibr import KALIBR
+from mixpose.session.calibration.mappings import (
+    ANIPOSELIB,
+    CALISCOPE,
+    KALIBR,
+    PYCALIB,
+    ROS,
+    ROS_INI,
+)
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
-from mixpose.session.calibration.ros import ROS, ROS_INI
-from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE, PYCALIB
 from mixpose.session.geometry import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
