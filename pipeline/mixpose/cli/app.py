@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,9 +24,12 @@ from mixpose.cli.request import (
 )
 from mixpose.units import Unit
 
-MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
-IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
-"""Groups of the options of ``mixpose simulate``."""
+motion = partial(option, panel="Motion of the body")
+images = partial(option, panel="Images")
+tables = partial(option, panel="Profiles and tables")
+in_view = partial(option, panel="What else is in view")
+in_time = partial(option, panel="Time, and sensors that are not as told")
+"""Options of ``mixpose simulate``, by their groups."""
 
 _TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 
@@ -200,63 +204,46 @@ class SimulateRequest:
     output: Path = option("New folder for the recording.", ...)
     frames: int = option("Number of frames.", ..., min=1)
     seed: int = option("Same seed, same recording.", 0, min=0)
-    fps: float | None = option(
-        "Frames per second; for poses with times put fps into the session.", panel=TIME
+    fps: float | None = in_time("Frames per second; for poses with times put fps into the session.")
+    noise: float = images("Camera noise, grey levels.", 2.0)
+    clutter: float = in_view("False features per frame and sensor.", 0.0)
+    hidden: float = in_view("Chance that a feature is hidden.", 0.0)
+    missing: float = in_time("Chance that a sensor has no frame.", 0.0)
+    brightness: float = images("Peak of a spot, grey levels.", 170.0)
+    brightness_spread: float = images(
+        "Spread of the brightness over the features, as a share.", 0.1
     )
-    noise: float = option("Camera noise, grey levels.", 2.0, panel=IMAGES)
-    clutter: float = option("False features per frame and sensor.", 0.0, panel=IN_VIEW)
-    hidden: float = option("Chance that a feature is hidden.", 0.0, panel=IN_VIEW)
-    missing: float = option("Chance that a sensor has no frame.", 0.0, panel=TIME)
-    brightness: float = option("Peak of a spot, grey levels.", 170.0, panel=IMAGES)
-    brightness_spread: float = option(
-        "Spread of the brightness over the features, as a share.", 0.1, panel=IMAGES
+    amplitude_translation: float | None = motion(
+        "Largest displacement along each axis, length units.", name="--translation"
     )
-    amplitude_translation: float | None = option(
-        "Largest displacement along each axis, length units.", name="--translation", panel=MOTION
+    amplitude_rotation_deg: float = motion(
+        "Largest turn about each axis, degrees.", 20.0, name="--rotation"
     )
-    amplitude_rotation_deg: float = option(
-        "Largest turn about each axis, degrees.", 20.0, name="--rotation", panel=MOTION
+    period_s: float = motion("Seconds in which the motion comes round.", 4.0, name="--period")
+    pixel_noise: float = tables("Error of detections in a camera's table, px.", 0.1)
+    range_noise: float | None = tables(
+        "Error of detections in tables of ranges and of clouds, length units."
     )
-    period_s: float = option(
-        "Seconds in which the motion comes round.", 4.0, name="--period", panel=MOTION
+    range_snr: float = tables("Height of a profile's peak over its noise.", 30.0)
+    deform: bool = in_view("Displace features by the spread the object states.", False)
+    readout: float | None = in_time(
+        "Seconds from a camera's first row to its last; else the session's."
     )
-    pixel_noise: float = option("Error of detections in a camera's table, px.", 0.1, panel=TABLES)
-    range_noise: float | None = option(
-        "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
+    exposure: float | None = in_time("Seconds for which a row is lit; else the session's.")
+    delay: list[str] | None = in_time(
+        "A sensor that is late; else the session's.", metavar="NAME=SECONDS"
     )
-    range_snr: float = option("Height of a profile's peak over its noise.", 30.0, panel=TABLES)
-    deform: bool = option(
-        "Displace features by the spread the object states.", False, panel=IN_VIEW
+    out_of_step: float = in_time("Seconds from the first sensor to the last, in their times.", 0.0)
+    lamps: int = in_view("Lamps behind the body.", 0, min=0)
+    mirror: float = in_view("Brightness of mirror images in a table below, as a share.", 0.0)
+    others: int = in_view("Other bodies with as many markers, beside this one.", 0, min=0)
+    occluder: int = in_view("Dark bars that swing before it.", 0, min=0)
+    jpeg: int | None = images("Quality of lossy compression.", min=1, max=100)
+    bayer: bool = images("Images of a colour sensor, interpolated.", False)
+    turned_camera_deg: float = in_time(
+        "Degrees by which the last camera was turned meanwhile.", 0.0, name="--turned-camera"
     )
-    readout: float | None = option(
-        "Seconds from a camera's first row to its last; else the session's.", panel=TIME
-    )
-    exposure: float | None = option(
-        "Seconds for which a row is lit; else the session's.", panel=TIME
-    )
-    delay: list[str] | None = option(
-        "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
-    )
-    out_of_step: float = option(
-        "Seconds from the first sensor to the last, in their times.", 0.0, panel=TIME
-    )
-    lamps: int = option("Lamps behind the body.", 0, min=0, panel=IN_VIEW)
-    mirror: float = option(
-        "Brightness of mirror images in a table below, as a share.", 0.0, panel=IN_VIEW
-    )
-    others: int = option(
-        "Other bodies with as many markers, beside this one.", 0, min=0, panel=IN_VIEW
-    )
-    occluder: int = option("Dark bars that swing before it.", 0, min=0, panel=IN_VIEW)
-    jpeg: int | None = option("Quality of lossy compression.", min=1, max=100, panel=IMAGES)
-    bayer: bool = option("Images of a colour sensor, interpolated.", False, panel=IMAGES)
-    turned_camera_deg: float = option(
-        "Degrees by which the last camera was turned meanwhile.",
-        0.0,
-        name="--turned-camera",
-        panel=TIME,
-    )
-    away_from: int | None = option("Frames after which the body is gone.", min=0, panel=MOTION)
+    away_from: int | None = motion("Frames after which the body is gone.", min=0)
     overwrite: bool = option("Replace a recording in the folder.", False)
 
 
