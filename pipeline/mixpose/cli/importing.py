@@ -163,25 +163,20 @@ def _plain(name: str) -> str:
 
 
 def _camera_warnings(cameras: list[CalibratedCamera]) -> list[str]:
-    warnings = []
-    unplaced = [camera.name for camera in cameras if camera.T_camera_rig is None]
-    if unplaced and len(cameras) > 1:
-        warnings.append(
-            f"{', '.join(unplaced)}: the files do not say where they stand; add T_sensor_world"
-        )
-    unsized = [camera.name for camera in cameras if camera.intrinsics.resolution is None]
-    if unsized:
-        warnings.append(
-            f"{', '.join(unsized)}: the files do not say how large images are; see that recordings "
-            "have the size that was calibrated"
-        )
     lenses = {camera.name: camera.intrinsics for camera in cameras}
-    unclear = [name for name, k in lenses.items() if k.model is None and k.distortion.size == 4]
-    if unclear:
-        warnings.append(
-            f"{', '.join(unclear)}: four coefficients of distortion are a pinhole's or a fisheye's"
-            ', and the file does not say which; where it is a fisheye\'s, change model to "fisheye"'
-        )
+    unplaced = [camera.name for camera in cameras if camera.T_camera_rig is None]
+    doubts = {
+        "the files do not say where they stand; add T_sensor_world": (
+            unplaced if len(cameras) > 1 else []
+        ),
+        "the files do not say how large images are; see that recordings have the size that was "
+        "calibrated": [name for name, lens in lenses.items() if lens.resolution is None],
+        "four coefficients of distortion are a pinhole's or a fisheye's, and the file does not say "
+        'which; where it is a fisheye\'s, change model to "fisheye"': [
+            name for name, k in lenses.items() if k.model is None and k.distortion.size == 4
+        ],
+    }
+    warnings = [f"{', '.join(names)}: {text}" for text, names in doubts.items() if names]
     for camera in cameras:
         (cx, cy), size = camera.intrinsics.camera_matrix[:2, 2], camera.intrinsics.resolution
         if size and not (0 <= cx <= size[0] - 1 and 0 <= cy <= size[1] - 1):

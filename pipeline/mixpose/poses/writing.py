@@ -72,14 +72,8 @@ def pose_of(estimate: Estimate) -> Floats | None:
 
 def require_finite(estimate: Estimate) -> None:
     """Raise a ValueError, with frame and field, for a NaN or an infinity: a fault of mixpose."""
-    values: dict[str, Floats | float | None] = {
-        "time_s": estimate.time_s,
-        "T_world_object": estimate.T_world_object,
-        "covariance": estimate.covariance,
-        "score": estimate.score,
-        "confidence": estimate.confidence,
-        "latency_ms": estimate.latency_ms,
-    }
+    names = ("time_s", "T_world_object", "covariance", "score", "confidence", "latency_ms")
+    values: dict[str, Floats | float | None] = {name: getattr(estimate, name) for name in names}
     for name, report in estimate.sensors.items():
         values[f"sensors.{name}.explained"] = report.explained
         values[f"sensors.{name}.rms"] = report.rms
