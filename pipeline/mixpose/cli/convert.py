@@ -107,8 +107,7 @@ def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floa
         session = session_of(poses, request.session, unit=request.unit)
     except SessionError as error:
         raise SessionError(f"--relative-to {name}: no body, which are {bodies}; {error}") from error
-    sensors = {setup.name: setup.sensor for setup in session.sensors}
-    cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
+    cameras = {s.name: s.sensor for s in session.sensors if not isinstance(s.sensor, RangeSensor)}
     if name in cameras:
         return np.asarray(cameras[name].T_sensor_world)  # type: ignore[attr-defined]
     allowed = f"cameras are {', '.join(cameras)}" if cameras else "the session has no camera"

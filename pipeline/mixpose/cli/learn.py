@@ -89,22 +89,17 @@ def _report(
             lines += [f"count = {body.count}"] if body.count > 1 else []
     output.print_lines(lines, *files)
     names = [file.name for file in shown_files]
-    pairs = zip(bodies, names, strict=True)
+    pairs = list(zip(bodies, names, strict=True))
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
-    for doubt in (*doubts, *look_alikes(bodies, names), *_late_warnings(session, bodies, names)):
+    doubts += look_alikes(bodies, names)
+    if late := [setup.name for setup in session.sensors if setup.delay or setup.readout]:
+        doubts += [
+            f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, "
+            "of which none is followed: move slowly, or learn from a recording of one alone"
+            for body, name in pairs
+            if body.count > 1
+        ]
+    for doubt in doubts:
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
-
-
-def _late_warnings(
-    session: Session, bodies: Sequence[LearntBody], names: Sequence[str]
-) -> list[str]:
-    """Return warnings of identical bodies, whose motion is unknown although sensors are late."""
-    late = [setup.name for setup in session.sensors if setup.delay or setup.readout]
-    return [
-        f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, of "
-        "which none is followed: move slowly, or learn from a recording of one alone"
-        for name, body in zip(names, bodies, strict=True)
-        if late and body.count > 1
-    ]

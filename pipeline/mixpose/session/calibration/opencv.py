@@ -23,7 +23,7 @@ from mixpose.rigid import inverse
 from mixpose.session import geometry as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
 from mixpose.session.geometry import CameraModel, Intrinsics, rigid
-from mixpose.session.messages import BadKeyError, nearest, under
+from mixpose.session.messages import BadKeyError, did_you_mean, under
 from mixpose.session.values import numbers
 
 # Names of nodes in files of OpenCV's samples and common calibration programs, tried in order.
@@ -180,9 +180,8 @@ def choose_node(opened: _Nodes, key: str, named: str | None) -> str:
             f"found none of the nodes {', '.join(common)}; name it as "
             f'calibration = {{ file = "...", {key} = "..." }}; {nodes}'
         )
-    close = nearest(named, present)
-    hint = f' did you mean "{close}"?' if close else ""
-    raise BadKeyError(f'found no node "{named}" for {key};{hint} {nodes}')
+    hint = did_you_mean(named, present) or ";"
+    raise BadKeyError(f'found no node "{named}" for {key}{hint} {nodes}')
 
 
 def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
