@@ -12,17 +12,17 @@ import typer
 
 from mixpose.cli.help import Command, Commands
 from mixpose.cli.request import (
-    AllowCode,
+    ANOTHER,
+    ANY_CODE,
     ConvertFormat,
-    PosesFile,
-    Recordings,
     RunRequest,
-    SessionFile,
-    Sources,
+    argument,
     command_for,
     option,
 )
 from mixpose.units import Unit
+
+INSTEAD = "Recording of a sensor in place of the session's."
 
 motion = partial(option, panel="Motion of the body")
 images = partial(option, panel="Images")
@@ -31,7 +31,6 @@ in_view = partial(option, panel="What else is in view")
 in_time = partial(option, panel="Time, and sensors that are not as told")
 """Options of ``mixpose simulate``, by their groups."""
 
-_TRUTH = typer.Argument(metavar="TRUTH.jsonl", help="True poses.")
 
 app = typer.Typer(
     name="mixpose",
@@ -65,14 +64,12 @@ def _common(
 class ImportRequest:
     """Make a session of the calibration files of other programs."""
 
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and bodies: .csv, .rom, .vsk or .obj.",
-        ),
-    ]
+    files: list[Path] = argument(
+        "Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, and "
+        "bodies: .csv, .rom, .vsk or .obj.",
+        ...,
+        metavar="FILE...",
+    )
     output: Path = option("The session file, which must be new; or stdout (-).", ...)
     unit: Unit = option("Unit of lengths in the session.", "mm")
     lengths: Unit | None = option("Unit of translations in files whose format does not fix it.")
@@ -82,7 +79,7 @@ class ImportRequest:
 class CalibrateRequest:
     """Calibrate sensors from a recording of the body, without matching markers."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     output: Path | None = option(
         "The calibrated session; or stdout (-).", metavar="CALIBRATED.toml"
     )
@@ -104,15 +101,15 @@ class CalibrateRequest:
     )
     check: bool = option("Only say whether the calibration still holds.", False)
     report: Path | None = option("A page with pictures; or stdout (-).", metavar="FILE.html")
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
+    allow_code: bool = option(ANY_CODE, False)
 
 
 @dataclass(frozen=True)
 class LearnRequest:
     """Learn the markers of bodies from a recording in which they move."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     output: Path = option(
         "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
         "one may go to stdout (-).",
@@ -128,20 +125,17 @@ class LearnRequest:
         "An older or measured table of the same markers, whose axes and names are kept.",
         metavar="OLD.csv",
     )
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
+    allow_code: bool = option(ANY_CODE, False)
 
 
 @dataclass(frozen=True)
 class DesignRequest:
     """Predict the accuracy of planned systems, side by side, and what would improve them."""
 
-    sessions: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SESSION.toml", help="One system or several; others are held to the first."
-        ),
-    ]
+    sessions: list[Path] = argument(
+        "One system or several; others are held to the first.", ..., metavar="SESSION.toml"
+    )
     poses: Path | None = option("Judge at these poses, not over a volume.", metavar="POSES.jsonl")
     count: int = option("Number of poses in the volume.", 24, min=1, max=2000)
     volume: str | None = option(
@@ -176,31 +170,31 @@ class DesignRequest:
 class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     quick: bool = option("Look at a few frames of each sensor only.", False)
-    source: Sources = None
-    allow_code: AllowCode = False
+    source: list[str] | None = option(ANOTHER, metavar="NAME=PATH")
+    allow_code: bool = option(ANY_CODE, False)
 
 
 @dataclass(frozen=True)
 class InspectRequest:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     output: Path = option("Folder for the pictures.", ...)
     frame: int | None = option("Number of the frame; else the recording's first.")
     poses: Path | None = option(
         "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
     )
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
+    allow_code: bool = option(ANY_CODE, False)
 
 
 @dataclass(frozen=True)
 class SimulateRequest:
     """Render a recording with truth.jsonl that `run` can play."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     output: Path = option("New folder for the recording.", ...)
     frames: int = option("Number of frames.", ..., min=1)
     seed: int = option("Same seed, same recording.", 0, min=0)
@@ -251,8 +245,8 @@ class SimulateRequest:
 class EvaluateRequest:
     """Errors of poses against the truth, modulo the object's symmetries."""
 
-    poses: PosesFile
-    truth: Annotated[Path, _TRUTH]
+    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
+    truth: Path = argument("True poses.", ..., metavar="TRUTH.jsonl")
     json: bool = option("Print JSON instead of a table.", False)
 
 
@@ -260,16 +254,16 @@ class EvaluateRequest:
 class ReportRequest:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
 
-    poses: PosesFile
+    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
     output: Path = option("The page, as report.html; or stdout (-).", ...)
-    truth: Annotated[Path | None, _TRUTH] = None
+    truth: Path | None = argument("True poses.", metavar="TRUTH.jsonl")
 
 
 @dataclass(frozen=True)
 class ConvertRequest:
     """Write poses in the format of another program."""
 
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")]
+    poses: Path = argument("Poses or true poses.", ..., metavar="POSES.jsonl")
     output: Path | None = option("Write here, not to stdout (-).")
     format: ConvertFormat | None = option(
         "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
@@ -291,14 +285,14 @@ class ConvertRequest:
         "c3d, trc: leave gaps where a marker was not measured by itself.", False
     )
     fps: float | None = option("c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6)
-    allow_code: AllowCode = False
+    allow_code: bool = option(ANY_CODE, False)
 
 
 @dataclass(frozen=True)
 class SmoothRequest:
     """Smooth the poses of a recording, each by all that came before and after."""
 
-    poses: PosesFile
+    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
     output: Path | None = option("Write here, not to stdout (-).", metavar="SMOOTH.jsonl")
     fill: float = option(
         "Fill gaps of at most so long, marked; else none.", 0.0, min=0, metavar="SECONDS"
@@ -312,7 +306,7 @@ class SmoothRequest:
 class PivotRequest:
     """The tip of a tool, from poses while it turns about its tip."""
 
-    poses: PosesFile
+    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
     object: str | None = option("The tool, where there are several bodies.", metavar="OBJECT")
     reference: str | None = option(
         "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
@@ -324,7 +318,7 @@ class PivotRequest:
 class AlignRequest:
     """A session in the frame of the floor: bodies, points or a plane that lie on it."""
 
-    session: SessionFile
+    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
     floor: list[str] = option(
         "What lies on the floor: poses, or a body in a frame. Repeatable.",
         ...,
@@ -332,8 +326,8 @@ class AlignRequest:
     )
     output: Path = option("The aligned session; or stdout (-).", ..., metavar="ALIGNED.toml")
     up: Literal["x", "y", "z"] = option("The axis that points up.", "z")
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
+    allow_code: bool = option(ANY_CODE, False)
 
 
 def _schema() -> None:

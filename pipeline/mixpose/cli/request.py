@@ -8,6 +8,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
+from functools import partial
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
@@ -21,26 +22,12 @@ from mixpose.selection import Selection
 Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
 ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
 
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
-PosesFile = Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")]
-Recordings = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
-]
-AllowCode = Annotated[
-    bool,
-    typer.Option(
-        "--allow-code", help='Run functions that the session names: method = "module:function".'
-    ),
-]
-Sources = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=PATH",
-        help="Another recording of a sensor, relative to the working folder, or the number of a "
-        "camera; repeatable.",
-    ),
-]
+ANOTHER = (
+    "Another recording of a sensor, relative to the working folder, or the number of a camera; "
+    "repeatable."
+)
+ANY_CODE = 'Run functions that the session names: method = "module:function".'
+"""Help of options of several commands."""
 
 SUFFIXES = {
     ".jsonl": "jsonl",
@@ -62,12 +49,17 @@ def option(
     *,
     name: str | None = None,
     panel: str | None = None,
+    make: Callable[..., Any] = typer.Option,
     **more: Any,
 ) -> Any:
     """Return a field that is an option, required if the default is `...`; `more` goes to typer."""
     settings = {"help": meaning, "rich_help_panel": panel, **more}
-    metadata = {"name": name, "settings": settings}
+    metadata = {"name": name, "make": make, "settings": settings}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+argument = partial(option, make=typer.Argument)
+"""A function that returns a field that is an argument."""
 
 
 def option_name(entry: Field[Any]) -> str:
@@ -85,11 +77,12 @@ def command_for(request: type, work: str) -> Callable[..., None]:
     """
     hints: dict[str, Any] = get_type_hints(request, include_extras=True)
     for entry in fields(request):
-        if entry.metadata:
-            names = ("-o", "--output") if entry.name == "output" else (option_name(entry),)
-            hints[entry.name] = Annotated[
-                hints[entry.name], typer.Option(*names, **entry.metadata["settings"])
-            ]
+        if make := entry.metadata.get("make"):
+            names: list[str] = []
+            if make is typer.Option:
+                names = ["-o", "--output"] if entry.name == "output" else [option_name(entry)]
+            made = make(*names, **entry.metadata["settings"])
+            hints[entry.name] = Annotated[hints[entry.name], made]
     form = signature(request)
     if "debug" in hints:
         hints["debug"] = typer.Context  # which has the value
@@ -110,14 +103,12 @@ def command_for(request: type, work: str) -> Callable[..., None]:
 class RunRequest:
     """Estimate a pose per frame."""
 
-    sessions: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SESSION.toml...",
-            help="One session file or several, patterns such as 'day*/session.toml', or text files "
-            "(.txt) with one to a line.",
-        ),
-    ]
+    sessions: list[str] = argument(
+        "One session file or several, patterns such as 'day*/session.toml', or text files (.txt) "
+        "with one to a line.",
+        ...,
+        metavar="SESSION.toml...",
+    )
     output: Path | None = option(
         "Write poses here, not to stdout (-), in the format that the suffix tells. With "
         "several sessions, a folder in which each gets its own for poses, log and status; what "
@@ -126,7 +117,7 @@ class RunRequest:
     format: Format | None = option(
         "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
     )
-    source: Sources = None
+    source: list[str] | None = option(ANOTHER, metavar="NAME=PATH")
     start: int | None = option("First frame number.")
     stop: int | None = option("Frame number to stop before.")
     step: int = option("Take every N-th frame number.", 1, min=1)
@@ -160,7 +151,7 @@ class RunRequest:
     predict: float | None = option(
         "Publish where the body will be so much after each frame.", metavar="SECONDS"
     )
-    allow_code: AllowCode = False
+    allow_code: bool = option(ANY_CODE, False)
     debug: bool = False
 
     @property
