@@ -143,7 +143,7 @@ MUTANTS = (
     ),
     Mutant(
         "poses-foretold-through-gaps",
-        "poses/foretold.py",
+        "poses/truth.py",
         "_GAP * usual) + 1",
         "_GAP * usual * 100) + 1",
         "the truth is made up for frames that it does not have",

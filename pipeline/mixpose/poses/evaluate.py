@@ -25,10 +25,9 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses import consistency
 from mixpose.poses.estimates import in_unit
-from mixpose.poses.foretold import truth_ahead
-from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.poses.truth import Swaps, renumbered, truth_ahead
 from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5
