@@ -11,9 +11,8 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames import Source, numbers_of, spread_over
+from mixpose.frames import Source, numbers_of, prefetch, spread_over
 from mixpose.frames.images import ImageSequence
-from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Frames, is_same, shown_by
 from mixpose.frames.tables import DetectionTable
 from mixpose.frames.video import Video
