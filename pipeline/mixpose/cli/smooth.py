@@ -64,10 +64,9 @@ def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) 
         header_of(poses, str(poses.unit), __version__),
         smoothed={label: _model(body) for label, body in bodies.items()},
     )
-    order = {label: k for k, label in enumerate(bodies)}
-    lines = [estimate for body in bodies.values() for estimate in body.estimates]
+    estimates = [estimate for body in bodies.values() for estimate in body.estimates]
     with Output(path, "jsonl", header, whole=True) as writer:
-        for estimate in sorted(lines, key=lambda estimate: (estimate.frame, order[estimate.label])):
+        for estimate in sorted(estimates, key=lambda estimate: estimate.frame):  # then by body
             writer.write(estimate)
 
 
