@@ -20,6 +20,7 @@ from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source, numbers_of
 from mixpose.frames.tables import DetectionTable
+from mixpose.frames.times import LISTED, listed
 from mixpose.judgement import expected_covariance
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, transform
@@ -148,13 +149,13 @@ def _say_sensor(
     if survey.damage:
         read = f"{len(survey.damage)} of the {total} looked at cannot be read"
     report.say("", read if survey.damage and not survey.numbers else f"{source.describe()}; {read}")
-    for text in survey.damage[: recordings.LISTED]:
+    for text in survey.damage[:LISTED]:
         report.say("", f"damaged: {text}")
     if caution := source.caution():
         report.warn(f"sensor {setup.name!r}: {caution}")
     numbers = {*survey.numbers, *survey.damaged}
     all_numbers = numbers.union(*(other.numbers for other in surveys.values()))
-    missing = recordings.listed(sorted(all_numbers - numbers))
+    missing = listed(sorted(all_numbers - numbers))
     if missing and all(other.is_whole for other in surveys.values()):
         report.say("", f"missing: {missing} of the {len(all_numbers)} frames of all sensors")
     _say_features(report, setup, source, survey)
@@ -196,7 +197,7 @@ def _say_features(
         report.warn(f"{sensor}: its recording has no frame")
     if survey.counts is None:
         if survey.numbers and survey.empty:
-            frames = recordings.listed(survey.empty)
+            frames = listed(survey.empty)
             report.warn(f"{sensor}: nothing but one value in frame {frames}")
         return
     low, high = min(survey.counts), max(survey.counts)
@@ -217,7 +218,7 @@ def _say_features(
             f"{expected} are expected: {keys.advice(session, setup, typical, image, expected)}"
         )
     elif survey.empty:
-        report.warn(f"{sensor}: no feature in frame {recordings.listed(survey.empty)}")
+        report.warn(f"{sensor}: no feature in frame {listed(survey.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,15 @@ if TYPE_CHECKING:
 Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
-_MOST_NUMBERS = 5  # frame numbers that a message names
+LISTED = 5  # frame numbers that a message names
 _LARGEST_NUMBER = 10**255  # as many digits as a file name may have
 _LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """List frame numbers in words; of many the first, and how many there are."""
+    text = ", ".join(map(str, numbers[:LISTED]))
+    return text if len(numbers) <= LISTED else f"{text}, ... ({len(numbers)} frames)"
 
 
 @dataclass(frozen=True)
@@ -46,11 +52,10 @@ class FrameTimes:
         """Raise a RecordingError if the table lacks a row of these frames."""
         if not (missing := self.missing(numbers)):
             return
-        named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
-        more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
+        frames = f"frame{'s' * (len(missing) > 1)} {listed(missing)}"
         raise RecordingError(
-            f"{self.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
-            "table with a row for each frame of the recording, or fps in place of times"
+            f"{self.path}: no row for {frames}; allowed is a table with a row for each frame of "
+            "the recording, or fps in place of times"
         )
 
 
