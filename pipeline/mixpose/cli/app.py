@@ -6,23 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.request import (
-    ANOTHER,
-    ANY_CODE,
-    ConvertFormat,
-    RunRequest,
-    argument,
-    command_for,
-    option,
-)
+from mixpose.cli.request import RunRequest, another_source, any_code, argument, command_for, option
 from mixpose.units import Unit
 
-INSTEAD = "Recording of a sensor in place of the session's."
+ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
+
+session_file = partial(argument, "The session file.", ..., metavar="SESSION.toml")
+poses_file = partial(argument, "Estimated poses.", ..., metavar="POSES.jsonl")
+instead = partial(option, "Recording of a sensor in place of the session's.", metavar="NAME=PATH")
+"""Arguments and options of several commands."""
 
 motion = partial(option, panel="Motion of the body")
 images = partial(option, panel="Images")
@@ -79,7 +76,7 @@ class ImportRequest:
 class CalibrateRequest:
     """Calibrate sensors from a recording of the body, without matching markers."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     output: Path | None = option(
         "The calibrated session; or stdout (-).", metavar="CALIBRATED.toml"
     )
@@ -101,15 +98,15 @@ class CalibrateRequest:
     )
     check: bool = option("Only say whether the calibration still holds.", False)
     report: Path | None = option("A page with pictures; or stdout (-).", metavar="FILE.html")
-    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
-    allow_code: bool = option(ANY_CODE, False)
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class LearnRequest:
     """Learn the markers of bodies from a recording in which they move."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     output: Path = option(
         "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
         "one may go to stdout (-).",
@@ -125,8 +122,8 @@ class LearnRequest:
         "An older or measured table of the same markers, whose axes and names are kept.",
         metavar="OLD.csv",
     )
-    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
-    allow_code: bool = option(ANY_CODE, False)
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
@@ -170,31 +167,31 @@ class DesignRequest:
 class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     quick: bool = option("Look at a few frames of each sensor only.", False)
-    source: list[str] | None = option(ANOTHER, metavar="NAME=PATH")
-    allow_code: bool = option(ANY_CODE, False)
+    source: list[str] | None = another_source()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class InspectRequest:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     output: Path = option("Folder for the pictures.", ...)
     frame: int | None = option("Number of the frame; else the recording's first.")
     poses: Path | None = option(
         "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
     )
-    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
-    allow_code: bool = option(ANY_CODE, False)
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class SimulateRequest:
     """Render a recording with truth.jsonl that `run` can play."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     output: Path = option("New folder for the recording.", ...)
     frames: int = option("Number of frames.", ..., min=1)
     seed: int = option("Same seed, same recording.", 0, min=0)
@@ -245,7 +242,7 @@ class SimulateRequest:
 class EvaluateRequest:
     """Errors of poses against the truth, modulo the object's symmetries."""
 
-    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
+    poses: Path = poses_file()
     truth: Path = argument("True poses.", ..., metavar="TRUTH.jsonl")
     json: bool = option("Print JSON instead of a table.", False)
 
@@ -254,7 +251,7 @@ class EvaluateRequest:
 class ReportRequest:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
 
-    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
+    poses: Path = poses_file()
     output: Path = option("The page, as report.html; or stdout (-).", ...)
     truth: Path | None = argument("True poses.", metavar="TRUTH.jsonl")
 
@@ -285,14 +282,14 @@ class ConvertRequest:
         "c3d, trc: leave gaps where a marker was not measured by itself.", False
     )
     fps: float | None = option("c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6)
-    allow_code: bool = option(ANY_CODE, False)
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class SmoothRequest:
     """Smooth the poses of a recording, each by all that came before and after."""
 
-    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
+    poses: Path = poses_file()
     output: Path | None = option("Write here, not to stdout (-).", metavar="SMOOTH.jsonl")
     fill: float = option(
         "Fill gaps of at most so long, marked; else none.", 0.0, min=0, metavar="SECONDS"
@@ -306,7 +303,7 @@ class SmoothRequest:
 class PivotRequest:
     """The tip of a tool, from poses while it turns about its tip."""
 
-    poses: Path = argument("Estimated poses.", ..., metavar="POSES.jsonl")
+    poses: Path = poses_file()
     object: str | None = option("The tool, where there are several bodies.", metavar="OBJECT")
     reference: str | None = option(
         "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
@@ -318,7 +315,7 @@ class PivotRequest:
 class AlignRequest:
     """A session in the frame of the floor: bodies, points or a plane that lie on it."""
 
-    session: Path = argument("The session file.", ..., metavar="SESSION.toml")
+    session: Path = session_file()
     floor: list[str] = option(
         "What lies on the floor: poses, or a body in a frame. Repeatable.",
         ...,
@@ -326,8 +323,8 @@ class AlignRequest:
     )
     output: Path = option("The aligned session; or stdout (-).", ..., metavar="ALIGNED.toml")
     up: Literal["x", "y", "z"] = option("The axis that points up.", "z")
-    source: list[str] | None = option(INSTEAD, metavar="NAME=PATH")
-    allow_code: bool = option(ANY_CODE, False)
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 def _schema() -> None:

@@ -20,14 +20,6 @@ from mixpose.errors import SessionError
 from mixpose.selection import Selection
 
 Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
-ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
-
-ANOTHER = (
-    "Another recording of a sensor, relative to the working folder, or the number of a camera; "
-    "repeatable."
-)
-ANY_CODE = 'Run functions that the session names: method = "module:function".'
-"""Help of options of several commands."""
 
 SUFFIXES = {
     ".jsonl": "jsonl",
@@ -59,7 +51,16 @@ def option(
 
 
 argument = partial(option, make=typer.Argument)
-"""A function that returns a field that is an argument."""
+another_source = partial(
+    option,
+    "Another recording of a sensor, relative to the working folder, or the number of a camera; "
+    "repeatable.",
+    metavar="NAME=PATH",
+)
+any_code = partial(
+    option, 'Run functions that the session names: method = "module:function".', False
+)
+"""Arguments, and options that several commands have."""
 
 
 def option_name(entry: Field[Any]) -> str:
@@ -117,7 +118,7 @@ class RunRequest:
     format: Format | None = option(
         "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
     )
-    source: list[str] | None = option(ANOTHER, metavar="NAME=PATH")
+    source: list[str] | None = another_source()
     start: int | None = option("First frame number.")
     stop: int | None = option("Frame number to stop before.")
     step: int = option("Take every N-th frame number.", 1, min=1)
@@ -151,7 +152,7 @@ class RunRequest:
     predict: float | None = option(
         "Publish where the body will be so much after each frame.", metavar="SECONDS"
     )
-    allow_code: bool = option(ANY_CODE, False)
+    allow_code: bool = any_code()
     debug: bool = False
 
     @property
