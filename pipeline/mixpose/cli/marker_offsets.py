@@ -41,8 +41,14 @@ class _Sums:
     pull: Floats = field(default_factory=lambda: np.zeros(3))  # their right-hand side
 
     def __add__(self, later: _Sums) -> _Sums:
-        _, *totals = (a + b for a, b in zip(vars(self).values(), vars(later).values(), strict=True))
-        return _Sums(self.first, *totals)
+        return _Sums(
+            self.first,
+            self.met + later.met,
+            self.squares + later.squares,
+            self.views + later.views,
+            self.normal + later.normal,
+            self.pull + later.pull,
+        )
 
     def shift(self) -> Floats:
         """Return the displacement (3,) in the body's axes that explains the offsets best."""
