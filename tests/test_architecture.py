@@ -62,7 +62,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "runner": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "matching", "tracking"}
     | {"frames", "session"},
-    "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }
 MAY_IMPORT["viewing"] = GROUND | {"sensors", "body", "objective", "pictures", "session"}

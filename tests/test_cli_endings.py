@@ -117,7 +117,7 @@ def test_a_compiled_module_that_is_cut_is_no_interrupt(tmp_path: Path) -> None:
         return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
 
     assert schema().returncode == 0
-    for name in ("poses/schema", "cli/words"):  # of the command, and of all of them
+    for name in ("poses/schema", "cli/request"):  # of the command, and of all of them
         folder, stem = name.split("/")
         (compiled,) = tmp_path.rglob(f"mixpose/{folder}/{stem}.*.pyc")
         whole = compiled.read_bytes()

@@ -20,10 +20,11 @@ from mixpose.records import Image, PointPattern, RawFrame
 NOTHING = PointPattern(np.zeros((0, 2)), np.zeros(0))
 
 
-class Recorded:
+class Recorded(Source):
     """A source with the given frame numbers; it fails in place of frame `fails`."""
 
     kind: SourceKind = "detections"
+    ahead: int = 0
 
     def __init__(
         self,

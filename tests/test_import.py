@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rounding import rounding
 
+from mixpose.cli.importing import gather, session_text
 from mixpose.errors import SessionError
-from mixpose.importing import gather, session_text
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import FisheyeCamera, PinholeCamera

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from command_line import command
 
+from mixpose.cli.importing import gather, session_text
 from mixpose.errors import SessionError
-from mixpose.importing import gather, session_text
 from mixpose.session import load_session
 
 

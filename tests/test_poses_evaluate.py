@@ -13,10 +13,10 @@ from mixpose.errors import RecordingError
 from mixpose.poses.consistency import normalised_error_squared
 from mixpose.poses.estimates import in_unit
 from mixpose.poses.evaluate import errors_to_truth, evaluate
-from mixpose.poses.instances import renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.poses.report import as_dict, as_table
+from mixpose.poses.truth import renumbered
 from mixpose.records import Floats, Hypothesis, Status
 
 RNG_SEED = 20240611

@@ -12,9 +12,9 @@ from pose_lines import covariance_of, pose_line, swinging, write_poses
 
 from mixpose.errors import RecordingError
 from mixpose.poses.evaluate import errors_to_truth, evaluate
-from mixpose.poses.foretold import truth_ahead
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.poses.truth import truth_ahead
 from mixpose.records import Floats
 
 INTERVAL_S, PARTS = 0.04, 8

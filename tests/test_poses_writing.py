@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from mixpose import rigid
 from mixpose.errors import RecordingError, SessionError
-from mixpose.poses.formats import FORMATS
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter, ResumePoint, read_poses, resume_point
-from mixpose.poses.ros import pose_message
+from mixpose.poses.writers import FORMATS, pose_message
 from mixpose.records import Estimate, Hypothesis, SensorReport
 
 HALF_TURN = rigid.from_rotation_vector([0.0, 0.0, np.pi], [0.0, 0.0, 0.0])

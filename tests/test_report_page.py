@@ -18,7 +18,7 @@ import pytest
 from command_line import LONGEST_S, command
 from report_runs import COVARIANCE, RECORDING, SYNTHETIC, estimate, write, write_run
 
-from mixpose.cli.app_after import ReportRequest
+from mixpose.cli.app import ReportRequest
 from mixpose.cli.report import write_report
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.evaluate import evaluate_files

@@ -16,6 +16,7 @@ import mixpose
 from mixpose import runner
 from mixpose.extraction import extract, extract_together
 from mixpose.frames import Source
+from mixpose.frames.source import SourceKind
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
@@ -30,14 +31,14 @@ SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
 
 @dataclass(frozen=True)
-class Rearranged:
+class Rearranged(Source):
     """A recording with its frames in another order, and something done to its images."""
 
     name: str
     recorded: Source
     order: Sequence[int]
     edit: Edit | None = None
-    kind: str = "images"
+    kind: SourceKind = "images"
     first: int = 0
     ahead: int = 0
 
@@ -87,7 +88,7 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def tracked(session: Session, order: Sequence[int], edit: Edit | None = None) -> list[Estimate]:
     sources = runner.open_sources(session, {})
     opened = {name: Rearranged(name, source, order, edit) for name, source in sources.items()}
-    return list(mixpose.run(session, opened=opened))  # type: ignore[arg-type]
+    return list(mixpose.run(session, opened=opened))
 
 
 def on_whole_frames(

@@ -14,7 +14,7 @@ from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, load_session
-from mixpose.session.intrinsics import size_of
+from mixpose.session.geometry import size_of
 
 K = np.array([[810.5, 0, 640.25], [0, 805.0, 512.5], [0, 0, 1]])
 D5 = np.array([-0.1, 0.02, 1e-05, -2e-4, 0.3])

@@ -13,16 +13,16 @@ import pytest
 
 import mixpose
 from mixpose import rigid
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.convert import convert_poses
 from mixpose.cli.output import written_paths
 from mixpose.errors import SessionError
 from mixpose.poses.evaluate import evaluate
-from mixpose.poses.formats import FORMATS
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile, read_poses, resume_point
 from mixpose.poses.report import as_dict, as_table
 from mixpose.poses.schema import schema
+from mixpose.poses.writers import FORMATS
 from mixpose.records import Estimate, Status
 from mixpose.session import Session, load_session
 

@@ -27,7 +27,7 @@ import numpy as np
 from make_synthetic import RECORDINGS
 
 import mixpose
-from mixpose.cli.app_after import SmoothRequest
+from mixpose.cli.app import SmoothRequest
 from mixpose.cli.run import header_of
 from mixpose.cli.smooth import smooth_poses
 from mixpose.poses.evaluate import evaluate_files

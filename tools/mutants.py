@@ -61,7 +61,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "publishing": ("test_publishing.py", "test_publishing_*.py"),
     "simulation": ("test_simulation_*.py",),
     "checking": ("test_check_*.py",),
-    "importing": ("test_import*.py",),
     "design": ("test_design.py",),
     "learning": ("test_learn*.py",),
     "cli": ("test_cli_findings.py", "test_cli_messages.py", "test_cli*.py"),

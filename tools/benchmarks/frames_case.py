@@ -47,7 +47,7 @@ Scene: TypeAlias = Callable[[Path], Session]
 
 
 @dataclass(frozen=True)
-class Held:
+class Held(Source):
     """A recording whose first frames are decoded already."""
 
     ahead: ClassVar[int] = 0

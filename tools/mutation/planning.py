@@ -9,7 +9,7 @@ _IMPORTS = ("test_import.py",)
 _FORMATS = (
     Mutant(
         "session-kalibr-chain-from-the-wrong-end",
-        "session/calibration/kalibr.py",
+        "session/calibration/mappings.py",
         "T = step @ T",
         "T = T @ step",
         "the third camera of a chain stands elsewhere",
@@ -17,7 +17,7 @@ _FORMATS = (
     ),
     Mutant(
         "session-kalibr-imu-the-wrong-way-round",
-        "session/calibration/kalibr.py",
+        "session/calibration/mappings.py",
         "return None if T_imu_cam is None else inverse(T_imu_cam)",
         "return T_imu_cam",
         "cameras of OpenVINS stand elsewhere",
@@ -67,25 +67,28 @@ _FORMATS = (
 
 _IMPORTING = (
     Mutant(
-        "importing-translations-keep-their-unit",
-        "importing.py",
+        "cli-import-translations-keep-their-unit",
+        "cli/importing.py",
         "from_parts(T[:3, :3], factor * T[:3, 3])",
         "from_parts(T[:3, :3], T[:3, 3])",
         "a rig in metres is written as millimetres",
+        ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
-        "importing-copies-pass",
-        "importing.py",
+        "cli-import-copies-pass",
+        "cli/importing.py",
         "if _are_same(a, b):",
         "if False:",
         "a camera that was copied by mistake is not noticed",
+        ("test_import.py", "test_import_command.py"),
     ),
     Mutant(
-        "importing-worlds-mixed",
-        "importing.py",
+        "cli-import-worlds-mixed",
+        "cli/importing.py",
         "if len(placed) > 1:",
         "if len(placed) > 2:",
         "cameras of two rigs are put into one world",
+        ("test_import.py", "test_import_command.py"),
     ),
 )
 
@@ -157,7 +160,7 @@ _DESIGN = (
     ),
     Mutant(
         "cli-evaluate-takes-units-in-silence",
-        "cli/app_after.py",
+        "cli/report.py",
         "if file.unit is None and errors.unit is not None:",
         "if file.unit is not None and errors.unit is None:",
         "a truth in metres without a header is compared as millimetres, and nothing says so",

@@ -143,7 +143,7 @@ MUTANTS = (
     ),
     Mutant(
         "poses-foretold-through-gaps",
-        "poses/foretold.py",
+        "poses/truth.py",
         "_GAP * usual) + 1",
         "_GAP * usual * 100) + 1",
         "the truth is made up for frames that it does not have",
@@ -166,8 +166,8 @@ MUTANTS = (
         ("test_session_files.py",),
     ),
     Mutant(
-        "importing-lengths-of-tables-in-silence",
-        "importing.py",
+        "cli-import-lengths-of-tables-in-silence",
+        "cli/importing.py",
         "    if lengths in (None, unit):",
         "    if True:",
         "a body in metres is a thousand times too small, though its unit was said",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice, pairwise
@@ -11,18 +11,16 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames import Source, numbers_of, spread_over
+from mixpose.frames import Source, numbers_of, prefetch, spread_over
 from mixpose.frames.images import ImageSequence
-from mixpose.frames.prefetch import prefetch
-from mixpose.frames.repeated import is_same, shown_by
-from mixpose.frames.source import Frames
+from mixpose.frames.source import Frames, is_same, shown_by
 from mixpose.frames.tables import DetectionTable
+from mixpose.frames.times import listed
 from mixpose.frames.video import Video
 from mixpose.records import Floats, Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
-LISTED = 5  # frame numbers listed in a message
 _TELLING = 6  # numbers in a frame: fewer may equal those of the frame before by chance
 _QUICK = 5  # frames of a quick survey
 # images of a sensor in which features are counted: finding them takes five times as long as reading
@@ -198,12 +196,6 @@ def time_warnings(surveys: Mapping[str, Survey]) -> list[str]:
                 "of them wrong, or are its frames numbered from another moment?"
             )
     return warnings
-
-
-def listed(numbers: Sequence[int]) -> str:
-    """List frame numbers in words; of many the first, and how many there are."""
-    text = ", ".join(map(str, numbers[:LISTED]))
-    return text if len(numbers) <= LISTED else f"{text}, ... ({len(numbers)} frames)"
 
 
 def frozen_warnings(surveys: Mapping[str, Survey]) -> list[str]:

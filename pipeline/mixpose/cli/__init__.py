@@ -42,7 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Replace standard streams that the parent process has closed."""
     # messages are dropped rather than written to standard output; poses cannot be written
     if sys.stderr is None:
         sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
@@ -116,7 +115,6 @@ def _interrupted(arguments: list[str]) -> int:
 
 
 def _drop_standard_output() -> None:
-    """Discard what is still in the buffer when Python flushes it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mixpose import __version__, rigid
 from mixpose.calibration.rig import centre_of
-from mixpose.cli.app_after import AlignRequest
+from mixpose.cli.app import AlignRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_suffix, refuse_to_overwrite_but, shown, write_text
 from mixpose.cli.run import named_sources
@@ -27,11 +27,7 @@ MARK = "# Aligned by mixpose"
 
 
 def align_session(request: AlignRequest) -> None:
-    """Write the session in the frame of the floor.
-
-    Raises SessionError if it holds directions of the world, and RecordingError if the poses
-    determine no floor.
-    """
+    """Write the session in the frame of the floor."""
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
     rewriting.refuse_held_directions(session)
@@ -75,7 +71,6 @@ def _floor_poses(text: str, session: Session, sources: Sequence[str]) -> list[Es
 
 
 def _places(session: Session) -> Floats:
-    """Return the places of sensors; for parallel beams the origins of their frames."""
     return np.stack([centre_of(setup.sensor) for setup in session.sensors])
 
 

@@ -4,20 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 
-from mixpose.cli import app_after
 from mixpose.cli.help import Command, Commands
-from mixpose.cli.request import RunRequest, Sources
-from mixpose.cli.words import AllowCode, Recordings, SessionFile, command_for, option
+from mixpose.cli.request import RunRequest, another_source, any_code, argument, command_for, option
 from mixpose.units import Unit
 
-MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
-IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
-"""Groups of the options of ``mixpose simulate``."""
+ConvertFormat: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros", "rerun", "c3d", "trc"]
+
+session_file = partial(argument, "The session file.", ..., metavar="SESSION.toml")
+poses_file = partial(argument, "Estimated poses.", ..., metavar="POSES.jsonl")
+instead = partial(option, "Recording of a sensor in place of the session's.", metavar="NAME=PATH")
+"""Arguments and options of several commands."""
+
+motion = partial(option, panel="Motion of the body")
+images = partial(option, panel="Images")
+tables = partial(option, panel="Profiles and tables")
+in_view = partial(option, panel="What else is in view")
+in_time = partial(option, panel="Time, and sensors that are not as told")
+"""Options of ``mixpose simulate``, by their groups."""
+
 
 app = typer.Typer(
     name="mixpose",
@@ -51,14 +61,12 @@ def _common(
 class ImportRequest:
     """Make a session of the calibration files of other programs."""
 
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and bodies: .csv, .rom, .vsk or .obj.",
-        ),
-    ]
+    files: list[Path] = argument(
+        "Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, and "
+        "bodies: .csv, .rom, .vsk or .obj.",
+        ...,
+        metavar="FILE...",
+    )
     output: Path = option("The session file, which must be new; or stdout (-).", ...)
     unit: Unit = option("Unit of lengths in the session.", "mm")
     lengths: Unit | None = option("Unit of translations in files whose format does not fix it.")
@@ -68,7 +76,7 @@ class ImportRequest:
 class CalibrateRequest:
     """Calibrate sensors from a recording of the body, without matching markers."""
 
-    session: SessionFile
+    session: Path = session_file()
     output: Path | None = option(
         "The calibrated session; or stdout (-).", metavar="CALIBRATED.toml"
     )
@@ -90,15 +98,15 @@ class CalibrateRequest:
     )
     check: bool = option("Only say whether the calibration still holds.", False)
     report: Path | None = option("A page with pictures; or stdout (-).", metavar="FILE.html")
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class LearnRequest:
     """Learn the markers of bodies from a recording in which they move."""
 
-    session: SessionFile
+    session: Path = session_file()
     output: Path = option(
         "Table of the markers; of several bodies the others go to BODY-2.csv and so on. A single "
         "one may go to stdout (-).",
@@ -114,20 +122,17 @@ class LearnRequest:
         "An older or measured table of the same markers, whose axes and names are kept.",
         metavar="OLD.csv",
     )
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class DesignRequest:
     """Predict the accuracy of planned systems, side by side, and what would improve them."""
 
-    sessions: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SESSION.toml", help="One system or several; others are held to the first."
-        ),
-    ]
+    sessions: list[Path] = argument(
+        "One system or several; others are held to the first.", ..., metavar="SESSION.toml"
+    )
     poses: Path | None = option("Judge at these poses, not over a volume.", metavar="POSES.jsonl")
     count: int = option("Number of poses in the volume.", 24, min=1, max=2000)
     volume: str | None = option(
@@ -162,92 +167,171 @@ class DesignRequest:
 class CheckRequest:
     """Read every frame before any run: features found, placement, accuracy to expect."""
 
-    session: SessionFile
+    session: Path = session_file()
     quick: bool = option("Look at a few frames of each sensor only.", False)
-    source: Sources = None
-    allow_code: AllowCode = False
+    source: list[str] | None = another_source()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class InspectRequest:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
 
-    session: SessionFile
+    session: Path = session_file()
     output: Path = option("Folder for the pictures.", ...)
     frame: int | None = option("Number of the frame; else the recording's first.")
     poses: Path | None = option(
         "Take the pose from a run, not from this frame alone.", metavar="POSES.jsonl"
     )
-    source: Recordings = None
-    allow_code: AllowCode = False
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
 
 
 @dataclass(frozen=True)
 class SimulateRequest:
     """Render a recording with truth.jsonl that `run` can play."""
 
-    session: SessionFile
+    session: Path = session_file()
     output: Path = option("New folder for the recording.", ...)
     frames: int = option("Number of frames.", ..., min=1)
     seed: int = option("Same seed, same recording.", 0, min=0)
-    fps: float | None = option(
-        "Frames per second; for poses with times put fps into the session.", panel=TIME
+    fps: float | None = in_time("Frames per second; for poses with times put fps into the session.")
+    noise: float = images("Camera noise, grey levels.", 2.0)
+    clutter: float = in_view("False features per frame and sensor.", 0.0)
+    hidden: float = in_view("Chance that a feature is hidden.", 0.0)
+    missing: float = in_time("Chance that a sensor has no frame.", 0.0)
+    brightness: float = images("Peak of a spot, grey levels.", 170.0)
+    brightness_spread: float = images(
+        "Spread of the brightness over the features, as a share.", 0.1
     )
-    noise: float = option("Camera noise, grey levels.", 2.0, panel=IMAGES)
-    clutter: float = option("False features per frame and sensor.", 0.0, panel=IN_VIEW)
-    hidden: float = option("Chance that a feature is hidden.", 0.0, panel=IN_VIEW)
-    missing: float = option("Chance that a sensor has no frame.", 0.0, panel=TIME)
-    brightness: float = option("Peak of a spot, grey levels.", 170.0, panel=IMAGES)
-    brightness_spread: float = option(
-        "Spread of the brightness over the features, as a share.", 0.1, panel=IMAGES
+    amplitude_translation: float | None = motion(
+        "Largest displacement along each axis, length units.", name="--translation"
     )
-    amplitude_translation: float | None = option(
-        "Largest displacement along each axis, length units.", name="--translation", panel=MOTION
+    amplitude_rotation_deg: float = motion(
+        "Largest turn about each axis, degrees.", 20.0, name="--rotation"
     )
-    amplitude_rotation_deg: float = option(
-        "Largest turn about each axis, degrees.", 20.0, name="--rotation", panel=MOTION
+    period_s: float = motion("Seconds in which the motion comes round.", 4.0, name="--period")
+    pixel_noise: float = tables("Error of detections in a camera's table, px.", 0.1)
+    range_noise: float | None = tables(
+        "Error of detections in tables of ranges and of clouds, length units."
     )
-    period_s: float = option(
-        "Seconds in which the motion comes round.", 4.0, name="--period", panel=MOTION
+    range_snr: float = tables("Height of a profile's peak over its noise.", 30.0)
+    deform: bool = in_view("Displace features by the spread the object states.", False)
+    readout: float | None = in_time(
+        "Seconds from a camera's first row to its last; else the session's."
     )
-    pixel_noise: float = option("Error of detections in a camera's table, px.", 0.1, panel=TABLES)
-    range_noise: float | None = option(
-        "Error of detections in tables of ranges and of clouds, length units.", panel=TABLES
+    exposure: float | None = in_time("Seconds for which a row is lit; else the session's.")
+    delay: list[str] | None = in_time(
+        "A sensor that is late; else the session's.", metavar="NAME=SECONDS"
     )
-    range_snr: float = option("Height of a profile's peak over its noise.", 30.0, panel=TABLES)
-    deform: bool = option(
-        "Displace features by the spread the object states.", False, panel=IN_VIEW
+    out_of_step: float = in_time("Seconds from the first sensor to the last, in their times.", 0.0)
+    lamps: int = in_view("Lamps behind the body.", 0, min=0)
+    mirror: float = in_view("Brightness of mirror images in a table below, as a share.", 0.0)
+    others: int = in_view("Other bodies with as many markers, beside this one.", 0, min=0)
+    occluder: int = in_view("Dark bars that swing before it.", 0, min=0)
+    jpeg: int | None = images("Quality of lossy compression.", min=1, max=100)
+    bayer: bool = images("Images of a colour sensor, interpolated.", False)
+    turned_camera_deg: float = in_time(
+        "Degrees by which the last camera was turned meanwhile.", 0.0, name="--turned-camera"
     )
-    readout: float | None = option(
-        "Seconds from a camera's first row to its last; else the session's.", panel=TIME
-    )
-    exposure: float | None = option(
-        "Seconds for which a row is lit; else the session's.", panel=TIME
-    )
-    delay: list[str] | None = option(
-        "A sensor that is late; else the session's.", metavar="NAME=SECONDS", panel=TIME
-    )
-    out_of_step: float = option(
-        "Seconds from the first sensor to the last, in their times.", 0.0, panel=TIME
-    )
-    lamps: int = option("Lamps behind the body.", 0, min=0, panel=IN_VIEW)
-    mirror: float = option(
-        "Brightness of mirror images in a table below, as a share.", 0.0, panel=IN_VIEW
-    )
-    others: int = option(
-        "Other bodies with as many markers, beside this one.", 0, min=0, panel=IN_VIEW
-    )
-    occluder: int = option("Dark bars that swing before it.", 0, min=0, panel=IN_VIEW)
-    jpeg: int | None = option("Quality of lossy compression.", min=1, max=100, panel=IMAGES)
-    bayer: bool = option("Images of a colour sensor, interpolated.", False, panel=IMAGES)
-    turned_camera_deg: float = option(
-        "Degrees by which the last camera was turned meanwhile.",
-        0.0,
-        name="--turned-camera",
-        panel=TIME,
-    )
-    away_from: int | None = option("Frames after which the body is gone.", min=0, panel=MOTION)
+    away_from: int | None = motion("Frames after which the body is gone.", min=0)
     overwrite: bool = option("Replace a recording in the folder.", False)
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """Errors of poses against the truth, modulo the object's symmetries."""
+
+    poses: Path = poses_file()
+    truth: Path = argument("True poses.", ..., metavar="TRUTH.jsonl")
+    json: bool = option("Print JSON instead of a table.", False)
+
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+
+    poses: Path = poses_file()
+    output: Path = option("The page, as report.html; or stdout (-).", ...)
+    truth: Path | None = argument("True poses.", metavar="TRUTH.jsonl")
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """Write poses in the format of another program."""
+
+    poses: Path = argument("Poses or true poses.", ..., metavar="POSES.jsonl")
+    output: Path | None = option("Write here, not to stdout (-).")
+    format: ConvertFormat | None = option(
+        "Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
+    )
+    unit: str | None = option("Unit of lengths where POSES does not say: m, cm, mm, um.")
+    object: str | None = option("Only the poses of this object.")
+    only_ok: bool = option("Leave out ambiguous frames too.", False)
+    scene_id: int | None = option("bop: the scene; 0.", min=0)
+    obj_id: int | None = option("bop: the object; 1.", min=0)
+    relative_to: str | None = option(
+        "bop, csv, ros, tum: relative to a camera, or another body of POSES, not the world.",
+        metavar="NAME",
+    )
+    session: Path | None = option("The session of the poses, where they do not lead to it.")
+    source: list[str] | None = option(
+        "rerun: as for run, else that of the run.", metavar="NAME=PATH"
+    )
+    measured: bool = option(
+        "c3d, trc: leave gaps where a marker was not measured by itself.", False
+    )
+    fps: float | None = option("c3d, trc: frames a second, in place of times.", min=1e-6, max=1e6)
+    allow_code: bool = any_code()
+
+
+@dataclass(frozen=True)
+class SmoothRequest:
+    """Smooth the poses of a recording, each by all that came before and after."""
+
+    poses: Path = poses_file()
+    output: Path | None = option("Write here, not to stdout (-).", metavar="SMOOTH.jsonl")
+    fill: float = option(
+        "Fill gaps of at most so long, marked; else none.", 0.0, min=0, metavar="SECONDS"
+    )
+    motion: Literal["acceleration", "jerk", "snap", "crackle"] | None = option(
+        "Which derivative of the motion takes white noise; else the likeliest."
+    )
+
+
+@dataclass(frozen=True)
+class PivotRequest:
+    """The tip of a tool, from poses while it turns about its tip."""
+
+    poses: Path = poses_file()
+    object: str | None = option("The tool, where there are several bodies.", metavar="OBJECT")
+    reference: str | None = option(
+        "The tip stays at a point of this body; else of the world.", metavar="OBJECT"
+    )
+    into: Path | None = option("Write the tip into this session.", metavar="SESSION.toml")
+
+
+@dataclass(frozen=True)
+class AlignRequest:
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
+
+    session: Path = session_file()
+    floor: list[str] = option(
+        "What lies on the floor: poses, or a body in a frame. Repeatable.",
+        ...,
+        metavar="POSES.jsonl|OBJECT@FRAME",
+    )
+    output: Path = option("The aligned session; or stdout (-).", ..., metavar="ALIGNED.toml")
+    up: Literal["x", "y", "z"] = option("The axis that points up.", "z")
+    source: list[str] | None = instead()
+    allow_code: bool = any_code()
+
+
+def _schema() -> None:
+    """Print the JSON Schema of pose lines."""
+    from mixpose.poses.schema import schema_text  # noqa: PLC0415
+
+    typer.echo(schema_text(), nl=False)
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
@@ -256,15 +340,15 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": command_for(InspectRequest, "inspect:inspect_frame"),
     "import": command_for(ImportRequest, "importing:import_files"),
     "simulate": command_for(SimulateRequest, "simulate:simulate_session"),
-    "evaluate": app_after.evaluate,
-    "convert": command_for(app_after.ConvertRequest, "convert:convert_poses"),
-    "schema": app_after.schema,
-    "report": command_for(app_after.ReportRequest, "report:write_report"),
+    "evaluate": command_for(EvaluateRequest, "report:evaluate_poses"),
+    "convert": command_for(ConvertRequest, "convert:convert_poses"),
+    "schema": _schema,
+    "report": command_for(ReportRequest, "report:write_report"),
     "calibrate": command_for(CalibrateRequest, "calibrate:calibrate_session"),
     "design": command_for(DesignRequest, "design:design_sessions"),
-    "pivot": command_for(app_after.PivotRequest, "pivot:pivot_poses"),
-    "align": command_for(app_after.AlignRequest, "align:align_session"),
-    "smooth": command_for(app_after.SmoothRequest, "smooth:smooth_poses"),
+    "pivot": command_for(PivotRequest, "pivot:pivot_poses"),
+    "align": command_for(AlignRequest, "align:align_session"),
+    "smooth": command_for(SmoothRequest, "smooth:smooth_poses"),
     "learn": command_for(LearnRequest, "learn:learn_session"),
 }
 for name, command in _COMMANDS.items():

@@ -32,10 +32,7 @@ from mixpose.session.rewriting import refuse_held_directions, refuse_lost_code
 
 
 def calibrate_session(request: CalibrateRequest) -> None:
-    """Calibrate a session; write the calibrated session and the report.
-
-    Raises RecordingError if the recording or the poses do not show the body.
-    """
+    """Calibrate a session; write the calibrated session and the report."""
     path = request.session
     session = load_session(path, allow_code=request.allow_code)
     target = request.output

@@ -20,6 +20,7 @@ from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source, numbers_of
 from mixpose.frames.tables import DetectionTable
+from mixpose.frames.times import LISTED, listed
 from mixpose.judgement import expected_covariance
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES, transform
@@ -33,8 +34,9 @@ _ALL_WAYS = np.pi / 2  # standard deviation of a turn, in radians, above which i
 
 @dataclass
 class _Report:
-    """Lines to be printed, warnings last, so that they stay on the screen."""
+    """Lines to be printed about a session, warnings last, so that they stay on the screen."""
 
+    session: Session
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     count_warnings: list[str] = field(default_factory=list)  # warnings about numbers of features
@@ -56,32 +58,25 @@ class _Report:
 
 
 def check_session(request: CheckRequest) -> None:
-    """Print sensors, recordings, the object's symmetries and the expected accuracy.
-
-    Raises RecordingError if a table of times lacks rows or, after all has been printed, if a frame
-    is damaged.
-    """
+    """Print what a session and its recording hold and let expect; raise if a frame is damaged."""
     session, quick = load_session(request.session, allow_code=request.allow_code), request.quick
     replaced = named_sources(request.source or ())
     opened = open_sources(session, replaced)
     for source in opened.values():
         source.check_times(ALL_NUMBERS)
-    report = _Report()
+    report = _Report(session)
     report.say("session", f"{session.path}, lengths in {session.unit}")
     for table in session.objects:
-        _say_object(report, session, table)
-    surveys: dict[str, recordings.Survey] = {}
+        _say_object(report, table)
     sample = None if quick else recordings.frames_to_count(opened)
     lengths = [source.length for source in opened.values()]
     total = None if None in lengths else sum(length or 0 for length in lengths)
     with bar("reading frames", total, shown=not quick) as tick:
-        for setup in session.sensors:
-            source = opened[setup.name]
-            surveys[setup.name] = recordings.survey(
-                session, setup, source, quick=quick, to_count=sample, done=partial(tick, advance=1)
-            )
+        tell = partial(tick, advance=1)
+        read = partial(recordings.survey, quick=quick, to_count=sample, done=tell)
+        surveys = {s.name: read(session, s, opened[s.name]) for s in session.sensors}
     for setup in session.sensors:
-        _say_sensor(report, session, setup, opened[setup.name], surveys)
+        _say_sensor(report, setup, opened[setup.name], surveys)
     shared = keys.shared_source_warnings(session, replaced)
     sizes = {name: survey.size for name, survey in surveys.items()}
     doubts = geometry.geometry_doubts(session, opened, surveys)
@@ -116,24 +111,23 @@ def check_session(request: CheckRequest) -> None:
 
 def _of_geometry(session: Session) -> _Report:
     """Report on the placement of sensors, their views of the bodies and the expected accuracy."""
-    report = _Report()
+    report = _Report(session)
     report.warnings += keys.key_warnings(session) + placement.placement_warnings(session)
     for setup in session.objects:
         report.prefix = f"{setup.body.name}: " if len(session.objects) > 1 else ""
         _say_accuracy(report, session.with_only(setup.body.name))
-    report.prefix = ""
     report.warnings += keys.shared_part_warnings(session)
     return report
 
 
-def _say_object(report: _Report, session: Session, setup: ObjectSetup) -> None:
-    body = setup.body
-    spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
-    extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
+def _say_object(report: _Report, setup: ObjectSetup) -> None:
+    session, body, unit = report.session, setup.body, report.session.unit
+    spread = f", spread up to {body.spread:g} {unit}" if body.spread else ", exact"
+    extent = f"{len(body)} features within {body.radius:.4g} {unit} of their centre"
     identical = f", {setup.count} that are identical" if setup.count > 1 else ""
     report.say("object", f"{body.name}: {extent}{spread}{identical}")
     count, prefix = len(body.symmetries), f"{body.name}: " if len(session.objects) > 1 else ""
-    within = f" within {body.asymmetry:.2g} {session.unit}" if body.asymmetry else ""
+    within = f" within {body.asymmetry:.2g} {unit}" if body.asymmetry else ""
     symmetry = f"{count} orientations look the same{within}" if count > 1 else "none"
     points = body.nodes.points
     if free_mask(session.estimator)[3:].all() and is_on_a_line(points, default_tolerance(points)):
@@ -143,32 +137,28 @@ def _say_object(report: _Report, session: Session, setup: ObjectSetup) -> None:
 
 
 def _say_sensor(
-    report: _Report,
-    session: Session,
-    setup: SensorSetup,
-    source: Source,
-    surveys: Mapping[str, recordings.Survey],
+    report: _Report, setup: SensorSetup, source: Source, surveys: Mapping[str, recordings.Survey]
 ) -> None:
-    survey = surveys[setup.name]
+    survey, unit = surveys[setup.name], report.session.unit
     size = "" if setup.resolution is None else f" {setup.resolution[0]}x{setup.resolution[1]}"
-    report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, session.unit)}")
-    for line in placement.placement_lines(setup, session.unit):
+    report.say("sensor", f"{setup.name}: {setup.model}{size}, {_extraction(setup, unit)}")
+    for line in placement.placement_lines(setup, unit):
         report.say("", line)
     total = len(survey.numbers) + len(survey.damage)
     read = "all read" if survey.is_whole else f"looked at {total}"
     if survey.damage:
         read = f"{len(survey.damage)} of the {total} looked at cannot be read"
     report.say("", read if survey.damage and not survey.numbers else f"{source.describe()}; {read}")
-    for text in survey.damage[: recordings.LISTED]:
+    for text in survey.damage[:LISTED]:
         report.say("", f"damaged: {text}")
     if caution := source.caution():
         report.warn(f"sensor {setup.name!r}: {caution}")
     numbers = {*survey.numbers, *survey.damaged}
     all_numbers = numbers.union(*(other.numbers for other in surveys.values()))
-    missing = recordings.listed(sorted(all_numbers - numbers))
+    missing = listed(sorted(all_numbers - numbers))
     if missing and all(other.is_whole for other in surveys.values()):
         report.say("", f"missing: {missing} of the {len(all_numbers)} frames of all sensors")
-    _say_features(report, session, setup, source, survey)
+    _say_features(report, setup, source, survey)
 
 
 def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
@@ -179,12 +169,9 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
         other_numbers = set().union(*(numbers[other] for other in numbers if other != name))
         pairs = len(frames & other_numbers)
         if other_numbers and pairs < 0.5 * min(len(frames), len(other_numbers)):
-            is_table = isinstance(sources[name], DetectionTable)
-            hint = (
-                "in the column frame; count all tables alike"
-                if is_table
-                else "that their names end in; rename the files"
-            )
+            hint = "that their names end in; rename the files"
+            if isinstance(sources[name], DetectionTable):
+                hint = "in the column frame; count all tables alike"
             warnings.append(
                 f"sensor {name!r}: {pairs} of its {len(frames)} frames pair with those of other "
                 f"sensors: frames are paired by the number {hint}"
@@ -201,16 +188,16 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
 
 
 def _say_features(
-    report: _Report, session: Session, setup: SensorSetup, source: Source, survey: recordings.Survey
+    report: _Report, setup: SensorSetup, source: Source, survey: recordings.Survey
 ) -> None:
-    sensor = f"sensor {setup.name!r}"
+    session, sensor = report.session, f"sensor {setup.name!r}"
     singles = [(session.with_only(table.body.name), table.count) for table in session.objects]
     expected = sum(count * placement.expected_count(setup, single) for single, count in singles)
     if not (survey.numbers or survey.damage):
         report.warn(f"{sensor}: its recording has no frame")
     if survey.counts is None:
         if survey.numbers and survey.empty:
-            frames = recordings.listed(survey.empty)
+            frames = listed(survey.empty)
             report.warn(f"{sensor}: nothing but one value in frame {frames}")
         return
     low, high = min(survey.counts), max(survey.counts)
@@ -231,7 +218,7 @@ def _say_features(
             f"{expected} are expected: {keys.advice(session, setup, typical, image, expected)}"
         )
     elif survey.empty:
-        report.warn(f"{sensor}: no feature in frame {recordings.listed(survey.empty)}")
+        report.warn(f"{sensor}: no feature in frame {listed(survey.empty)}")
 
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:
@@ -297,12 +284,12 @@ def _say_accuracy_at(
                 f"{where}, the sensors do not determine {', '.join(unknown)}: hold what is known "
                 "at the pose of [start] with free in [estimator], or add a sensor"
             )
-    looking_alike = [
-        lookalikes.look_alikes(session.sensors, session.body, T, free)
+    ambiguous = [
+        alike
         for T, (covariance, _) in zip(poses, expected, strict=True)
         if np.isfinite(np.diag(covariance)).all()
+        and (alike := lookalikes.look_alikes(session.sensors, session.body, T, free))
     ]
-    ambiguous = [alike for alike in looking_alike if alike]
     if ambiguous:
         report.warn(_look_alike_text(session, ambiguous, len(poses), where))
     return bool(ambiguous)

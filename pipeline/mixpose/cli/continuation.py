@@ -10,10 +10,10 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from contextlib import closing, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 from mixpose import __version__
 from mixpose.cli.lines import LineFile, note_path
@@ -26,6 +26,7 @@ from mixpose.frames.capture import is_pipe
 from mixpose.frames.video import Video
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import ResumePoint, resume_point
+from mixpose.records import Estimate
 from mixpose.runner import Memory
 from mixpose.selection import Selection
 from mixpose.whole_files import appearing_whole
@@ -45,11 +46,8 @@ class Note:
     memory: Memory
 
 
-class Notes:
-    """Save the state of a run at intervals; the note is removed when the recording is finished.
-
-    A context manager; nothing is written if the output cannot be resumed.
-    """
+class Notes(AbstractContextManager["Notes"]):
+    """Save the state of a run at intervals if it can be resumed, and remove it at the end."""
 
     def __init__(self, request: RunRequest) -> None:
         poses, format_name = request.poses, request.format_name
@@ -58,9 +56,6 @@ class Notes:
         self._reaches_end = request.stop is None
         self._last: tuple[int, LineFile, Memory] | None = None
         self._written_at = -INTERVAL_S
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: object, *_: object) -> None:
         if kind is not None or not self._reaches_end:
@@ -102,13 +97,20 @@ class Continuation:
     last_written: ResumePoint | None = None
     is_done: bool = False  # whether no frame remains to be estimated
 
+    def is_new(self, estimate: Estimate, labels: Sequence[str]) -> bool:
+        """Test whether an estimate of one of the bodies comes after the last line in the file."""
+        last, line = self.last_written, labels.index(estimate.label) + 1  # of the frame
+        return last is None or (estimate.frame, line) > (last.frame, last.lines)
+
 
 def resume(request: RunRequest, header: Header, opened: dict[str, Source]) -> Continuation:
-    """Find where a run resumes in its file of poses.
+    """Find where a run begins or, by --resume, goes on in its file of poses.
 
     Raises SessionError if no file is named, it belongs to another run, another run writes to it,
     or a sensor is live; RecordingError if it holds no poses, or the recording cannot be read.
     """
+    if not request.resume:
+        return Continuation(None, request.selection)
     for name, source in opened.items():
         if source.kind == "live" or (isinstance(source, Video) and is_pipe(source.address)):
             raise SessionError(
@@ -172,7 +174,6 @@ def _after(selection: Selection, last: int) -> Selection:
 
 
 def _note(poses: Path) -> Note | None:
-    """Return the note about a poses file, if one exists and fits it."""
     try:
         note = decode(Note, json.loads(note_path(poses).read_bytes()))
     except (OSError, ValueError, RecursionError):

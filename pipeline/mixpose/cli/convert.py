@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import Output, refuse_to_overwrite, written_paths
 from mixpose.cli.request import SUFFIXES, by_suffix, output_of
 from mixpose.cli.session_formats import MARKER_FORMATS, session_of, write_markers, write_rerun
 from mixpose.errors import SessionError
 from mixpose.poses import estimates
-from mixpose.poses.formats import ONE_TRAJECTORY
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.poses.writers import ONE_TRAJECTORY
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
 from mixpose.units import UNITS_PER_METRE
@@ -27,10 +26,7 @@ _BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 
 
 def convert_poses(request: ConvertRequest) -> None:
-    """Write the poses of a file in another format.
-
-    Raises RecordingError if it holds what the format cannot express.
-    """
+    """Write the poses of a file in another format."""
     request = replace(request, output=output_of(request.output))
     path, name = request.poses, _format(request)
     _refuse_options_of_other_formats(name, request)
@@ -46,16 +42,24 @@ def convert_poses(request: ConvertRequest) -> None:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
     labels = tuple(dict.fromkeys(line.label for line in lines))
     outputs = written_paths(request.output, name, labels)
-    for output in outputs if name not in MARKER_FORMATS else ():
-        if output.is_file() | (not output.exists()):
-            refuse_to_overwrite(output, [path])
+    for target in outputs if name not in MARKER_FORMATS else ():
+        if target.is_file() | (not target.exists()):
+            refuse_to_overwrite(target, [path])
     if name == "rerun":
         write_rerun(poses, lines, request)
     elif name in MARKER_FORMATS:
         write_markers(poses, lines, _unit(poses, request), name, request)
         return
     else:
-        _write(poses, lines, name, T_sensor_world, request)
+        frame_id = request.relative_to if name == "ros" else None
+        values = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
+        options = {key: value for key, value in values.items() if value is not None}
+        header = estimates.header_of(poses, _unit(poses, request), __version__)
+        if name != "bop" or (request.object is not None and request.obj_id is not None):
+            header = replace(header, objects=estimates.objects_of(lines))
+        with Output(request.output, name, header, labels, options=options, whole=True) as output:
+            for line in lines:
+                output.write(estimates.relative_to(T_sensor_world, line))
     if request.output is not None:
         # other formats have no place for frames without a pose
         posed = sum(line.T_world_object is not None for line in lines)
@@ -63,27 +67,7 @@ def convert_poses(request: ConvertRequest) -> None:
         say(f"{counted(count, 'pose')} -> {', '.join(map(str, outputs))}")
 
 
-def _write(
-    poses: PoseFile,
-    lines: Sequence[PoseLine],
-    name: str,
-    T_sensor_world: Floats,
-    request: ConvertRequest,
-) -> None:
-    frame_id = request.relative_to if name == "ros" else None
-    values = {"scene_id": request.scene_id, "obj_id": request.obj_id, "frame_id": frame_id}
-    options = {key: value for key, value in values.items() if value is not None}
-    header = estimates.header_of(poses, _unit(poses, request), __version__)
-    if name != "bop" or (request.object is not None and request.obj_id is not None):
-        header = replace(header, objects=estimates.objects_of(lines))
-    labels = tuple(dict.fromkeys(line.label for line in lines))
-    with Output(request.output, name, header, labels, options=options, whole=True) as output:
-        for line in lines:
-            output.write(estimates.relative_to(T_sensor_world, line))
-
-
 def _refuse_of_other_references(name: str, request: ConvertRequest) -> None:
-    """Raise SessionError for options that need poses relative to a camera, not to a body."""
     if name == "bop":
         raise SessionError(
             f"--relative-to {request.relative_to}: is a body, and --format bop holds poses "
@@ -123,8 +107,7 @@ def _T_sensor_world(poses: PoseFile, name: str, request: ConvertRequest) -> Floa
         session = session_of(poses, request.session, unit=request.unit)
     except SessionError as error:
         raise SessionError(f"--relative-to {name}: no body, which are {bodies}; {error}") from error
-    sensors = {setup.name: setup.sensor for setup in session.sensors}
-    cameras = {name: s for name, s in sensors.items() if not isinstance(s, RangeSensor)}
+    cameras = {s.name: s.sensor for s in session.sensors if not isinstance(s.sensor, RangeSensor)}
     if name in cameras:
         return np.asarray(cameras[name].T_sensor_world)  # type: ignore[attr-defined]
     allowed = f"cameras are {', '.join(cameras)}" if cameras else "the session has no camera"
@@ -170,7 +153,6 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
 
 
 def _unit(poses: PoseFile, request: ConvertRequest) -> str:
-    """Return the unit of lengths in the poses file."""
     allowed = ", ".join(UNITS_PER_METRE)
     if request.unit is not None and request.unit not in UNITS_PER_METRE:
         raise SessionError(f"--unit {request.unit}: allowed are {allowed}")

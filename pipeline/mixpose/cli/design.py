@@ -97,15 +97,7 @@ def _poses(session: Session, request: DesignRequest) -> Floats:
         return spread_poses(
             session, request.count, volume=volume, turn_deg=request.turn, seed=request.seed
         )
-    poses = _read(request.poses, session)
-    if len(poses) > _MOST_POSES:
-        poses = [poses[int(k)] for k in np.linspace(0, len(poses) - 1, _MOST_POSES)]
-    return np.array(poses)
-
-
-def _read(path: Path, session: Session) -> list[Floats]:
-    """Return poses of the session's body from a file; SessionError if none, or another unit."""
-    file = read_poses(path)
+    file = read_poses(request.poses)
     file.require_unit(session.unit, SessionError)
     name = session.body.name
     poses = [
@@ -116,10 +108,12 @@ def _read(path: Path, session: Session) -> list[Floats]:
     if not poses:
         others = ", ".join(dict.fromkeys(pose.object for pose in file.poses)) or "none"
         raise SessionError(
-            f"--poses {path}: holds no pose of {name!r}, the body of {session.path}; found lines "
-            f"of {others}"
+            f"--poses {file.path}: holds no pose of {name!r}, the body of {session.path}; found "
+            f"lines of {others}"
         )
-    return poses
+    if len(poses) > _MOST_POSES:
+        poses = [poses[int(k)] for k in np.linspace(0, len(poses) - 1, _MOST_POSES)]
+    return np.array(poses)
 
 
 def _three(option: str, text: str) -> Floats:

@@ -19,7 +19,7 @@ from mixpose.body import ASIDE, TURNED
 from mixpose.checking import CAUSES, explanation, judge, late_sensor
 from mixpose.cli import marker_offsets as offsets
 from mixpose.cli.marker_offsets import BodySize, Marker
-from mixpose.frames.repeated import is_same, shown_by
+from mixpose.frames.source import is_same, shown_by
 from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, FrameSet
@@ -127,7 +127,6 @@ class Findings:
             self._frames.append((frame_set.number, planes))
 
     def _too_many(self, views: Sequence[View]) -> dict[str, int]:
-        """Return the numbers of features of sensors that found far more than expected."""
         counts = {
             view.name: view.observation.found
             for view in views
@@ -187,13 +186,13 @@ class Findings:
 
     def sensor_lines(self) -> list[str]:
         """Return lines about missing, repeated or odd frames and features of sensors."""
-        total, lines = self._places + 1, []
-        for what, by_sensor in (("no frame", self._no_frame), ("no feature", self._no_feature)):
-            lines += [
-                f"sensor {name!r} had {what} in {frames.count} of {total} frames: {frames.text()}"
-                for name, frames in by_sensor.items()
-                if frames.are_no_accident(total)
-            ]
+        total = self._places + 1
+        lines = [
+            f"sensor {name!r} had {what} in {frames.count} of {total} frames: {frames.text()}"
+            for what, by_sensor in (("no frame", self._no_frame), ("no feature", self._no_feature))
+            for name, frames in by_sensor.items()
+            if frames.are_no_accident(total)
+        ]
         lines += [
             f"sensor {name!r} found up to {self._most[name]} features, where {self._expected} are "
             f"expected, in {frames.count} of {total} frames, none of them ok: {frames.text()}; "
@@ -260,7 +259,6 @@ class Findings:
 
     @property
     def _repeat_count(self) -> int:
-        """Number of repeated frames of sensors that contradict others."""
         return sum(frames.count for frames in self._repeated.values())
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import groupby, zip_longest
 from typing import Any
 
 import typer
@@ -82,8 +82,7 @@ _WORDINGS = (
 )
 
 _ADDRESS = re.compile(r"(.*:)?\d+")
-OPTIONAL = {"--view": _ADDRESS}
-"""Options whose value may be missing: a word that does not match is the next argument."""
+"""A value of --view, which may be missing: another word is the next argument."""
 
 
 class Command(TyperCommand):
@@ -166,7 +165,6 @@ def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
 
 
 def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
-    """Return the value of an option as it was typed, the last if there are several."""
     for i in reversed(range(len(arguments))):
         option, equals, value = arguments[i].partition("=")
         if option in names:
@@ -175,11 +173,8 @@ def _typed(names: Sequence[str], arguments: Sequence[str]) -> str | None:
 
 
 def with_values(arguments: Sequence[str]) -> list[str]:
-    """Return arguments with an empty value after each of the `OPTIONAL` options without one."""
-    completed: list[str] = []
-    for k, argument in enumerate(arguments):
-        pattern = OPTIONAL.get(argument)
-        following = arguments[k + 1] if k + 1 < len(arguments) else ""
-        has_value = pattern is None or pattern.fullmatch(following) is not None
-        completed.append(argument if has_value else f"{argument}=")
-    return completed
+    """Return arguments with an empty value after each --view without one."""
+    return [
+        f"{word}=" if word == "--view" and not _ADDRESS.fullmatch(following) else word
+        for word, following in zip_longest(arguments, arguments[1:], fillvalue="")
+    ]

@@ -24,10 +24,7 @@ from mixpose.tracking import with_clouds
 
 
 def inspect_frame(request: InspectRequest) -> None:
-    """Write pictures of one frame into a folder and print what was found in it.
-
-    The poses are estimated from this frame alone, or taken from a run.
-    """
+    """Draw and describe a frame; its poses are estimated from it alone, or taken from a run."""
     folder, poses = request.output, request.poses
     refuse_stdout(folder, "-o", "pictures", "a folder, as -o seen")
     session = load_session(request.session, allow_code=request.allow_code)
@@ -89,7 +86,6 @@ def _check_folder(folder: Path, session: Session) -> None:
 
 
 def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
-    """Return the frames of a number, by default the first."""
     with closing(pair(opened, number, None if number is None else number + 1)) as frames:
         frame_set = next(frames, None)
     if frame_set is not None:

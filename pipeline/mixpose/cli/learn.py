@@ -24,7 +24,12 @@ def learn_session(request: LearnRequest) -> None:
     inputs = path, request.like
     output.refuse_to_overwrite_but(request.output, inputs, MARK)
     output.refuse_suffix(request.output, (".csv", ".txt"), "a body is a table of markers")
-    older = None if request.like is None else _older(request.like, session)
+    older = None
+    if request.like is not None:
+        try:
+            older = read_marker_file(request.like, session.unit)
+        except BadKeyError as problem:
+            raise SessionError(f"--like {request.like}: {problem.text}") from problem
     if others := [setup.name for setup in session.sensors if setup.sensor.dimension < 2]:
         warn(f"{', '.join(others)}: bodies are learnt from cameras and clouds, and not from this")
     with shown_progress() as progress:
@@ -41,13 +46,6 @@ def learn_session(request: LearnRequest) -> None:
         output.refuse_to_overwrite_but(file, inputs, MARK)
         output.write_text(file, table_text(body), "-o")
     _report(lesson, bodies, files, session)
-
-
-def _older(path: Path, session: Session) -> Markers:
-    try:
-        return read_marker_file(path, session.unit)
-    except BadKeyError as problem:
-        raise SessionError(f"--like {path}: {problem.text}") from problem
 
 
 def _in_frames(
@@ -91,22 +89,17 @@ def _report(
             lines += [f"count = {body.count}"] if body.count > 1 else []
     output.print_lines(lines, *files)
     names = [file.name for file in shown_files]
-    pairs = zip(bodies, names, strict=True)
+    pairs = list(zip(bodies, names, strict=True))
     doubts = [text for pair in pairs for text in doubts_of(*pair, session.unit)]
-    for doubt in (*doubts, *look_alikes(bodies, names), *_late_warnings(session, bodies, names)):
+    doubts += look_alikes(bodies, names)
+    if late := [setup.name for setup in session.sensors if setup.delay or setup.readout]:
+        doubts += [
+            f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, "
+            "of which none is followed: move slowly, or learn from a recording of one alone"
+            for body, name in pairs
+            if body.count > 1
+        ]
+    for doubt in doubts:
         warn(doubt)
     others = f"; {lesson.still} other points stood still" if lesson.still else ""
     say(f"learnt from {lesson.frames} frames -> {', '.join(map(output.shown, files))}{others}")
-
-
-def _late_warnings(
-    session: Session, bodies: Sequence[LearntBody], names: Sequence[str]
-) -> list[str]:
-    """Return warnings of identical bodies, whose motion is unknown although sensors are late."""
-    late = [setup.name for setup in session.sensors if setup.delay or setup.readout]
-    return [
-        f"{name}: delay and readout of {', '.join(late)} are not looked at for bodies alike, of "
-        "which none is followed: move slowly, or learn from a recording of one alone"
-        for name, body in zip(names, bodies, strict=True)
-        if late and body.count > 1
-    ]

@@ -58,11 +58,7 @@ class LineFile:
         return len(text)
 
     def flush(self) -> None:
-        """Write the text since the last flush.
-
-        Raises SessionError if it cannot be written, after which the file is as before, and
-        BrokenPipeError if a pipe has no reader any more.
-        """
+        """Write the text since the last flush, or none of it: SessionError, or BrokenPipeError."""
         data = "".join(self._due).encode("utf-8")
         self._due = []
         remaining = memoryview(data)

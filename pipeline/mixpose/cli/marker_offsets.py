@@ -62,7 +62,6 @@ class _Sums:
 
 
 def _remaining_variance(whole: _Sums, since: _Sums) -> float:
-    """Return the variance of all offsets once those of a stretch are displaced."""
     return max((whole.squares - since.explained()) / max(whole.views, 1e-12), 1e-12)
 
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # not needed to print a message
     from mixpose.calibration.task import Progress
-    from mixpose.frames import Source
     from mixpose.records import DelayEstimate, Estimate
     from mixpose.session import Session
 
@@ -48,19 +47,6 @@ def say(message: str) -> None:
 def warn(message: str) -> None:
     """Print a warning on one line."""
     say(f"warning: {' '.join(message.split())}")
-
-
-def warn_of_sources(
-    session: Session, sources: Mapping[str, Source], replaced: Mapping[str, str]
-) -> None:
-    """Warn of oddities of the recordings; those in `replaced` replace the session's."""
-    from mixpose.checking import shared_source_warnings  # noqa: PLC0415 - only a run needs it
-
-    for warning in shared_source_warnings(session, replaced):
-        warn(warning)
-    for name, source in sources.items():
-        if caution := source.caution():
-            warn(f"sensor {name!r}: {caution}")
 
 
 def counted(count: int, noun: str) -> str:
@@ -239,7 +225,6 @@ class Summary:
 
 @contextmanager
 def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
-    """Yield a display of rich on standard error if that is a terminal; else None."""
     if not shown or not sys.stderr.isatty():
         yield None
         return
@@ -256,10 +241,7 @@ def _display(*, shown: bool = True, spins: bool = False) -> Iterator[Any]:
 def bar(
     title: str, total: int | None, *, shown: bool = True, spins: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """Yield a function that advances a progress bar, which only a terminal shows.
-
-    A bar that `spins` does not show how much remains.
-    """
+    """Yield a function that advances a progress bar, or a spinner, which only a terminal shows."""
     with _display(shown=shown, spins=spins) as display:
         if display is None:
             yield lambda **changes: None
@@ -283,8 +265,8 @@ def shown_progress() -> Iterator[Progress]:
             return
         steps.append(step)
         if len(steps) == _TIMED:
-            remaining, mean_s = total - done, sum(steps) / _TIMED
-            seconds = mean_s * remaining
+            remaining = total - done
+            seconds = sum(steps) / _TIMED * remaining
             about = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
             say(f"{remaining} frames of cameras left to search, about {about}")
 

@@ -14,18 +14,20 @@ from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import warn
 from mixpose.errors import SessionError, reporting
 from mixpose.naming import distinct
-from mixpose.poses import benchmarks, csvtable, formats, jsonl, writing
+from mixpose.poses import jsonl, writers, writing
 from mixpose.poses.header import Header
 from mixpose.records import Estimate
 from mixpose.whole_files import appearing_whole
 
 _HEADER = '{"type": "header"'
-_WHOLE_LINES = map(re.escape, (benchmarks.BOP_COLUMNS, benchmarks.TUM_COLUMNS, writing.NO_TIMES))
+_WHOLE_LINES = map(re.escape, (writers.BOP_COLUMNS, writers.TUM_COLUMNS, writing.NO_TIMES))
 _FIRST_LINES = re.compile(
-    rf"{re.escape(_HEADER)}.*|{','.join(csvtable.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
+    rf"{re.escape(_HEADER)}.*|{','.join(writers.FRAME_COLUMNS[:3])},.*|{'|'.join(_WHOLE_LINES)}"
     r"|# frame -?\d+, (ok|ambiguous)"
 )
 """First lines of files of poses that mixpose wrote."""
+
+_FOREIGN = "{} {}: holds something that mixpose did not write; name another file"
 
 
 class Output(ExitStack):
@@ -58,14 +60,14 @@ class Output(ExitStack):
         if resumed is not None:
             self._writer = jsonl.JsonlWriter(cast(TextIO, resumed), header, resume=True)
         self._by_label: dict[str, Output] = {}  # if bodies have separate files
-        if not _are_separate(format_name, labels):
+        if format_name not in writers.ONE_TRAJECTORY or len(labels) < 2:
             return
         if path is None:
             raise SessionError(
                 f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
                 "with -o: each body gets one with its own name in it"
             )
-        for label, file in zip(labels, _body_paths(path, labels), strict=True):
+        for label, file in zip(labels, written_paths(path, format_name, labels), strict=True):
             self._by_label[label] = Output(file, format_name, header, options=options, whole=whole)
 
     def __enter__(self) -> Self:
@@ -105,26 +107,16 @@ class Output(ExitStack):
             self.file = LineFile(self._path, shown=self._named)
         # writers of poses call only write and flush
         stream = sys.stdout if self.file is None else cast(TextIO, self.file)
-        self._writer = formats.FORMATS[self._format](stream, self._header, **self._options)
+        self._writer = writers.FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
-def _body_paths(path: Path, labels: Sequence[str]) -> list[Path]:
-    """Return distinct files for the poses of bodies: ``poses.tum`` → ``poses.tool.tum``."""
+def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
+    """Return the files that poses go to; of several bodies perhaps ``poses.<body>.tum``."""
+    if path is None or format_name not in writers.ONE_TRAJECTORY or len(labels) < 2:
+        return [] if path is None else [path]
     words = distinct(labels, partial(re.sub, r"[^\w\- ]", "_"), str.casefold)
     return [path.with_name(f"{path.stem}.{word}{path.suffix}") for word in words]
-
-
-def _are_separate(format_name: str, labels: Sequence[str]) -> bool:
-    """Test whether a format needs a file for each of several bodies."""
-    return format_name in formats.ONE_TRAJECTORY and len(labels) > 1
-
-
-def written_paths(path: Path | None, format_name: str, labels: Sequence[str]) -> list[Path]:
-    """Return the files that poses go to; none for standard output."""
-    if path is None:
-        return []
-    return _body_paths(path, labels) if _are_separate(format_name, labels) else [path]
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
@@ -133,7 +125,7 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     first = beginning.partition("\n")[0].rstrip("\r")
     is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
     if beginning and not (_FIRST_LINES.fullmatch(first) or is_rerun):
-        raise _foreign(path)
+        raise SessionError(_FOREIGN.format("-o", path))
     if first.startswith(_HEADER) and '"mixpose": ' not in first:
         raise SessionError(f"-o {path}: holds poses of another origin; name another file")
 
@@ -141,15 +133,12 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
 def refuse_to_overwrite_but(
     path: Path, inputs: Iterable[Path | None], mark: str, option: str = "-o", *, begins: str = ""
 ) -> None:
-    """Raise SessionError unless a file to be written is new, empty, or has `mark` in its beginning.
-
-    It has to start with `begins`; `option` is the option that named the file.
-    """
+    """Raise SessionError unless a file is new, empty, or `begins` as told and has `mark` in it."""
     if is_stdout(path):
         return
     beginning = _beginning(path, inputs, option)
     if beginning and not (beginning.startswith(begins) and mark in beginning):
-        raise _foreign(path, option)
+        raise SessionError(_FOREIGN.format(option, path))
 
 
 def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") -> str:
@@ -164,12 +153,6 @@ def _beginning(path: Path, inputs: Iterable[Path | None], option: str = "-o") ->
         raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")
-
-
-def _foreign(path: Path, option: str = "-o") -> SessionError:
-    return SessionError(
-        f"{option} {path}: holds something that mixpose did not write; name another file"
-    )
 
 
 def is_stdout(named: Path | None) -> bool:

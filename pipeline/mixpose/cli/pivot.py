@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mixpose.cli.app_after import PivotRequest
+from mixpose.cli.app import PivotRequest
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import print_lines, write_text
 from mixpose.errors import RecordingError, SessionError
@@ -23,10 +23,7 @@ _SLIPPED = 2.0  # times the deviations: a tip that stays gives 1 within a few pe
 
 
 def pivot_poses(request: PivotRequest) -> None:
-    """Find the tip of a tool, print it, and write it into a session.
-
-    Raises RecordingError if the poses do not determine the tip.
-    """
+    """Find the tip of a tool, print it, and write it into a session."""
     path = request.poses
     poses = read_poses(path)
     tool = _tool(poses, request)

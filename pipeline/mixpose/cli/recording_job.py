@@ -130,7 +130,7 @@ def finished(job: Job) -> Outcome | None:
 
 
 def _is_of(outcome: Outcome, job: Job) -> bool:
-    """Test whether an outcome is of the same session, options and version as a job."""
+    """Test whether an outcome is of the session, options and version of a job."""
     key = (outcome.session_sha256, outcome.options, outcome.mixpose)
     return key == (job.session_sha256, job.options, job.mixpose)
 
@@ -176,9 +176,10 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
     parsed = [counts for line in lines if (counts := parsed_frames(line))]
     frames, bodies = parsed[-1] if parsed else ({}, 1)
-    if resumes and state != FAILED:
-        with suppress(OSError, ValueError, KeyError):
-            frames = _statuses_in(poses)
+    if resumes and state != FAILED:  # interrupted runs have poses in the file, too
+        with suppress(OSError, ValueError, KeyError), poses.open(encoding="ascii") as stream:
+            whole = [json.loads(line) for line in stream if line.endswith("\n")]
+            frames = dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
     last_line = (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
     reason = None if status == 0 else last_line
     outcome = replace(
@@ -206,13 +207,6 @@ def _can_resume(part: Path, job: Job) -> bool:
     return False
 
 
-def _statuses_in(poses: Path) -> dict[str, int]:
-    """Count the poses of each status in a file, which interrupted runs contributed to."""
-    with poses.open(encoding="ascii") as lines:
-        whole = [json.loads(line) for line in lines if line.endswith("\n")]
-    return dict(Counter(line["status"] for line in whole if line["type"] == "pose"))
-
-
 def write_json(path: Path, content: Mapping[str, object]) -> None:
     """Write an indented JSON file as a whole."""
     with appearing_whole(path) as part:
@@ -220,10 +214,7 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
-    """Rename a complete folder to its final name, unless another worker was faster.
-
-    Existing poses are not replaced by a run that failed.
-    """
+    """Rename a complete folder to its final name; poses that are done already stay."""
     place = Path(job.folder) / job.name
     while True:
         earlier, existing = finished(job), outcome_in(place)

@@ -1,4 +1,4 @@
-"""Arguments and options of ``mixpose run``.
+"""Requests of commands, made of arguments and options, and that of ``mixpose run``.
 
 This module imports little, so that a command which only starts other processes loads fast.
 """
@@ -6,16 +6,20 @@ This module imports little, so that a command which only starts other processes 
 from __future__ import annotations
 
 import glob
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, field, fields
+from functools import partial
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal, TypeAlias, get_type_hints
 
 import typer
 
-from mixpose.cli.words import AllowCode, Format, option
 from mixpose.errors import SessionError
 from mixpose.selection import Selection
+
+Format: TypeAlias = Literal["jsonl", "csv", "tum", "bop", "ros"]
 
 SUFFIXES = {
     ".jsonl": "jsonl",
@@ -30,28 +34,82 @@ SUFFIXES = {
 FARTHEST_S = 0.5
 """Longest prediction of poses, s: by then a hand may have reversed its motion."""
 
-Sources = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=PATH",
-        help="Another recording of a sensor, relative to the working folder, or the number of a "
-        "camera; repeatable.",
-    ),
-]
+
+def option(
+    meaning: str,
+    default: Any = None,
+    *,
+    name: str | None = None,
+    panel: str | None = None,
+    make: Callable[..., Any] = typer.Option,
+    **more: Any,
+) -> Any:
+    """Return a field that is an option, required if the default is `...`; `more` goes to typer."""
+    settings = {"help": meaning, "rich_help_panel": panel, **more}
+    metadata = {"name": name, "make": make, "settings": settings}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+argument = partial(option, make=typer.Argument)
+another_source = partial(
+    option,
+    "Another recording of a sensor, relative to the working folder, or the number of a camera; "
+    "repeatable.",
+    metavar="NAME=PATH",
+)
+any_code = partial(
+    option, 'Run functions that the session names: method = "module:function".', False
+)
+"""Arguments, and options that several commands have."""
+
+
+def option_name(entry: Field[Any]) -> str:
+    """Return the option of a field; named even for a bool, or typer would add one with "no-"."""
+    return entry.metadata.get("name") or f"--{entry.name.replace('_', '-')}"
+
+
+def command_for(request: type, work: str) -> Callable[..., None]:
+    """Make a command with the fields of a record as parameters and its docstring as help.
+
+    The record is passed to the ``module:function`` `work` of this package, imported when called.
+    All raise SessionError if the session or an option is wrong, or an output would overwrite
+    something else, and RecordingError if a recording or poses cannot be read. A field `debug` takes
+    the value of ``--debug``.
+    """
+    hints: dict[str, Any] = get_type_hints(request, include_extras=True)
+    for entry in fields(request):
+        if make := entry.metadata.get("make"):
+            names: list[str] = []
+            if make is typer.Option:
+                names = ["-o", "--output"] if entry.name == "output" else [option_name(entry)]
+            made = make(*names, **entry.metadata["settings"])
+            hints[entry.name] = Annotated[hints[entry.name], made]
+    form = signature(request)
+    if "debug" in hints:
+        hints["debug"] = typer.Context  # which has the value
+    typed = [p.replace(annotation=hints[name]) for name, p in form.parameters.items()]
+
+    def command(**values: Any) -> None:
+        module, _, name = work.partition(":")
+        if "debug" in values:
+            values["debug"] = bool(values["debug"].obj)
+        getattr(import_module(f"mixpose.cli.{module}"), name)(request(**values))
+
+    command.__doc__, command.__annotations__ = request.__doc__, hints
+    command.__signature__ = form.replace(parameters=typed)  # type: ignore[attr-defined]
+    return command
 
 
 @dataclass(frozen=True)
 class RunRequest:
     """Estimate a pose per frame."""
 
-    sessions: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SESSION.toml...",
-            help="One session file or several, patterns such as 'day*/session.toml', or text files "
-            "(.txt) with one to a line.",
-        ),
-    ]
+    sessions: list[str] = argument(
+        "One session file or several, patterns such as 'day*/session.toml', or text files (.txt) "
+        "with one to a line.",
+        ...,
+        metavar="SESSION.toml...",
+    )
     output: Path | None = option(
         "Write poses here, not to stdout (-), in the format that the suffix tells. With "
         "several sessions, a folder in which each gets its own for poses, log and status; what "
@@ -60,7 +118,7 @@ class RunRequest:
     format: Format | None = option(
         "Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."
     )
-    source: Sources = None
+    source: list[str] | None = another_source()
     start: int | None = option("First frame number.")
     stop: int | None = option("Frame number to stop before.")
     step: int = option("Take every N-th frame number.", 1, min=1)
@@ -94,7 +152,7 @@ class RunRequest:
     predict: float | None = option(
         "Publish where the body will be so much after each frame.", metavar="SECONDS"
     )
-    allow_code: AllowCode = False
+    allow_code: bool = any_code()
     debug: bool = False
 
     @property
@@ -104,11 +162,7 @@ class RunRequest:
 
     @property
     def format_name(self) -> str:
-        """The format of poses: of --format, else of the file's suffix, else JSON lines.
-
-        Raises SessionError if the suffix belongs to no format, or to one that cannot be written
-        while poses are estimated.
-        """
+        """The format of poses: of --format, else of the file's suffix, else JSON lines."""
         return self.format or ("jsonl" if self.are_many else _format_by_suffix(self.poses))
 
     @property
@@ -126,7 +180,7 @@ class RunRequest:
 
     @property
     def options(self) -> dict[str, int | bool]:
-        """Options that differ from their defaults and must be the same for all lines of a file."""
+        """Options unlike their defaults that must be the same for all lines of a file."""
         step = {"step": self.step} if self.step != 1 else {}
         return step | ({"labels": True} if self.labels else {})
 

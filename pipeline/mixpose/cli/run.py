@@ -6,19 +6,18 @@ import glob
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from functools import partial
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.continuation import Continuation, Notes, is_device, resume
-from mixpose.cli.notices import Summary, bar, origin_of, say, warn_of_sources
+from mixpose.checking import shared_source_warnings
+from mixpose.cli.continuation import Notes, is_device, resume
+from mixpose.cli.notices import Summary, bar, origin_of, say, warn
 from mixpose.cli.output import Output, refuse_stdout, refuse_to_overwrite, written_paths
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
 from mixpose.objective import View
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import ResumePoint
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
@@ -28,10 +27,7 @@ from mixpose.tracking.proposers import predicted
 
 
 def run_session(request: RunRequest) -> None:
-    """Estimate every frame of a session's recording and write the poses.
-
-    Whatever is raised, frames already estimated stay written.
-    """
+    """Write the poses of a recording; whatever is raised, those estimated already stay written."""
     with ExitStack() as pages:  # closed after the poses
         _run_session(request, pages)
 
@@ -45,33 +41,38 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
     for path in outputs:
         if not is_device(path):
             refuse_to_overwrite(path, _inputs(session))
-    plan = Continuation(None, request.selection)
-    if request.resume:
-        plan = resume(request, header, opened)
+    plan = resume(request, header, opened)
     if plan.is_done:
         say(f"nothing left to do: {request.poses} has all frames asked for already")
         return
-    warn_of_sources(session, opened, replaced)
+    cautions = [f"sensor {k!r}: {text}" for k, s in opened.items() if (text := s.caution())]
+    for warning in (*shared_source_warnings(session, replaced), *cautions):
+        warn(warning)
     summary = Summary(session)
     view = _view(pages, session, request, opened)
     output = Output(request.poses, request.format_name, header, header.labels, resumed=plan.file)
+
+    def call_watches(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        for watch in watches if plan.is_new(estimate, session.labels) else ():
+            watch(frame_set, views, estimate)
+
     with output, prompt_switching(), ExitStack() as stack:
-        is_new = partial(_is_new, session.labels, plan.last_written)
         watches = [*_watches(stack, session, request, header), summary.findings.watch, *view]
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
             opened=opened,
             selection=plan.selection,
-            watch=partial(_call_watches, is_new, watches),
+            watch=call_watches,
             memory=plan.memory,
             remember=memories.append,
             labels=request.labels,
         )
         stack.enter_context(closing(estimates))
         notes = stack.enter_context(Notes(request))
-        shown = _with_progress(estimates, session, quiet=request.poses is None)
-        for estimate in filter(is_new, shown):
+        for estimate in _with_progress(estimates, session, quiet=request.poses is None):
+            if not plan.is_new(estimate, session.labels):
+                continue
             output.write(estimate)
             is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are written
             if output.file is not None and is_whole:
@@ -81,12 +82,6 @@ def _run_session(request: RunRequest, pages: ExitStack) -> None:
                 say(f"frame {estimate.frame}: {origin_of(estimate)}")
     names = [str(path) for path in (*outputs, request.overlay) if path is not None]
     summary.say(f" -> {', '.join(names)}" if names else "")
-
-
-def _is_new(labels: Sequence[str], last: ResumePoint | None, estimate: Estimate) -> bool:
-    """Test whether an estimate comes after the last line that an earlier run wrote."""
-    line_number = labels.index(estimate.label) + 1  # among the lines of the frame
-    return last is None or (estimate.frame, line_number) > (last.frame, last.lines)
 
 
 def _watches(
@@ -137,18 +132,6 @@ def _view(
     return [viewer.watch]
 
 
-def _call_watches(
-    is_new: Callable[[Estimate], bool],
-    watches: Sequence[Watch],
-    frame_set: FrameSet,
-    views: Sequence[View],
-    estimate: Estimate,
-) -> None:
-    """Pass a new estimate and its frame to all watches."""
-    for watch in watches if is_new(estimate) else ():
-        watch(frame_set, views, estimate)
-
-
 def _inputs(session: Session) -> Iterator[Path]:
     """Yield the files that a run reads, which no output may replace."""
     yield session.path
@@ -168,9 +151,7 @@ def header_of(
     sources: Mapping[str, str] | None = None,
     options: Mapping[str, int | bool] | None = None,
 ) -> Header:
-    """Return the header of a session's poses, with `sources` that replace the session's and those
-    `options` that change pose lines.
-    """
+    """Return the header of poses; `sources` replace the session's, `options` change pose lines."""
     return Header(
         unit=session.unit,
         session=str(session.path),
@@ -187,10 +168,7 @@ def header_of(
 
 
 def named_sources(named: Iterable[str]) -> dict[str, str]:
-    """Return recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
-
-    Raises SessionError if a text is not of this form.
-    """
+    """Return recordings by sensor, from texts like ``left=frames/``; ``left=0`` is camera 0."""
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")
@@ -206,10 +184,9 @@ def _with_progress(
     estimates: Generator[Estimate, None, None], session: Session, *, quiet: bool
 ) -> Iterable[Estimate]:
     """Pass estimates on; show progress on standard error, on a terminal and unless `quiet`."""
+    lost = 0
     with bar(str(session.path), None, shown=not quiet, spins=True) as advance:
-        lost = 0
         for count, estimate in enumerate(estimates, 1):
             lost += estimate.status == "lost"
-            text = f"frame {estimate.frame}, {count} done, {lost} lost"
-            advance(advance=1, description=text)
+            advance(advance=1, description=f"frame {estimate.frame}, {count} done, {lost} lost")
             yield estimate

@@ -1,7 +1,4 @@
-"""``mixpose convert`` to formats that need the session of the poses.
-
-These are trajectories of labelled markers (.c3d, .trc), and poses with their recording (.rrd).
-"""
+"""``mixpose convert`` to markers (.c3d, .trc) and recordings (.rrd), which need the session."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.cli.app_after import ConvertRequest
+from mixpose.cli.app import ConvertRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError, require_package
@@ -38,12 +35,7 @@ def write_markers(
     format_name: str,
     request: ConvertRequest,
 ) -> None:
-    """Write the places of all markers: measured ones, else by the pose.
-
-    `lines` are the poses to write, with lengths in `unit`. Raises SessionError if a package is
-    missing or options do not fit the poses, and RecordingError if such a file cannot hold the
-    poses.
-    """
+    """Write the places of all markers: measured ones, else by the pose; lengths are in `unit`."""
     session = session_of(poses, request.session, allow_code=request.allow_code, unit=unit)
     output, measured = request.output, request.measured
     if format_name == "c3d":
@@ -84,10 +76,7 @@ def trajectories_of(
     measured: bool,
     fps: float | None = None,
 ) -> Trajectories:
-    """Collect the places of all markers from pose lines.
-
-    `measured` leaves gaps where no marker was measured; `fps` replaces the rate of the times.
-    """
+    """Collect the places of all markers; `measured` leaves gaps, `fps` replaces the times."""
     bodies = _bodies(poses, lines, session)
     names = [(label, name) for label, body in bodies.items() for name in body.labels]
     columns = {pair: k for k, pair in enumerate(names)}
@@ -150,7 +139,6 @@ def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Map
 
 
 def _rate(poses: PoseFile, numbers: Mapping[int, int]) -> float:
-    """Return the frames per second by the times of poses; 1 if they have none."""
     rate_and_error = trajectories.rate_of(poses.poses, numbers)
     if rate_and_error is None:
         warn(f"{poses.path}: has no times; the rate is told as 1 frame a second; --fps says more")
@@ -173,11 +161,7 @@ def _require_output(output: Path | None, name: str, suffix: str, package: str, m
 
 
 def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequest) -> None:
-    """Write poses and the recording of their session as an ``.rrd`` file.
-
-    Raises SessionError if the package of the viewer is missing, or the session is not found or does
-    not fit the poses; RecordingError if the recording cannot be read.
-    """
+    """Write poses and the recording of their session as an ``.rrd`` file."""
     output = _require_output(request.output, "rerun", "rrd", "rerun-sdk", "")
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - only where it is written
 
@@ -188,11 +172,7 @@ def write_rerun(poses: PoseFile, lines: Sequence[PoseLine], request: ConvertRequ
 
 
 def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dict[str, Source]:
-    """Open the recording of poses: that of their header, else of the session.
-
-    Recordings that are `named` replace it. Raises SessionError for a live sensor, whose frames are
-    gone, and RecordingError if a recording cannot be opened.
-    """
+    """Open the recording of poses: those `named`, else that of their header or of the session."""
     from mixpose.cli.run import named_sources  # noqa: PLC0415 - only where it is read again
     from mixpose.runner import open_sources  # noqa: PLC0415
 
@@ -211,10 +191,7 @@ def recording_of(poses: PoseFile, session: Session, named: Sequence[str]) -> dic
 def session_of(
     poses: PoseFile, named: Path | None, *, allow_code: bool = False, unit: str | None = None
 ) -> Session:
-    """Load the session of poses: the one `named`, or that of their header.
-
-    `unit` is for poses that state none. Raises SessionError for a missing session or another unit.
-    """
+    """Load the session of poses: `named`, or of their header; `unit` is of poses without one."""
     path = named
     if path is None:
         stated = poses.header.get("session")

@@ -13,7 +13,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -59,10 +59,7 @@ def run(request: RunRequest) -> None:
 
 
 def sessions_of(named: Sequence[str]) -> list[Path]:
-    """Return the sessions that arguments name: files, patterns, or text files with one per line.
-
-    Raises SessionError if a pattern matches nothing, or a list cannot be read or is empty.
-    """
+    """Return the sessions that files, patterns, or text files with one per line name."""
     sessions: dict[Path, None] = {}
     for text in named:
         path = Path(text)
@@ -114,11 +111,7 @@ def _refuse_alone(sessions: Sequence[Path], request: RunRequest) -> None:
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest) -> int:
-    """Run all recordings that are not done yet; report each, and return the highest exit status.
-
-    The number of workers has no effect on a cluster that is not local. Raises SessionError if there
-    is no folder for the poses, or an option is for a single recording.
-    """
+    """Run all recordings that are not done yet; report each, and return the highest exit status."""
     _refuse_alone(sessions, request)
     folder = _folder(request.poses, len(sessions))
     jobs = _jobs(sessions, folder, request)
@@ -163,18 +156,15 @@ def _doing(request: RunRequest) -> Iterator[tuple[Executor, partial[Outcome]]]:
 
 
 def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
-    """Return the outcome of a job, a failure if its workers were lost repeatedly."""
     if isinstance(result, Outcome):
         return result
+    # its workers were lost repeatedly
     reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
     return replace(recording_job.outcome_of(job, FAILED, 3, reason), host="")
 
 
 def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
-    names = names_of(sessions)
-    suffix = next(
-        end for end, format_name in SUFFIXES.items() if format_name == request.format_name
-    )
+    suffix = next(end for end, name in SUFFIXES.items() if name == request.format_name)
     return [
         Job(
             session=str(session.absolute()),
@@ -186,7 +176,7 @@ def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[J
             mixpose=__version__,
             shared=request.scheduler is not None,
         )
-        for session, name in zip(sessions, names, strict=True)
+        for session, name in zip(sessions, names_of(sessions), strict=True)
     ]
 
 
@@ -209,7 +199,6 @@ def names_of(sessions: Sequence[Path]) -> list[str]:
 
 
 def _options(request: RunRequest) -> tuple[str, ...]:
-    """Return the options for the run of one session."""
     values = {"format": request.format_name, "step": request.step}
     values |= {"start": request.start, "stop": request.stop}
     flags = {"allow-code": request.allow_code, "labels": request.labels, "debug": request.debug}
@@ -218,10 +207,9 @@ def _options(request: RunRequest) -> tuple[str, ...]:
 
 
 def _sha256(session: Path) -> str:
-    try:
+    with suppress(OSError):
         return hashlib.sha256(_beginning(session)).hexdigest()
-    except OSError:
-        return ""
+    return ""
 
 
 def _beginning(path: Path) -> bytes:
@@ -259,7 +247,6 @@ def _refuse_others(folder: Path, jobs: Sequence[Job]) -> None:
 
 
 def _line(outcome: Outcome) -> str:
-    """Return the result of a recording in words."""
     if outcome.reason is not None:
         return outcome.reason.removeprefix(f"{outcome.session}: ")
     text = frames_text(outcome.frames, outcome.bodies)

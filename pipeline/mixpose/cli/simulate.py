@@ -8,7 +8,7 @@ from dataclasses import fields
 from mixpose.cli.app import SimulateRequest
 from mixpose.cli.notices import bar, counted, warn
 from mixpose.cli.output import refuse_stdout
-from mixpose.cli.words import option_name
+from mixpose.cli.request import option_name
 from mixpose.errors import SessionError
 from mixpose.session import load_session
 from mixpose.session.values import LONGEST_DELAY_S, as_number

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.app_after import SmoothRequest
+from mixpose.cli.app import SmoothRequest
 from mixpose.cli.notices import counted, say, warn
 from mixpose.cli.output import Output, refuse_suffix, refuse_to_overwrite
 from mixpose.cli.request import output_of
@@ -21,10 +21,7 @@ from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
 
 
 def smooth_poses(request: SmoothRequest) -> None:
-    """Smooth the poses of a file and write them.
-
-    Raises RecordingError if they were smoothed before, are predictions, or lack what is needed.
-    """
+    """Smooth the poses of a file and write them."""
     path, output, fill_s = request.poses, output_of(request.output), request.fill
     poses = read_poses(path)
     if poses.header.get("smoothed"):
@@ -67,10 +64,9 @@ def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) 
         header_of(poses, str(poses.unit), __version__),
         smoothed={label: _model(body) for label, body in bodies.items()},
     )
-    order = {label: k for k, label in enumerate(bodies)}
-    lines = [estimate for body in bodies.values() for estimate in body.estimates]
+    estimates = [estimate for body in bodies.values() for estimate in body.estimates]
     with Output(path, "jsonl", header, whole=True) as writer:
-        for estimate in sorted(lines, key=lambda estimate: (estimate.frame, order[estimate.label])):
+        for estimate in sorted(estimates, key=lambda estimate: estimate.frame):  # then by body
             writer.write(estimate)
 
 

@@ -11,6 +11,6 @@ from mixpose.frames.opening import (
     spread_over as spread_over,
 )
 from mixpose.frames.pairing import pair as pair, paired_by_stamp as paired_by_stamp
-from mixpose.frames.prefetch import prefetch as prefetch
+from mixpose.frames.pairing import prefetch as prefetch
 from mixpose.frames.source import ALL_NUMBERS as ALL_NUMBERS, SensorKind as SensorKind
 from mixpose.frames.source import Source as Source, SourceSpec as SourceSpec

@@ -123,10 +123,7 @@ def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
 
 @dataclass
 class ColourRoom:
-    """The image that is reused for all coloured frames of a capture.
-
-    To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
-    """
+    """The image reused for coloured frames: to allocate one, OpenCV waits for the interpreter."""
 
     image: cv2.typing.MatLike | None = None  # (H, W, 3 or 4), the last coloured frame
 
@@ -138,10 +135,7 @@ def retrieve(
     expected: tuple[int, int] | None,
     room: ColourRoom | None = None,
 ) -> Image:
-    """Convert the grabbed frame to grey values (H, W); `room` is reused from frame to frame.
-
-    Raises RecordingError if it cannot be decoded or has not the expected width and height.
-    """
+    """Convert the grabbed frame to grey values (H, W), reusing `room`; or raise RecordingError."""
     is_decoded, image = capture.retrieve() if room is None else capture.retrieve(room.image)
     if not is_decoded or image is None:
         raise RecordingError(f"{name_of(address)}: frame {number} cannot be decoded")
@@ -167,11 +161,7 @@ def name_of(address: str | int) -> str:
 
 
 def quieten_opencv() -> None:
-    """Turn off messages of OpenCV and of its FFmpeg backend, unless the user has set their levels.
-
-    They would hide mixpose's own line on what cannot be read among dozens. FFmpeg's level counts
-    only before the first video is opened.
-    """
+    """Silence OpenCV and its FFmpeg, which hide mixpose's lines, unless the user set levels."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -1,8 +1,7 @@
-"""Test whether a video file is whole, by its outermost structure.
+"""Test whether a video file is whole: the sizes that its outermost parts state must fit into it.
 
 A decoder reports the end of a truncated file like any other, and the number of frames in a
-container may be an estimate.  But AVI, MP4 and Matroska files state the sizes of their outermost
-parts, and these must fit into the file.
+container may be an estimate.
 """
 
 from __future__ import annotations
@@ -32,50 +31,43 @@ def container_of(path: Path) -> Container | None:
 
 
 def missing_bytes(path: Path) -> int:
-    """Return how many bytes of its outermost parts a video file lacks; 0 if they are unknown.
-
-    Raises OSError if it cannot be read.
-    """
+    """Return how many bytes a video file lacks, 0 if unknown; OSError if it cannot be read."""
     container = container_of(path)
     if container is None:
         return 0
-    end_of = {"avi": _riff_end, "mp4": _mp4_end, "matroska": _matroska_end}[container]
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
-        missing = end_of(file, size) - size
+        if container == "matroska":
+            missing = _matroska_end(file) - size
+        else:
+            length_of, offset = _riff_length if container == "avi" else _mp4_length, 0
+            while offset + 8 <= size:
+                file.seek(offset)
+                if not (length := length_of(file.read(16))):
+                    break
+                offset += length
+            missing = offset - size
     return missing if missing > _SLACK_BYTES else 0
 
 
-def _riff_end(file: BinaryIO, size: int) -> int:
-    """Return the end of the last RIFF part; long AVI files have several (OpenDML)."""
-    offset = 0
-    while offset + 8 <= size:
-        file.seek(offset)
-        head = file.read(8)
-        length = int.from_bytes(head[4:], "little")
-        # interrupted recorders leave a size of 0, streams one of all ones
-        if head[:4] != b"RIFF" or length in (0, 2**32 - 1):
-            break
-        offset += 8 + length + length % 2
-    return offset
+def _riff_length(head: bytes) -> int:
+    """Return the length of a RIFF part, of which long AVI files have several (OpenDML), or 0."""
+    length = int.from_bytes(head[4:8], "little")
+    # interrupted recorders leave a size of 0, streams one of all ones
+    is_known = head[:4] == b"RIFF" and length not in (0, 2**32 - 1)
+    return 8 + length + length % 2 if is_known else 0
 
 
-def _mp4_end(file: BinaryIO, size: int) -> int:
-    """Return the end of the last box (ISO/IEC 14496-12, section 4.2); the rest is padding."""
-    offset = 0
-    while offset + 8 <= size:
-        file.seek(offset)
-        head = file.read(16)
-        length = int.from_bytes(head[:4])
-        if length == 1:
-            length = int.from_bytes(head[8:])
-        if head[4:8] not in _MP4_BOXES or length < 8:  # 0 means up to the end of the file
-            break
-        offset += length
-    return offset
+def _mp4_length(head: bytes) -> int:
+    """Return the length of a box (ISO/IEC 14496-12, section 4.2); 0 for padding."""
+    length = int.from_bytes(head[:4])
+    if length == 1:
+        length = int.from_bytes(head[8:])
+    # 0 means up to the end of the file
+    return length if head[4:8] in _MP4_BOXES and length >= 8 else 0
 
 
-def _matroska_end(file: BinaryIO, size: int) -> int:
+def _matroska_end(file: BinaryIO) -> int:
     """Return the end of the segment behind the EBML header (RFC 8794); 0 if its size is unknown."""
     offset = 0
     for _ in ("header", "segment"):

@@ -18,8 +18,8 @@ import numpy as np
 
 from mixpose.errors import RecordingError, reporting
 from mixpose.frames.capture import quieten_opencv
-from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, require_times
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text
+from mixpose.frames.times import Clock
 from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS
 from mixpose.records import Image, RawFrame
 
@@ -103,13 +103,11 @@ class ImageSequence(Source):
             )
         return None
 
-    def check_times(self, wanted: range) -> None:
-        """Require a time for each image in the range."""
-        require_times(self.clock, (number for number in self.numbers if number in wanted))
+    def known_numbers(self) -> Sequence[int]:
+        """Return the frame numbers, ascending."""
+        return self.numbers
 
-    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Decode the images whose numbers lie in the range; the others are not even opened."""
-        wanted = selection(start, stop, step, self.first)
+    def _frames(self, wanted: range) -> Frames:
         size, like = self.resolution, "the sensor's resolution"
         for number, path in zip(self.numbers, self.paths, strict=True):
             if number not in wanted:
@@ -129,20 +127,13 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
     """Open images as a source, in the order of their `frame_numbers`."""
     numbers, ordered = zip(*sorted(zip(frame_numbers(paths), paths, strict=True)), strict=True)
     is_stamped = spec.times is None and all(_FIRST_STAMP <= n < _LAST_STAMP for n in numbers)
-    clock = _time_of_stamp if is_stamped else clock
+    if is_stamped:  # a quotient of whole numbers is rounded once
+        clock = lambda stamp: stamp / 10**9  # noqa: E731
     return ImageSequence(ordered, numbers, spec.resolution, clock, is_stamped, spec.fps is not None)
 
 
-def _time_of_stamp(stamp: int) -> float:
-    """Convert nanoseconds to seconds."""
-    return stamp / 10**9  # a quotient of whole numbers is rounded once
-
-
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
-    """Return frame numbers of images: those at the ends of names, if all have different ones.
-
-    Else they are numbered by their place in `paths`, from 0.
-    """
+    """Return frame numbers: those at the ends of names, if all differ, else places in `paths`."""
     numbers = [number for number in _end_numbers(paths) if number is not None]
     return numbers if len(numbers) == len({*numbers}) == len(paths) else [*range(len(paths))]
 

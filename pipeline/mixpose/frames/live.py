@@ -23,7 +23,7 @@ import cv2
 from mixpose.constants import constant
 from mixpose.errors import RecordingError
 from mixpose.frames import capture as captures
-from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, selection
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, Moment, RawFrame
 
@@ -67,9 +67,6 @@ class LiveSource(Source):
     """A camera or a stream, opened when its frames are requested."""
 
     kind: ClassVar[SourceKind] = "live"
-    ahead: ClassVar[int] = 0
-    first: ClassVar[int] = 0
-    length: ClassVar[None] = None
 
     address: str | int  # of a stream or a device, or the index of a camera
     resolution: tuple[int, int] | None  # size that every frame must have, in px
@@ -79,15 +76,7 @@ class LiveSource(Source):
         """Describe the source in a line."""
         return f"live {captures.name_of(self.address)}, opened when it is needed"
 
-    def check_times(self, wanted: range) -> None:
-        """Require nothing, as future frames are unknown."""
-
-    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Yield the newest frame whenever there is a new one.
-
-        Raises RecordingError if the source does not open or falls silent.
-        """
-        wanted = selection(start, stop, step, self.first)
+    def _frames(self, wanted: range) -> Frames:
         for frame_set in join_live({"": self}, wanted):
             yield frame_set.frames[""]
 

@@ -15,11 +15,11 @@ import numpy as np
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.capture import is_pipe
-from mixpose.frames.images import IMAGE_SUFFIXES, ImageSequence, natural_order, open_images
+from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
 from mixpose.frames.live import live_address, open_live
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
-from mixpose.frames.tables import DetectionTable, open_table
+from mixpose.frames.tables import open_table
 from mixpose.frames.times import Clock, clock_of, csv_rows
 from mixpose.frames.video import open_video
 
@@ -49,11 +49,8 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
 
 def numbers_of(source: Source) -> set[int] | None:
     """Return the frame numbers of a recording; None if only decoding it would tell."""
-    if isinstance(source, ImageSequence):
-        return set(source.numbers)
-    if isinstance(source, DetectionTable):
-        return set(source.numbers())
-    return None if source.length is None else set(range(source.length))
+    numbers = source.known_numbers()
+    return None if numbers is None else set(numbers)
 
 
 def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
@@ -63,11 +60,7 @@ def spread_over(numbers: Sequence[int], most: int, run: int = 1) -> list[int]:
 
 
 def open_source(spec: SourceSpec) -> Source:
-    """Find the recording of a sensor and open it; only its beginning is read.
-
-    Raises SessionError if its options contradict each other or do not fit it, and RecordingError if
-    it does not exist or cannot be read.
-    """
+    """Find and open a recording; SessionError if options do not fit it, else RecordingError."""
     clock = clock_of(spec)
     try:
         kind, places = _recognise(spec)
@@ -113,7 +106,6 @@ def _recognise(spec: SourceSpec) -> tuple[SourceKind, list[str]]:
 
 
 def _listed(spec: SourceSpec, source: Sequence[str]) -> list[str]:
-    """Return the files of a list, in its order."""
     if not source:
         raise SessionError(f"sensor {spec.sensor!r}: source: found an empty list of images")
     paths = [spec.base / name for name in source]
@@ -149,11 +141,6 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
     )
 
 
-def _similarity(name: str, wanted: str) -> float:
-    """Return the similarity of a name to a missing one, to a tenth, regardless of case."""
-    return round(SequenceMatcher(None, name.lower(), wanted.lower()).ratio(), 1)
-
-
 def _looked_in(path: Path) -> str:
     """Describe the folder where a file was looked for, and its contents."""
     folder = path.parent
@@ -169,8 +156,8 @@ def _looked_in(path: Path) -> str:
         return f"{text}, which cannot be read: {error.strerror}"
     # of files that differ in numbers alone, show the first
     kinds = {re.sub(r"[0-9]+", "0", entry.name): entry.name for entry in reversed(entries)}
-    names = list(kinds.values())[::-1]
-    names.sort(key=lambda name: -_similarity(name, path.name))
+    names, wanted = list(kinds.values())[::-1], path.name.lower()
+    names.sort(key=lambda name: -round(SequenceMatcher(None, name.lower(), wanted).ratio(), 1))
     shown = ", ".join(names[:_MOST_NAMES])
     more = f", ... ({len(entries)} in all)" if len(entries) > min(len(kinds), _MOST_NAMES) else ""
     return f"{text}, where there is {shown}{more}" if entries else f"{text}, which is empty"

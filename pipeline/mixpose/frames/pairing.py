@@ -1,4 +1,4 @@
-"""Join frames of several sensors, by their numbers or by their stamps.
+"""Join frames of several sensors, by their numbers or by their stamps, and read them ahead.
 
 Recorders of robots name images after the nanosecond of their capture, and cameras triggered
 together differ by microseconds: such frames, and those of tables with times but no numbers, are
@@ -8,22 +8,26 @@ paired by the nearest stamp.
 from __future__ import annotations
 
 import math
+import threading
 from bisect import bisect_left
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
+from queue import SimpleQueue
 from statistics import median_low
+from typing import TypeVar
 
 import numpy as np
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.live import LiveSource, join_live
-from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Source, selection
 from mixpose.frames.tables import DetectionTable
 from mixpose.records import FrameSet, RawFrame
+
+T = TypeVar("T")
 
 READY_BYTES = 2**24  # for further decoded frames of a source that wait
 MOST_MORE = 13  # further frames: a pose may take as long as 16 others, and not delay a decoder
@@ -100,6 +104,58 @@ def _more_ahead(frame: RawFrame) -> int:
     return min(MOST_MORE, READY_BYTES // max(size, 1))
 
 
+def prefetch(
+    items: Iterator[T], depth: int = 3, more: Callable[[T], int] | None = None
+) -> Generator[T, None, None]:
+    """Yield `items` in order while a worker thread fetches the next ones.
+
+    The thread ends when this generator is exhausted, closed or collected; only that thread advances
+    `items`, and closes it if it can be closed. An exception of `items` is raised in its place. At
+    most `depth` items wait, and another may be on its way; `more` is called with the first item and
+    returns how many more may wait.
+    """
+    # items in tuples of one, and in the end the exception raised, or None
+    waiting: SimpleQueue[tuple[T] | BaseException | None] = SimpleQueue()
+    room: SimpleQueue[None] = SimpleQueue()
+    for _ in range(max(depth, 1)):
+        room.put(None)
+    stop = threading.Event()
+
+    def fetch() -> None:
+        """Move items to the queue as there is room, until they end, fail or are stopped."""
+        # two unbounded queues cost less than a bounded one, as their locks are not in Python
+        error: BaseException | None = None
+        try:
+            with ExitStack() as closing:
+                closing.callback(getattr(items, "close", lambda: None))
+                for k, item in enumerate(items):
+                    for _ in range(more(item) if more and not k else 0):
+                        room.put(None)
+                    room.get()
+                    if stop.is_set():
+                        break
+                    waiting.put((item,))
+        except BaseException as caught:  # the consumer raises it
+            error = caught
+        if not stop.is_set():
+            waiting.put(error)
+
+    worker = threading.Thread(target=fetch, name="mixpose-prefetch", daemon=True)
+    worker.start()
+    try:
+        while isinstance(entry := waiting.get(), tuple):
+            room.put(None)
+            yield entry[0]
+        if entry is not None:
+            raise entry
+    finally:
+        stop.set()
+        room.put(None)  # wakes a worker that waits for room, so that it stops
+        # the garbage collector may close this generator in the thread of the worker
+        if worker is not threading.current_thread():
+            worker.join()
+
+
 def paired_by_stamp(sources: Mapping[str, Source]) -> dict[str, Source]:
     """Renumber the frames of sources that have stamps, so that they pair; they keep their times.
 
@@ -148,7 +204,6 @@ def _nearest_known(numbers: Sequence[int], known: Sequence[int], reach: float) -
 
 
 def _renumbered(source: Source, numbers: Sequence[int]) -> Source:
-    """Give the frames of a source other numbers; they keep their times."""
     if isinstance(source, DetectionTable):
         return replace(source, places=numbers)
     assert isinstance(source, ImageSequence), "what has stamps"

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
-from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, csv_rows, finite, require_times
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text
+from mixpose.frames.times import Clock, csv_rows, finite
 from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
@@ -24,7 +24,6 @@ class RangeProfiles(Source):
     """Range profiles of a sensor, numbered from 0."""
 
     kind: ClassVar[SourceKind] = "profiles"
-    ahead: ClassVar[int] = 0
 
     path: Path  # ``.npy`` (frames x bins) or ``.csv`` without a header, a row per frame
     range_min: float  # range of the first bin, length units
@@ -56,13 +55,7 @@ class RangeProfiles(Source):
             f"{reach:g}, {numbers_text(0, self.length - 1, self.length)}"
         )
 
-    def check_times(self, wanted: range) -> None:
-        """Require a time for each profile in the range."""
-        require_times(self.clock, (number for number in range(self.length) if number in wanted))
-
-    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Read the profiles in the range; the others are not converted."""
-        wanted = selection(start, stop, step, self.first)
+    def _frames(self, wanted: range) -> Frames:
         rows = _npy_rows if _is_npy(self.path) else _csv_rows
         for number, values in rows(self.path, wanted):
             time_s = None if self.clock is None else self.clock(number)

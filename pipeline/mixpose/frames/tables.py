@@ -16,9 +16,8 @@ from typing import ClassVar, NoReturn, TypeAlias
 import numpy as np
 
 from mixpose.errors import RecordingError
-from mixpose.frames import source, times
-from mixpose.frames.source import Frames, SensorKind, Source, SourceKind, SourceSpec
-from mixpose.frames.times import Clock, FrameTimes, column_names, csv_rows, finite, numeric, whole
+from mixpose.frames.source import Frames, SensorKind, Source, SourceKind, SourceSpec, numbers_text
+from mixpose.frames.times import Clock, column_names, csv_rows, finite, numeric, whole
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
@@ -50,7 +49,6 @@ class DetectionTable(Source):
     """Detections of a sensor in rows; streamed if frames ascend, else read as a whole."""
 
     kind: ClassVar[SourceKind] = "detections"
-    ahead: ClassVar[int] = 0
 
     path: Path  # the CSV file
     columns: tuple[str, ...]  # its header
@@ -78,7 +76,7 @@ class DetectionTable(Source):
         contents = self._contents
         if contents.first is None or contents.last is None:
             return "0 detections"
-        numbers = source.numbers_text(contents.first, contents.last, contents.frames)
+        numbers = numbers_text(contents.first, contents.last, contents.frames)
         return f"{contents.rows} detections, {numbers}"
 
     def caution(self) -> str | None:
@@ -90,12 +88,6 @@ class DetectionTable(Source):
             "column frame where the clocks of sensors differ"
         )
 
-    def check_times(self, wanted: range) -> None:
-        """Require a time for each frame in the range; reads the table once more."""
-        if isinstance(self.clock, FrameTimes):
-            numbers = (number for number in self.numbers() if number in wanted)
-            times.require_times(self.clock, numbers)
-
     @property
     def stamps(self) -> list[int]:
         """Times in nanoseconds, ascending, if frames have neither numbers nor a clock."""
@@ -103,7 +95,7 @@ class DetectionTable(Source):
             return []
         return [int(key // 1) * 10**9 + round(key % 1 * 1e9) for key in self._keys()]
 
-    def numbers(self) -> list[int]:
+    def known_numbers(self) -> list[int]:
         """Return frame numbers, ascending, up to the first row that cannot be read."""
         keys = self._keys()
         return list(map(int, keys if self._is_numbered else self.places[: len(keys)]))
@@ -114,13 +106,8 @@ class DetectionTable(Source):
             keys.update(key for key, _, _ in self._rows())
         return sorted(keys)
 
-    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Group rows to frames; skipped frames are not converted.
-
-        The time of a frame is that of its earliest detection; a row of weight 0 only states that
-        the frame exists.
-        """
-        wanted = source.selection(start, stop, step, self.first)
+    def _frames(self, wanted: range) -> Frames:
+        """Group rows to frames, at the time of the earliest; rows of weight 0 have no detection."""
         rows: Iterator[_Row] = self._rows()
         if not self._contents.in_order:
             unsorted = list(islice(rows, MOST_UNSORTED_ROWS + 1))

@@ -1,27 +1,32 @@
-"""Give frames their times, by a table or a rate; read CSV files row by row.
-
-Errors about a cell name the file and the line.
-"""
+"""Give frames their times, by a table or a rate; read CSV files, with errors that name the line."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NoReturn, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from mixpose.errors import RecordingError, SessionError, reporting
-from mixpose.frames.source import SourceSpec
+
+if TYPE_CHECKING:
+    from mixpose.frames.source import SourceSpec
 
 Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
-_MOST_NUMBERS = 5  # frame numbers that a message names
+LISTED = 5  # frame numbers that a message names
 _LARGEST_NUMBER = 10**255  # as many digits as a file name may have
 _LONGEST_LINE = 16_000_000  # characters: a profile of a million bins
+
+
+def listed(numbers: Sequence[int]) -> str:
+    """List frame numbers in words; of many the first, and how many there are."""
+    text = ", ".join(map(str, numbers[:LISTED]))
+    return text if len(numbers) <= LISTED else f"{text}, ... ({len(numbers)} frames)"
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,23 @@ class FrameTimes:
             )
         return self.seconds[number]
 
+    def missing(self, numbers: Iterable[int]) -> list[int]:
+        """Return the frame numbers without a row."""
+        return [number for number in numbers if number not in self.seconds]
+
+    def require(self, numbers: Iterable[int]) -> None:
+        """Raise a RecordingError if the table lacks a row of these frames."""
+        if not (missing := self.missing(numbers)):
+            return
+        frames = f"frame{'s' * (len(missing) > 1)} {listed(missing)}"
+        raise RecordingError(
+            f"{self.path}: no row for {frames}; allowed is a table with a row for each frame of "
+            "the recording, or fps in place of times"
+        )
+
 
 def read_times(path: Path) -> FrameTimes:
-    """Read a table with the header ``frame,time_s``, rows in any order.
-
-    Raises RecordingError if it cannot be read, a cell is no finite number or a frame comes twice.
-    """
+    """Read a table ``frame,time_s``, rows in any order; RecordingError if a row is wrong."""
     times: dict[int, float] = {}
     rows = csv_rows(path)
     _, cells = next(rows, (0, []))
@@ -61,33 +77,8 @@ def read_times(path: Path) -> FrameTimes:
     return FrameTimes(path, times)
 
 
-def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
-    """Return the frame numbers without a row in a table of times; none with a rate."""
-    if not isinstance(clock, FrameTimes):
-        return []
-    return [number for number in numbers if number not in clock.seconds]
-
-
-def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
-    """Raise a RecordingError if a table of times lacks a row of these frames."""
-    missing = untimed(clock, numbers)
-    if not missing:
-        return
-    assert isinstance(clock, FrameTimes), "rates lack nothing"
-    named = ", ".join(map(str, missing[:_MOST_NUMBERS]))
-    more = f", ... ({len(missing)} frames)" if len(missing) > _MOST_NUMBERS else ""
-    raise RecordingError(
-        f"{clock.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
-        "table with a row for each frame of the recording, or fps in place of times"
-    )
-
-
 def clock_of(spec: SourceSpec) -> Clock | None:
-    """Return the clock for the frames of a source; None if the session states none.
-
-    Raises SessionError if both `times` and `fps` are given, or `fps` is not positive, and
-    RecordingError if the table of times cannot be read.
-    """
+    """Return the clock of a source, if stated; SessionError or RecordingError if it is wrong."""
     if spec.times is not None and spec.fps is not None:
         raise SessionError(f"sensor {spec.sensor!r}: found times and fps, only one is allowed")
     if spec.times is not None:
@@ -101,10 +92,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers, from 1, and cells of the rows of a CSV file; blank lines are skipped.
-
-    Raises RecordingError if it cannot be read as text, or a row has not as many cells as the first.
-    """
+    """Yield line numbers, from 1, and cells of a CSV file's rows that are not blank, or raise."""
     width = None
     cannot = reporting(RecordingError, f"{path}: cannot be read")
     try:

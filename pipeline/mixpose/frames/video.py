@@ -15,8 +15,8 @@ import cv2
 from mixpose.errors import RecordingError, reporting
 from mixpose.frames import capture as captures
 from mixpose.frames.containers import container_of, missing_bytes
-from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock, require_times, untimed
+from mixpose.frames.source import Frames, Source, SourceKind, SourceSpec, numbers_text
+from mixpose.frames.times import Clock, FrameTimes
 from mixpose.limits import MOST_PIXELS
 from mixpose.records import Moment, RawFrame
 
@@ -27,7 +27,6 @@ class Video(Source):
 
     kind: ClassVar[SourceKind] = "video"
     ahead: ClassVar[int] = 3
-    first: ClassVar[int] = 0
 
     address: str  # path of the file or pipe, or address of a stream (with ``://``)
     resolution: tuple[int, int] | None  # size that every frame must have, in px
@@ -53,30 +52,19 @@ class Video(Source):
     def check_times(self, wanted: range) -> None:
         """Require a time for each frame in the range; count the frames if rows are missing."""
         promised = [number for number in range(self.promised or 0) if number in wanted]
-        if untimed(self.clock, promised):
-            count = self._count(min(promised[-1] + 1, wanted.stop))
-            require_times(self.clock, [number for number in promised if number < count])
+        if isinstance(self.clock, FrameTimes) and self.clock.missing(promised):
+            enough, count = min(promised[-1] + 1, wanted.stop), 0
+            with _opened(self.address) as capture:
+                while count < enough and captures.grab(capture, self.address):
+                    count += 1
+            self.clock.require(number for number in promised if number < count)
 
-    def _count(self, enough: int) -> int:
-        """Count the frames that can be read, up to a number that is enough."""
+    def _frames(self, wanted: range) -> Frames:
+        """Decode the frames; the last of a file cut short may be incomplete and is left out."""
+        expected, room = self.resolution or self.size, captures.ColourRoom()
+        number, time_s = 0, None
+        pending: RawFrame | None = None
         with _opened(self.address) as capture:
-            count = 0
-            while count < enough and captures.grab(capture, self.address):
-                count += 1
-        return count
-
-    def frames(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Frames:
-        """Decode the frames in the range; those between are skipped, not converted.
-
-        Raises RecordingError after the frames that can be read; the last one of a file cut short
-        may be incomplete and is left out.
-        """
-        wanted = selection(start, stop, step, self.first)
-        with _opened(self.address) as capture:
-            number = 0
-            time_s = None
-            pending: RawFrame | None = None
-            room = captures.ColourRoom()
             while number < wanted.stop or pending is not None:
                 if not captures.grab(capture, self.address):
                     self._check_end(capture, number, time_s)
@@ -86,25 +74,15 @@ class Video(Source):
                     pending = None
                 time_s = _time_of(capture, number, time_s)
                 if number in wanted:
-                    frame = self._frame(capture, number, time_s, room)
+                    moment = Moment(time.monotonic(), "arrival") if self.size is None else None
+                    image = captures.retrieve(capture, self.address, number, expected, room)
+                    seconds = time_s if self.clock is None else self.clock(number)
+                    frame = RawFrame(number, seconds, image, moment)
                     if self.missing:
                         pending = frame
                     else:
                         yield frame
                 number += 1
-
-    def _frame(
-        self,
-        capture: cv2.VideoCapture,
-        number: int,
-        time_s: float | None,
-        room: captures.ColourRoom,
-    ) -> RawFrame:
-        moment = Moment(time.monotonic(), "arrival") if self.size is None else None
-        image = captures.retrieve(capture, self.address, number, self.resolution or self.size, room)
-        if self.clock is not None:
-            time_s = self.clock(number)
-        return RawFrame(number, time_s, image, moment)
 
     def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
         """Raise a RecordingError if the video should not end after `count` frames."""
@@ -124,7 +102,6 @@ class Video(Source):
             raise RecordingError(f"{self.address}: damaged or cut short; {self._reached(count)}")
 
     def _reached(self, count: int) -> str:
-        """Describe which frames could be read."""
         promised = f" of the {self.promised} that it promises" if self.promised else ""
         which = f"only {numbers_text(0, count - 1, count)}" if count > 0 else "no frame"
         return f"{which}{promised} could be read"
@@ -147,9 +124,7 @@ class Video(Source):
 
 
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
-    """Open a video for its size and length, a stream or a pipe later; RecordingError if it does not
-    open.
-    """
+    """Open a video for its size and length, a stream or a pipe later; or raise RecordingError."""
     if captures.is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)
     with _opened(address) as capture:

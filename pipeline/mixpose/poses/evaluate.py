@@ -25,10 +25,9 @@ from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses import consistency
 from mixpose.poses.estimates import in_unit
-from mixpose.poses.foretold import truth_ahead
-from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.poses.truth import Swaps, renumbered, truth_ahead
 from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5
@@ -195,14 +194,11 @@ def _check_comparable(poses: PoseFile, truth: PoseFile, true_objects: set[str]) 
         raise RecordingError(f"{truth.path}: holds no pose, so there is nothing to compare with")
     objects = {line.label for line in poses.poses}
     if objects and not objects & true_objects:
+        names, true = (", ".join(map(repr, sorted(group))) for group in (objects, true_objects))
         raise RecordingError(
-            f"{poses.path}: holds poses of {_names(objects)}, but {truth.path} of "
-            f"{_names(true_objects)}; the object's name must be the same in both"
+            f"{poses.path}: holds poses of {names}, but {truth.path} of {true}; the object's name "
+            "must be the same in both"
         )
-
-
-def _names(objects: set[str]) -> str:
-    return ", ".join(repr(name) for name in sorted(objects))
 
 
 def _right_answers(truths: Sequence[Floats], symmetries: Floats | None) -> Floats:

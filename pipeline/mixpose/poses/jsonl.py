@@ -29,12 +29,16 @@ class JsonlWriter(PoseWriter):
     """
 
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
-        first_line = "" if resume else json.dumps(header_line(header), allow_nan=False)
-        super().__init__(stream, header, first_line)
+        super().__init__(stream, header, "" if resume else header_text(header))
 
     def _write(self, estimate: Estimate) -> None:
         # a single call for the whole line, so that an interruption rarely leaves half of it
         self._stream.write(json.dumps(pose_line(estimate), allow_nan=False) + "\n")
+
+
+def header_text(header: Header) -> str:
+    """Return the first line of a poses file, without a line end."""
+    return json.dumps(header_line(header), allow_nan=False)
 
 
 def header_line(header: Header) -> dict[str, Any]:
@@ -101,12 +105,10 @@ def pose_line(estimate: Estimate) -> dict[str, Any]:
 
 
 def _if_any(key: str, value: Any) -> dict[str, Any]:
-    """Return a key with its value, or nothing if the value is empty."""
     return {key: value} if value else {}
 
 
 def _tip_of(estimate: Estimate) -> dict[str, Any]:
-    """Return the tip and its covariance, of a body that has one."""
     if estimate.tip_object is None:
         return {}
     if estimate.status == "lost":
@@ -115,12 +117,10 @@ def _tip_of(estimate: Estimate) -> dict[str, Any]:
 
 
 def _rounded(residual: float | None) -> float | None:
-    """Round to four significant digits."""
     return None if residual is None else float(f"{residual:.4g}")
 
 
 def _label(label: Label) -> dict[str, Any]:
-    """Return the detection of a feature, unrounded."""
     place = {"at": plain(label.at)}
     return place if label.detection is None else {**place, "detection": label.detection}
 
@@ -162,23 +162,16 @@ def read_poses(path: str | Path) -> PoseFile:
 
 
 def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
-    """Read a poses file that a run may still be writing, and tell whether its last line is cut off.
-
-    That line is left out. Raises RecordingError for any other line, as `read_poses`.
-    """
+    """Read poses that may still be written, without a last line that is cut; tell if one was."""
     path = Path(path)
     data = _read_bytes(path)
     whole = data.rfind(b"\n") + 1
-    cut = whole > 0 and not _is_json(data[whole:])
-    return _parse(path, data[:whole] if cut else data), cut
-
-
-def _is_json(line: bytes) -> bool:
+    cut = False
     try:
-        json.loads(line.strip() or b"{}")
+        json.loads(data[whole:].strip() or b"{}")
     except (ValueError, RecursionError):
-        return False
-    return True
+        cut = whole > 0
+    return _parse(path, data[:whole] if cut else data), cut
 
 
 @dataclass(frozen=True)
@@ -282,7 +275,6 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _parse(path: Path, data: bytes) -> PoseFile:
-    """Parse a poses file; errors name the line."""
     header: Mapping[str, Any] = {}
     unit: str | None = None
     symmetries: Mapping[str, Floats] = {}

@@ -82,33 +82,30 @@ def _one_body(evaluation: Evaluation) -> list[str]:
             f"{'do' if many else 'does'} not count"
         )
     lines += ["", *_spread_lines(evaluation, unit), *_axis_lines(evaluation, unit)]
+    remarks = []
     if evaluation.best_rotation_deg is not None:
-        lines += [
-            "",
+        remarks.append(
             f"rotation and position count the ambiguous frame{'s' * (evaluation.ambiguous != 1)}, "
             "too; ok alone: without these; best hypothesis: of each of these, the pose nearest to "
-            "the truth",
-        ]
+            "the truth"
+        )
     nees = evaluation.nees
     if nees is None:
-        lines += ["", "covariance: no frame that is ok has one"]
+        remarks.append("covariance: no frame that is ok has one")
     else:
         counted = f"{nees.frames} frame{'s that are' if nees.frames != 1 else ' that is'} ok"
-        lines += [
-            "",
-            f"covariance, {counted}: "
-            f"squared error per dimension {nees.mean_per_dimension:.3g} (right: 1), "
-            f"inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %",
-        ]
+        remarks.append(
+            f"covariance, {counted}: squared error per dimension {nees.mean_per_dimension:.3g} "
+            f"(right: 1), inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %"
+        )
     if evaluation.offset is not None:
-        lines += ["", evaluation.offset.text(unit)]
+        remarks.append(evaluation.offset.text(unit))
     if evaluation.exchanged:
-        lines += [
-            "",
+        remarks.append(
             "the truth has covariances, as estimates do, and the poses have none: were the two "
-            "files exchanged? mixpose evaluate POSES.jsonl TRUTH.jsonl",
-        ]
-    return lines
+            "files exchanged? mixpose evaluate POSES.jsonl TRUTH.jsonl"
+        )
+    return [*lines, *(line for remark in remarks for line in ("", remark))]
 
 
 def _spread_lines(evaluation: Evaluation, unit: str) -> list[str]:

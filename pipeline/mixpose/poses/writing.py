@@ -13,9 +13,13 @@ from mixpose.errors import RecordingError
 from mixpose.poses.header import Header
 from mixpose.records import Estimate, Floats
 
+NO_TIMES = "# time is the frame number: the recording has no times"
+
 
 class PoseWriter(ABC):
     """Writes estimates to a text stream as they come; the stream stays open."""
+
+    _has_times: bool | None = None  # the first frame decides
 
     def __init__(self, stream: TextIO, header: Header, first_line: str = "") -> None:
         self._stream, self._header = stream, header
@@ -37,6 +41,21 @@ class PoseWriter(ABC):
     def _write(self, estimate: Estimate) -> None:
         """Write a frame."""
 
+    def _time_of(self, estimate: Estimate, format_name: str) -> float:
+        """Return the time in s, or the frame number; RecordingError if earlier frames differ."""
+        has_time = estimate.time_s is not None
+        if self._has_times is None and not has_time:
+            self._stream.write(f"{NO_TIMES}\n")
+        if self._has_times not in (None, has_time):
+            text = "a time" if has_time else "no time"
+            raise RecordingError(
+                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
+                f"{format_name!r} needs times for all frames or for none; give the sensors times, "
+                "or write jsonl"
+            )
+        self._has_times = has_time
+        return float(plain(estimate.frame if estimate.time_s is None else estimate.time_s))
+
 
 def plain(values: ArrayLike | None) -> Any:
     """Convert to nested lists of floats, or a float, without negative zeros; None stays None."""
@@ -52,18 +71,9 @@ def pose_of(estimate: Estimate) -> Floats | None:
 
 
 def require_finite(estimate: Estimate) -> None:
-    """Raise a ValueError, naming frame and field, if an estimate holds a NaN or an infinity.
-
-    No format can hold these; such an estimate is a fault of the program.
-    """
-    values: dict[str, Floats | float | None] = {
-        "time_s": estimate.time_s,
-        "T_world_object": estimate.T_world_object,
-        "covariance": estimate.covariance,
-        "score": estimate.score,
-        "confidence": estimate.confidence,
-        "latency_ms": estimate.latency_ms,
-    }
+    """Raise a ValueError, with frame and field, for a NaN or an infinity: a fault of mixpose."""
+    names = ("time_s", "T_world_object", "covariance", "score", "confidence", "latency_ms")
+    values: dict[str, Floats | float | None] = {name: getattr(estimate, name) for name in names}
     for name, report in estimate.sensors.items():
         values[f"sensors.{name}.explained"] = report.explained
         values[f"sensors.{name}.rms"] = report.rms
@@ -79,30 +89,3 @@ def _is_finite(value: Floats | float) -> bool:
     if not isinstance(value, np.ndarray):
         return math.isfinite(value)  # ten times as fast as NumPy for a single number
     return bool(np.isfinite(value).all())
-
-
-NO_TIMES = "# time is the frame number: the recording has no times"
-
-
-class Stamps:
-    """Times of poses; frame numbers if the recording has no times, as a comment then states."""
-
-    def __init__(self, stream: TextIO, format_name: str) -> None:
-        self._stream, self._format = stream, format_name
-        self._has_times: bool | None = None  # the first frame decides
-
-    def time_of(self, estimate: Estimate) -> float:
-        """Return the time in s, or the frame number; RecordingError if earlier frames differ."""
-        has_time = estimate.time_s is not None
-        if self._has_times is None:
-            self._has_times = has_time
-            if not has_time:
-                self._stream.write(f"{NO_TIMES}\n")
-        if has_time != self._has_times:
-            text = "a time" if has_time else "no time"
-            raise RecordingError(
-                f"frame {estimate.frame} has {text}, unlike the frames before it: format "
-                f"{self._format!r} needs times for all frames or for none; give the sensors "
-                "times, or write jsonl"
-            )
-        return float(plain(estimate.frame if estimate.time_s is None else estimate.time_s))

@@ -91,8 +91,8 @@ class Backlog:
             self._messages.clear()
 
 
-class Channel:
-    """Send messages to one receiver in a thread; count and report what becomes of them."""
+class Channel(threading.Thread):
+    """A thread that sends messages to one receiver; it counts and reports what becomes of them."""
 
     def __init__(
         self,
@@ -101,6 +101,7 @@ class Channel:
         tell: Callable[[str], None],
         rules: PublishingRules,
     ) -> None:
+        super().__init__(name="mixpose-publish", daemon=True)
         self._address, self._sender, self._tell, self._rules = address, sender, tell, rules
         self._backlog = Backlog(rules.waiting)
         self._latencies = deque[float](maxlen=_REMEMBERED)
@@ -108,28 +109,20 @@ class Channel:
         self._sent = self._unheard = self._too_large = self._failed = 0
         self._is_away = False
         self._began: float | None = None  # when the current send began
-        self._thread = threading.Thread(target=self._work, name="mixpose-publish", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread, which connects to the receiver."""
-        self._thread.start()
 
     def put(self, message: Message) -> None:
         """Queue a message, unless it is not ok and only ok poses are to be published."""
         if message.estimate.status == "ok" or self._address.options.get("only") != "ok":
             self._backlog.put(message)
 
-    def end(self) -> None:
-        """Announce that no further messages come."""
-        self._backlog.end()
-
     def close(self) -> None:
-        """After the end, send the remaining messages for a limited time, and disconnect."""
+        """Take no further messages, send the remaining ones for a limited time, and disconnect."""
+        self._backlog.end()
         began, rules = self._began, self._rules
         is_stuck = began is not None and time.monotonic() - began > rules.stuck_s
-        self._thread.join(0.0 if is_stuck else rules.farewell_s)
+        self.join(0.0 if is_stuck else rules.farewell_s)
         self._sender.close()
-        self._thread.join(rules.farewell_s)
+        self.join(rules.farewell_s)
         self._backlog.drop_all()
 
     def text(self) -> str:
@@ -146,7 +139,8 @@ class Channel:
             text += f"; {median:.1f} ms after {self._stamped_by}, 99 % within {most:.1f} ms"
         return text
 
-    def _work(self) -> None:
+    def run(self) -> None:
+        """Connect to the receiver and send, until the end."""
         is_connected = False
         while (message := self._backlog.take()) is not None:
             try:
@@ -226,8 +220,6 @@ class Publishing:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for channel in self._channels:
-            channel.end()
         closing = [threading.Thread(target=channel.close) for channel in self._channels]
         for thread in closing:
             thread.start()

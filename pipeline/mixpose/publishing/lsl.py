@@ -13,12 +13,8 @@ if TYPE_CHECKING:
     from pylsl import StreamOutlet
 
 # labels, types and units as of https://github.com/sccn/xdf/wiki/MoCap-Meta-Data
-_CHANNELS = (
-    *((f"Position{axis}", f"Position{axis}") for axis in "XYZ"),
-    *((f"Orientation{axis}", f"Orientation{axis}") for axis in "XYZW"),
-    ("Status", "Status"),
-    ("Frame", "Frame"),
-)
+_PLACE = [*(f"Position{axis}" for axis in "XYZ"), *(f"Orientation{axis}" for axis in "XYZW")]
+_CHANNELS = (*_PLACE, "Status", "Frame")
 _STATUS = {"lost": 0.0, "ambiguous": 1.0, "ok": 2.0}
 _FLUSH_S = 0.5  # outlets send in a thread of their own, which ends with them
 
@@ -70,20 +66,17 @@ class LslSender(Sender):
         self._outlets.clear()
 
 
-def _info(pylsl: Any, name: str, header: Header) -> Any:
-    """Return the description of an outlet's stream."""
-    info = pylsl.StreamInfo(
-        name, "MoCap", len(_CHANNELS), pylsl.IRREGULAR_RATE, pylsl.cf_double64, f"mixpose-{name}"
-    )
+def _info(pylsl: Any, stream: str, header: Header) -> Any:
+    kind = "MoCap", len(_CHANNELS), pylsl.IRREGULAR_RATE, pylsl.cf_double64
+    info = pylsl.StreamInfo(stream, *kind, f"mixpose-{stream}")
     description = info.desc()
     description.append_child_value("manufacturer", "mixpose")
     channels = description.append_child("channels")
-    for label, kind in _CHANNELS:
+    for name in _CHANNELS:
         channel = channels.append_child("channel")
-        channel.append_child_value("label", label)
-        channel.append_child_value("type", kind)
-        if kind.startswith("Position"):
-            channel.append_child_value("unit", header.unit)
-        elif kind.startswith("Orientation"):
-            channel.append_child_value("unit", "quaternion")
+        channel.append_child_value("label", name)
+        channel.append_child_value("type", name)
+        if name in _PLACE:
+            unit = header.unit if name.startswith("Position") else "quaternion"
+            channel.append_child_value("unit", unit)
     return info

@@ -14,7 +14,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from mixpose.errors import SessionError, require_package
 from mixpose.naming import distinct
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import header_line, pose_line
+from mixpose.poses.jsonl import pose_line
 from mixpose.records import Estimate, Moment
 
 
@@ -39,10 +39,7 @@ class Address:
     def place(
         self, example: str, port: int | None = None, *, bare: bool = False
     ) -> tuple[str, int]:
-        """Return host and port, by default `port`; raise an error with an example if none is known.
-
-        `bare` allows no path.
-        """
+        """Return host and port, else `port`, `bare` without a path; or raise with an example."""
         written = self.port or port
         if bare and self.path:
             raise self.error(f"found {self.path!r} behind host and port; allowed: {example}")
@@ -138,11 +135,6 @@ class Message:
         if self.ahead_s:
             line["ahead_s"] = self.ahead_s
         return json.dumps(line, allow_nan=False)
-
-
-def header_text(header: Header) -> str:
-    """Return the header line without a line end."""
-    return json.dumps(header_line(header), allow_nan=False)
 
 
 def path_word(label: str) -> str:

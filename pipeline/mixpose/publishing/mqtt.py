@@ -7,8 +7,9 @@ import threading
 from typing import TYPE_CHECKING, Any, cast
 
 from mixpose.poses.header import Header
+from mixpose.poses.jsonl import header_text
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Address, Message, Sender, header_text, path_words
+from mixpose.publishing.message import Address, Message, Sender, path_words
 from mixpose.publishing.sockets import force_down, keep_little
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mixpose.poses.header import Header
-from mixpose.poses.ros import pose_message
+from mixpose.poses.writers import pose_message
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import Address, Message, Sender, path_word, path_words
 from mixpose.publishing.sockets import connected, force_down
@@ -120,7 +120,6 @@ class RosNodeSender(Sender):
 
 
 def _type(kind: str) -> Any:
-    """Return the class of a message, ``package/msg/Name``."""
     package, _, name = kind.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), name)
 

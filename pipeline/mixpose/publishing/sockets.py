@@ -11,13 +11,13 @@ from typing import Any
 
 from mixpose import rigid
 from mixpose.poses.header import Header
+from mixpose.poses.jsonl import header_text
 from mixpose.publishing.channel import PublishingRules
 from mixpose.publishing.message import (
     Address,
     Message,
     Sender,
     TooLargeError,
-    header_text,
     path_words,
 )
 

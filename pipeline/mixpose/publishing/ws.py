@@ -13,8 +13,9 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING
 
 from mixpose.poses.header import Header
+from mixpose.poses.jsonl import header_text
 from mixpose.publishing.channel import PublishingRules
-from mixpose.publishing.message import Address, Message, Sender, header_text
+from mixpose.publishing.message import Address, Message, Sender
 from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:

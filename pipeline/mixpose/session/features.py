@@ -40,16 +40,15 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
             key,
         )
     if count < FEWEST_FEATURES:
+        counted = f"{count} feature{'s' * (count != 1)}"
         raise BadKeyError(
-            f"found {count} feature{'s' * (count != 1)}; allowed: at least three points and "
-            "segments together",
+            f"found {counted}; allowed: at least three points and segments together",
             key if table.segments is None else "segments",
         )
     for i, (start, end) in enumerate(segments):
         if np.array_equal(start, end):
-            raise BadKeyError(
-                "found a segment without length; allowed: two different ends", "segments", i
-            )
+            text = "found a segment without length; allowed: two different ends"
+            raise BadKeyError(text, "segments", i)
     places = len(np.unique(np.concatenate([points, segments.mean(axis=1)]), axis=0))
     if places < FEWEST_FEATURES:
         raise BadKeyError(
@@ -146,7 +145,6 @@ def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers:
 
 
 def _spreads(table: ObjectTable, markers: Markers, count: int) -> Floats:
-    """Return covariances (N, 3, 3) of all features."""
     if markers.sigma is None:
         with under("sigma"):
             return covariances(0.0 if table.sigma is None else table.sigma, count)
@@ -200,11 +198,7 @@ def _check_ambiguous(sigma: Any, count: int) -> None:
 
 
 def _covariances_of(sigma: list[Any]) -> Floats:
-    spreads = []
-    for i, item in enumerate(sigma):
-        with under(i):
-            spreads.append(_covariance(item))
-    return np.array(spreads)
+    return np.array([under(i)(_covariance)(item) for i, item in enumerate(sigma)])
 
 
 def _covariance(sigma: Any) -> Floats:

@@ -45,13 +45,10 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
     if suffix in (".yaml", ".yml", ".json", ".xml", ".stl"):
         raise BadKeyError(mismatch(path.name, _ALLOWED))
     content = read_bytes(path)
-    if suffix not in READERS:
-        with in_file(path.name):
-            if content.startswith(NDI_MARK):
-                raise BadKeyError("is an NDI body: rename it, to end in .rom")
-        return read_markers(path)
-    read, stated = READERS[suffix]
+    read, stated = READERS.get(suffix, (read_table, unit))
     with in_file(path.name):
+        if suffix not in READERS and content.startswith(NDI_MARK):
+            raise BadKeyError("is an NDI body: rename it, to end in .rom")
         markers = read(content)
         for number in markers.points.ravel().tolist():
             if not is_number(number):
@@ -195,31 +192,29 @@ class Markers:
     normals: Floats | None = None  # (N, 3), outward, if the file has flat markers
 
 
-def read_markers(path: Path) -> Markers:
+def read_table(content: bytes) -> Markers:
     """Read a marker table, a CSV file; raise BadKeyError that names line and column.
 
     After ``name,x,y,z`` the header has no column, one (σ), three (σ along x, y and z) or nine (the
     covariance, row by row), and may end with `LEARNT_COLUMNS`.
     """
-    content = read_bytes(path)
-    with in_file(path.name):
-        reader = csv.reader(io.StringIO(as_text(content), newline=""), skipinitialspace=True)
-        try:
-            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-        except csv.Error as error:
-            raise BadKeyError(f"line {reader.line_num}: {error}") from error
-        if not rows:
-            raise BadKeyError("the file is empty; allowed: a header name,x,y,z and a row per point")
-        header = [cell.strip() for cell in rows[0][1]]
-        words = [name.lower() for name in header]
-        if words[:4] != _HEADER or len(words) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
-            text = mismatch(",".join(header), "name,x,y,z and then no, one, three or nine")
-            raise BadKeyError(f"line 1: {text} columns of sigma")
-        if len(rows) == 1:
-            raise BadKeyError("found no markers below the header")
-        values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
-        values = values[:, : len(header) - 1 - _learnt(header)]
-        names = _names_of([(line, row[0]) for line, row in rows[1:]])
+    reader = csv.reader(io.StringIO(as_text(content), newline=""), skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise BadKeyError(f"line {reader.line_num}: {error}") from error
+    if not rows:
+        raise BadKeyError("the file is empty; allowed: a header name,x,y,z and a row per point")
+    header = [cell.strip() for cell in rows[0][1]]
+    words = [name.lower() for name in header]
+    if words[:4] != _HEADER or len(words) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
+        text = mismatch(",".join(header), "name,x,y,z and then no, one, three or nine")
+        raise BadKeyError(f"line 1: {text} columns of sigma")
+    if len(rows) == 1:
+        raise BadKeyError("found no markers below the header")
+    values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
+    values = values[:, : len(header) - 1 - _learnt(header)]
+    names = _names_of([(line, row[0]) for line, row in rows[1:]])
     spreads, shapes = values[:, 3:], {1: (-1,), 3: (-1, 3), 9: (-1, 3, 3)}
     sigma = spreads.reshape(shapes[spreads.shape[1]]).tolist() if spreads.size else None
     return Markers(values[:, :3], sigma, names)

@@ -112,10 +112,7 @@ def did_you_mean(value: object, words: Iterable[str]) -> str:
 
 
 def one_line(file: object, key: Key, text: str, session: Any = None) -> str:
-    """Return the whole message about a key of a file, on a single line.
-
-    `session` is the parsed file, from which the message takes names of sensors and bodies.
-    """
+    """Return the whole message about a key of a file, with names from the parsed `session`."""
     first = key[0] if key else None
     entry = session.get(first) if isinstance(session, dict) else None
     if first == "object" and not isinstance(entry, list):

@@ -13,8 +13,8 @@ from mixpose.fit import EstimatorOptions
 from mixpose.limits import MOST_SAMPLES
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.features import build_body
+from mixpose.session.geometry import read_motion
 from mixpose.session.messages import BadKeyError, one_line, one_of, under
-from mixpose.session.motion import read_motion
 from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
 from mixpose.session.setup import ObjectSetup, Session, Start
@@ -47,14 +47,6 @@ def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     return _load(Path(path), allow_code=allow_code, bodies=True)
 
 
-def _no_such_file(path: Path) -> str:
-    """Return the message about a missing session file, with the session files in its folder."""
-    names = sorted(other.name for other in path.parent.glob("*.toml"))
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    listed = f"{', '.join(names[:_LISTED])}{more}" if names else "no .toml file"
-    return f"{path}: no such file; in {path.parent} there is {listed}"
-
-
 def _load(path: Path, *, allow_code: bool, bodies: bool) -> Session:
     data: dict[str, Any] = {}
     try:
@@ -67,7 +59,11 @@ def _load(path: Path, *, allow_code: bool, bodies: bool) -> Session:
         return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
         if not data and isinstance(problem.__cause__, FileNotFoundError):
-            raise SessionError(_no_such_file(path)) from problem
+            names = sorted(other.name for other in path.parent.glob("*.toml"))
+            more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+            listed = f"{', '.join(names[:_LISTED])}{more}" if names else "no .toml file"
+            text = f"{path}: no such file; in {path.parent} there is {listed}"
+            raise SessionError(text) from problem
         raise SessionError(one_line(path, problem.key, problem.text, data)) from problem
     except RecursionError as error:
         raise SessionError(f"{path}: lists or tables in it are nested too deeply") from error
@@ -100,7 +96,6 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
 
 
 def _objects(table: SessionTable, folder: Path) -> tuple[ObjectSetup, ...]:
-    """Build all bodies; raise BadKeyError if two have the same name."""
     if table.start is not None and len(table.object) > 1:
         raise BadKeyError(
             f"found one for {len(table.object)} bodies; allowed: [object.start] below each "

@@ -27,7 +27,11 @@ _BARE_END = re.compile(r"(?<!\r)\n")
 def document_of(session: Session, target: Path) -> Any:
     """Return the TOML document of a session, with paths relative to the folder of `target`."""
     document = tomlkit.parse(_text(session).removeprefix(_BOM))
-    _redirect_paths(document, session.folder, target.parent)
+    old, new = session.folder.resolve(), target.parent.resolve()
+    for table, key, *_ in paths_in(document) if old != new else ():
+        value = str(table[key])
+        if not (Path(value).is_absolute() or "://" in value or value.startswith("camera:")):
+            table[key] = Path(os.path.relpath(old / value, new)).as_posix()
     return document
 
 
@@ -36,16 +40,16 @@ def refuse_lost_code(session: Session, target: Path) -> None:
     for setup in session.sensors:
         module, colon, _ = setup.extract.method.partition(":")
         name = module.partition(".")[0]
-        if colon and _has_module(session.folder, name) and not _has_module(target.parent, name):
+        has_module = [
+            (folder / f"{name}.py").is_file() or (folder / name).is_dir()
+            for folder in (session.folder, target.parent)
+        ]
+        if colon and has_module == [True, False]:
             raise SessionError(
                 f'{session.path}: extract.method: "{setup.extract.method}" is looked for beside '
                 f"the session, and {target.parent.absolute()} has no {name}; allowed: -o in "
                 f"{session.folder.absolute()}, or {name} copied there"
             )
-
-
-def _has_module(folder: Path, name: str) -> bool:
-    return (folder / f"{name}.py").is_file() or (folder / name).is_dir()
 
 
 def text_of(document: Any, session: Session, head: str = "") -> str:
@@ -57,7 +61,6 @@ def text_of(document: Any, session: Session, head: str = "") -> str:
 
 
 def _text(session: Session) -> str:
-    """Return the text of the session file with its byte order mark and line ends."""
     return session.path.read_bytes().decode("utf-8")
 
 
@@ -124,17 +127,6 @@ def rounded(values: Floats | float, digits: int = 10) -> Any:
     if array.ndim == 0:
         return float(f"{float(array):.{digits}g}") + 0.0
     return [rounded(row, digits) for row in array]
-
-
-def _redirect_paths(document: Any, old: Path, new: Path) -> None:
-    """Rewrite paths relative to the folder `old` as paths relative to the folder `new`."""
-    if old.resolve() == new.resolve():
-        return
-    for table, key, *_ in paths_in(document):
-        value = str(table[key])
-        if not (Path(value).is_absolute() or "://" in value or value.startswith("camera:")):
-            path = os.path.relpath(old.resolve() / value, new.resolve())
-            table[key] = Path(path).as_posix()
 
 
 def paths_in(document: Any) -> Iterator[tuple[Any, str | int, Role, str]]:

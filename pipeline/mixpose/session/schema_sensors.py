@@ -216,7 +216,8 @@ class CameraTable(PlacedTable):
     """OpenCV's distortion coefficients, in OpenCV's order. Left out: none.
     Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`"""
     calibration: Annotated[
-        CalibrationTable | None, BeforeValidator(values.read_calibration_key)
+        CalibrationTable | None,
+        BeforeValidator(lambda item: {"file": item} if isinstance(item, str) else item),
     ] = Field(None, description='a file, or a table { file = "...", ... }')
     """A calibration file in place of `camera_matrix` and `distortion`.
     Example: `calibration = "left.yml"`"""

@@ -16,9 +16,8 @@ from mixpose.rigid import from_parts
 from mixpose.sensors import CalibrationError, FisheyeCamera, PinholeCamera, Sensor
 from mixpose.session import schema_sensors
 from mixpose.session.calibration import CalibratedCamera, read_calibration
-from mixpose.session.intrinsics import Intrinsics, read_camera_matrix, read_distortion
+from mixpose.session.geometry import Intrinsics, read_camera_matrix, read_distortion, read_motion
 from mixpose.session.messages import BadKeyError, under
-from mixpose.session.motion import read_motion
 from mixpose.session.schema_sensors import (
     AnySensorTable,
     CameraTable,
@@ -40,10 +39,7 @@ _KEPT = {"name", "model", "source", "fps", "range_min", "bin_size", "delay", "re
 def build_sensors(
     tables: list[AnySensorTable], defaults: ExtractTable, folder: Path, unit: Unit
 ) -> tuple[SensorSetup, ...]:
-    """Build all sensors of a session, `defaults` being its ``[extract]``.
-
-    Paths are relative to `folder`; lengths of calibration files are converted into `unit`.
-    """
+    """Build all sensors; `defaults` is ``[extract]``, paths are of `folder`, lengths in `unit`."""
     with under("extract"):
         merge_extract(defaults, None)
     setups: list[SensorSetup] = []

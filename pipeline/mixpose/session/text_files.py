@@ -10,16 +10,13 @@ from typing import Any
 from mixpose.limits import MOST_BYTES, MOST_YAML_CHARACTERS, MOST_YAML_NODES
 from mixpose.session.messages import BadKeyError
 
-_BINARY_FORMATS = tuple(
-    (re.compile(start, re.DOTALL), name)
-    for start, name in (
-        (rb"\x89PNG|\xff\xd8\xff|BM....\x00\x00|II\*\x00|MM\x00\*|GIF8", "an image"),
-        (rb"RIFF....AVI |....ftyp|\x1aE\xdf\xa3", "a video"),
-        (rb"%PDF", "a PDF file"),
-        (rb"PK\x03\x04|\x1f\x8b", "a packed file"),
-    )
-)
-"""First bytes, and names, of binary files that users name by mistake."""
+_BINARY_FORMATS = {
+    rb"\x89PNG|\xff\xd8\xff|BM....\x00\x00|II\*\x00|MM\x00\*|GIF8": "an image",
+    rb"RIFF....AVI |....ftyp|\x1aE\xdf\xa3": "a video",
+    rb"%PDF": "a PDF file",
+    rb"PK\x03\x04|\x1f\x8b": "a packed file",
+}
+"""Names of binary files that users name by mistake, by their first bytes."""
 
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")
 _TABLE = re.compile(r"\[\[?\s*(sensor|object)\s*\]")
@@ -56,9 +53,9 @@ def read_bytes(path: Path) -> bytes:
 
 def as_text(content: bytes) -> str:
     """Decode UTF-8, with or without a byte order mark; raise BadKeyError if it is not text."""
-    kind = next((name for start, name in _BINARY_FORMATS if start.match(content)), None)
-    if kind is not None:
-        raise BadKeyError(f"found {kind}; allowed: a text file in UTF-8")
+    for start, kind in _BINARY_FORMATS.items():
+        if re.match(start, content, re.DOTALL):
+            raise BadKeyError(f"found {kind}; allowed: a text file in UTF-8")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

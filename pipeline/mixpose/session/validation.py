@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -17,24 +16,20 @@ _TAG = "model"  # the key that distinguishes the kinds of sensor
 _TOP = "the top of the file, before its first [table]"
 
 
-@dataclass(frozen=True)
-class _Place:
-    """The place of an error: its key in the file, the class of its table, and its field."""
+class _Place(NamedTuple):
+    """The place of an error."""
 
-    key: Key
+    key: Key  # in the file
     table: type[BaseModel]
     field: FieldInfo | None
 
 
 def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
-    """Return the validated table of the whole file.
-
-    Raises BadKeyError for the first error, unknown keys first: a misspelt key is often the reason
-    why another one is missing.
-    """
+    """Return the validated table of the whole file, or raise BadKeyError for its first error."""
     try:
         return root.model_validate(data)
     except ValidationError as error:
+        # unknown keys first: a misspelt one is often the reason why another one is missing
         findings = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     problem = _problem(root, findings[0])
     if len(findings) > 1:
@@ -82,20 +77,17 @@ def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
-    """Yield an annotation and all its arguments, at any depth."""
     yield annotation
     for part in get_args(annotation):
         yield from _parts(part)
 
 
 def _tables(annotation: Any) -> list[type[BaseModel]]:
-    """Return the classes of tables in an annotation."""
     parts = _parts(annotation)
     return [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
 
 
 def _literals(field: FieldInfo | None) -> list[str]:
-    """Return the literal texts in a field's annotation."""
     return [part for part in _parts(field and field.annotation) if isinstance(part, str)]
 
 
@@ -162,14 +154,9 @@ def _homes(root: type[BaseModel], key: str) -> list[str]:
 def _all_tables(table: type[BaseModel], path: str = _TOP) -> Iterator[tuple[str, type[BaseModel]]]:
     yield path, table
     for key, field in table.model_fields.items():
-        inside = _tables(field.annotation)
-        for inner in inside:
+        for inner in (inside := _tables(field.annotation)):
+            outer = "" if path == _TOP else path.strip("[]").partition("]")[0] + "."
+            name = f"[{outer}{key}]"  # without the model: [sensor.extract]
             if len(inside) > 1:
                 name = f"[[{key}]] of model {' or '.join(_literals(inner.model_fields[_TAG]))}"
-            elif path == _TOP:
-                name = f"[{key}]"
-            else:
-                # without the model: [sensor.extract]
-                outer = path.strip("[]").partition("]")[0]
-                name = f"[{outer}.{key}]"
             yield from _all_tables(inner, name)

@@ -81,7 +81,6 @@ def _read_threshold(value: Any) -> str | float:
 
 
 def _read_source(value: Any) -> str | tuple[str, ...]:
-    """Return a text, a list of texts as a tuple, or the number of a camera as text."""
     if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
         return f"camera:{value}"
     texts = value if isinstance(value, list) else [value]
@@ -99,7 +98,6 @@ def _read_delay(value: Any) -> float | Literal["estimate"]:
 
 
 def _read_free(value: Any) -> tuple[str, ...]:
-    """Return the names of directions in the order of the twist."""
     if not isinstance(value, list) or not value:
         raise BadKeyError(mismatch(value, _FREE_ALLOWED))
     for i, name in enumerate(value):
@@ -135,11 +133,6 @@ def read_resolution(value: Any) -> tuple[int, int]:
 
 
 Resolution: TypeAlias = Annotated[tuple[int, int] | None, ReadBy(read_resolution, RESOLUTION_FORM)]
-
-
-def read_calibration_key(value: Any) -> Any:
-    """Return the table that a file name alone abbreviates; other values unchanged."""
-    return {"file": value} if isinstance(value, str) else value
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -182,8 +175,5 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
     length, inner = shape[0], shape[1:]
     if not isinstance(value, list) or not value or (length is not None and len(value) != length):
         raise BadKeyError(mismatch(value, allowed))
-    rows = []
-    for i, item in enumerate(value):
-        with under(i):
-            rows.append(numbers(item, inner, allowed))
+    rows = [under(i)(numbers)(item, inner, allowed) for i, item in enumerate(value)]
     return np.array(rows, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Read calibration files, whose format is recognised by content; each format has a module."""
+"""Read calibration files, whose format is recognised by content."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from pathlib import Path
 
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Rig, read_content
 from mixpose.session.calibration.colmap import COLMAP
-from mixpose.session.calibration.kalibr import KALIBR
+from mixpose.session.calibration.mappings import (
+    ANIPOSELIB,
+    CALISCOPE,
+    KALIBR,
+    PYCALIB,
+    ROS,
+    ROS_INI,
+)
 from mixpose.session.calibration.opencv import OPENCV, read_nodes
-from mixpose.session.calibration.pycalib import PYCALIB
-from mixpose.session.calibration.ros import ROS, ROS_INI
-from mixpose.session.calibration.tables import ANIPOSELIB, CALISCOPE
-from mixpose.session.intrinsics import CameraModel
+from mixpose.session.geometry import CameraModel
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
 
@@ -25,10 +29,7 @@ FORMATS = (KALIBR, OPENCV, PYCALIB, ROS, ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP)
 def read_calibration(
     wanted: CalibrationTable, folder: Path, model: CameraModel
 ) -> CalibratedCamera:
-    """Read the camera that a session names, by its file, relative to `folder`, and names in it.
-
-    Raises BadKeyError if the file has no known format, lacks the camera, or has another model.
-    """
+    """Read the camera that a session names, in a file relative to `folder`; else BadKeyError."""
     content = read_content(folder / wanted.file, wanted.file)
     with in_file(wanted.file):
         camera = _read(content, wanted, model)
@@ -42,10 +43,7 @@ def read_calibration(
 
 
 def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
-    """Read all cameras of several files, and group the files that belong together into rigs.
-
-    `also` ends the list of what is allowed in the message about a file of no known format.
-    """
+    """Read all cameras of files, grouped into rigs; `also` ends the list of allowed formats."""
     by_format: dict[str, tuple[Format, list[Content]]] = {}
     for path in paths:
         content = read_content(path, str(path))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from mixpose.records import Floats
-from mixpose.session.intrinsics import CameraModel, Intrinsics
+from mixpose.session.geometry import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.text_files import as_text, parse_toml, parse_yaml, read_bytes
 from mixpose.units import Unit

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics, read_camera_matrix, size_of
+from mixpose.session.geometry import CameraModel, Intrinsics, read_camera_matrix, size_of
 from mixpose.session.messages import BadKeyError, mismatch, one_of, under
 from mixpose.session.values import LARGEST, as_number
 

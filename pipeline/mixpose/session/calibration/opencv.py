@@ -20,11 +20,10 @@ import numpy as np
 from mixpose.limits import MOST_OPENED
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session import intrinsics as pieces
+from mixpose.session import geometry as pieces
 from mixpose.session.calibration.camera import CalibratedCamera, Content, Format, Group, Reader
-from mixpose.session.intrinsics import CameraModel, Intrinsics
-from mixpose.session.messages import BadKeyError, nearest, under
-from mixpose.session.motion import rigid
+from mixpose.session.geometry import CameraModel, Intrinsics, rigid
+from mixpose.session.messages import BadKeyError, did_you_mean, under
 from mixpose.session.values import numbers
 
 # Names of nodes in files of OpenCV's samples and common calibration programs, tried in order.
@@ -43,6 +42,7 @@ _SIZE_NODES = (
     ("image_Width", "image_Height"),
     ("img_width", "img_height"),
 )
+_STARTS = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
 _DASH = re.compile(r"-(?:\s|$)")
 _NUMBERED = re.compile(rf"({'|'.join(MATRIX_NODES)})_?(\d+|left|right)")
 
@@ -54,11 +54,6 @@ class _Nodes:
     nodes: dict[str, cv2.FileNode]
     # nodes point into their storages, which must live as long as they
     storages: list[cv2.FileStorage] = field(default_factory=list)
-
-
-def _recognises(content: Content) -> bool:
-    starts = ("%YAML:", "%YAML ", "<?xml", "<opencv_storage")
-    return content.text.lstrip().startswith(starts) or "opencv-matrix" in content.text
 
 
 def _open(group: Iterable[Content]) -> _Nodes:
@@ -185,9 +180,8 @@ def choose_node(opened: _Nodes, key: str, named: str | None) -> str:
             f"found none of the nodes {', '.join(common)}; name it as "
             f'calibration = {{ file = "...", {key} = "..." }}; {nodes}'
         )
-    close = nearest(named, present)
-    hint = f' did you mean "{close}"?' if close else ""
-    raise BadKeyError(f'found no node "{named}" for {key};{hint} {nodes}')
+    hint = did_you_mean(named, present) or ";"
+    raise BadKeyError(f'found no node "{named}" for {key}{hint} {nodes}')
 
 
 def _stereo_pose(opened: _Nodes, names: list[str], name: str) -> Floats | None:
@@ -256,4 +250,12 @@ def _resolution(opened: _Nodes) -> tuple[int, int] | None:
     return None
 
 
-OPENCV = Format("an OpenCV file", "OpenCV FileStorage", _recognises, _cameras, _groups)
+OPENCV = Format(
+    "an OpenCV file",
+    "OpenCV FileStorage",
+    recognises=lambda content: (
+        content.text.lstrip().startswith(_STARTS) or "opencv-matrix" in content.text
+    ),
+    cameras=_cameras,
+    groups=_groups,
+)
