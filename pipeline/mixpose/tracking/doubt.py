@@ -38,7 +38,7 @@ from mixpose.judgement import (
 from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
-from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, is_flat, mirror_odds
+from mixpose.tracking.mirrors import IN_A_MIRROR, MIRRORED, depth_reversed, is_flat, mirror_odds
 from mixpose.tracking.proposers import candidates_of, reason, starts_at
 from mixpose.tracking.rivals import log_odds_against
 
@@ -257,8 +257,10 @@ def reflection_mistake(data: Frame, judged: ScoredPose) -> Mistake:
     """
     track, lasts = data.track, not data.options.mirrors
     before = track.log_odds_mistaken(MIRRORED) if lasts else 0.0
-    is_early = track.ok_count < data.rules.proposals.believed
-    is_asked = before > 0 or (lasts and is_early and before > -_largest_log_odds(data))
+    is_early = track.ok_count < data.rules.proposals.believed and before > -_largest_log_odds(data)
+    # one sensor sees hardly more of a reversed depth than larger residuals
+    is_far = len(judged.used.images) == 1 and judged.residual_ratio > 1
+    is_asked = before > 0 or (lasts and is_early) or is_far
     odds = _log_odds_reflected(data, judged, is_asked, before)
     if odds == -math.inf:  # earlier evidence stays
         return Mistake(MIRRORED, MIRRORED, before, -math.inf)
@@ -282,13 +284,15 @@ def _log_odds_reflected(data: Frame, judged: ScoredPose, is_asked: bool, before:
     if is_asked or sum(np.minimum(matches.missed, matches.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
-        mirror_frame = _reflected_frame(data, sharp if sharp.sum() >= 3 else met > 0)
+        near_plane = sharp if sharp.sum() >= 3 else met > 0
+        mirror_frame = _reflected_frame(data, near_plane)
         # rivals meet at least a quarter of the body's features; values grow as the square
         value = float(data.finest.weights[:, 0] @ matches.explained)
         if is_asked or mirror_frame.finest.value(T) > value / 16:
             # fitted, which may end at clutter; and as it stands, if asked for
             rival = data.rival(judged, T, data.close_uncertainty, ahead=likely)
-            starts = [rival, *([Start(T)] if is_asked else [])]
+            reversed_ = depth_reversed(data, judged, near_plane)
+            starts = [rival, *([Start(T), Start(reversed_)] if is_asked else [])]
             near = max([_evidence(mirror_frame, start) for start in starts]) - body_evidence
             if near > likely:
                 return near
