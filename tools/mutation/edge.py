@@ -113,8 +113,8 @@ _SIMULATION = (
     Mutant(
         "simulation-weightless-frames-left-out",
         "simulation/render.py",
-        "points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)",
-        "points, weights = np.zeros((0, len(self._coordinates))), np.zeros(0)",
+        "points, weights = np.zeros((1, len(coordinates))), np.zeros(1)",
+        "points, weights = np.zeros((0, len(coordinates))), np.zeros(0)",
         "a frame without detections is missing from its table",
     ),
 )
