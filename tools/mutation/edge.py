@@ -239,8 +239,8 @@ _CHECKING = (
     Mutant(
         "checking-no-small-bodies",
         "checking/placement.py",
-        "if extent > _SMALL * setup.extract.sigma:",
-        "if extent > 0 * setup.extract.sigma:",
+        "if extent <= _SMALL * setup.extract.sigma:",
+        "if extent <= 0 * setup.extract.sigma:",
         "two units of length in one file are not noticed",
     ),
     Mutant(
