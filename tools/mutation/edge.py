@@ -8,8 +8,8 @@ _SIMULATION = (
     Mutant(
         "simulation-averted-features-are-seen",
         "simulation/visible_spots.py",
-        "return sensors.facing(sensor, M,",
-        "return ~sensors.facing(sensor, M,",
+        "return sensors.facing(sensor, T_world_object,",
+        "return ~sensors.facing(sensor, T_world_object,",
         "recordings show the back of the body",
     ),
     Mutant(

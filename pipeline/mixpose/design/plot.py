@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mixpose.design.study import Study
-from mixpose.errors import SessionError
+from mixpose.errors import SessionError, require_plots
 from mixpose.records import Floats
 from mixpose.rigid import TWIST_NAMES
 
@@ -18,19 +18,11 @@ if TYPE_CHECKING:
 _SUFFIXES = (".png", ".svg", ".pdf")
 
 
-def require_plots(path: Path) -> None:
-    """Check that a picture can be drawn, before anything is computed for it.
-
-    Raises a SessionError if matplotlib is not installed, or does not write such files.
-    """
+def require_picture(path: Path) -> None:
+    """Raise a SessionError if matplotlib is not installed, or does not write such files."""
     if path.suffix.lower() not in _SUFFIXES:
         raise SessionError(f"--plot {path}: found {path.suffix!r}; allowed: {', '.join(_SUFFIXES)}")
-    try:
-        import matplotlib.figure  # noqa: F401, PLC0415
-    except ImportError as error:
-        raise SessionError(
-            "design: --plot needs matplotlib, which is not installed; pip install 'mixpose[plots]'"
-        ) from error
+    require_plots("design: --plot needs")
 
 
 def draw_study(study: Study, path: Path) -> None:

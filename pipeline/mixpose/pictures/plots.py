@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.errors import SessionError
 from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View, build_objective, matched_objective, pose_jacobian
 from mixpose.pictures.canvas import Picture
@@ -38,16 +37,6 @@ _MAPS = 3
 _BATCH = 512  # poses that are projected at once
 _APART = 0.01  # of a plot's width: least distance between names of features
 _SAMPLES = 200  # at most, per feature: enough for a plot
-
-
-def require_matplotlib() -> None:
-    """Raise a `SessionError` if matplotlib is not installed."""
-    try:
-        import matplotlib.figure  # noqa: F401, PLC0415
-    except ImportError as error:
-        raise SessionError(
-            "inspect: plots need matplotlib, which is not installed; pip install 'mixpose[plots]'"
-        ) from error
 
 
 def ranges_picture(

@@ -75,17 +75,12 @@ class Planner:
         Random numbers are keyed by its `index` in the session; it is `step_s` later than the first
         sensor, and so are its times.
         """
-        shutter = shutter_of(setup, self.options, step_s)
-        is_image = setup.sensor.dimension == 2
-        is_profile = setup.range_min is not None and setup.bin_size is not None
-        if files.kind == "detections" or (setup.sensor.dimension == 1 and not is_profile):
+        shutter, is_image = shutter_of(setup, self.options, step_s), setup.sensor.dimension == 2
+        if files.kind == "detections":
             channel = self._table(setup, files)
-            if is_image:  # a detection is the middle of a streak
-                shutter = replace(shutter, exposure_s=0.0)
-        elif is_image:
-            channel = self._camera(setup, files, index)
+            shutter = replace(shutter, exposure_s=0.0)  # a detection is the middle of a streak
         else:
-            channel = self._profiles(setup, files, index)
+            channel = (self._camera if is_image else self._profiles)(setup, files, index)
         scenery = self.scenery if is_image else Scenery()
         view = replace(channel.view, shutter=shutter, scenery=scenery)
         return replace(channel, view=view, step_s=step_s)

@@ -44,6 +44,10 @@ class Actor:
     is_body_image: bool = False  # a mirror image of the body, which is away when the body is
     is_body: bool = False  # a body of the session: solid, some features hidden by chance
 
+    def seen_at(self, T_world_object: Floats) -> Floats:
+        """Return the motion (4, 4) from the object to where it is seen, perhaps in a mirror."""
+        return T_world_object if self.mirror is None else self.mirror @ T_world_object
+
 
 @dataclass(frozen=True)
 class Arm:

@@ -104,7 +104,7 @@ def look(
     if is_away:
         radii[0] = 0.0
     for actor, T in zip(actors, poses, strict=True):
-        seen = facing(view.sensor, actor.body, T, actor.mirror)
+        seen = facing(view.sensor, actor.body, actor.seen_at(T))
         if actor.is_body:
             seen &= ~_hidden_by_chance(len(actor.body), options, rng)
             cores = zip(actors, middles, radii, strict=True)
@@ -162,15 +162,15 @@ class _Spots:
         offset: Floats,
     ) -> None:
         """Add the spots of one feature, at each moment of the exposure."""
-        body, mirror, sensor = actor.body, actor.mirror, view.sensor
+        body, sensor = actor.body, view.sensor
         has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
         poses = view.shutter.poses(sensor, body.means[feature], pose_after)
         for pose in poses:
             T = pose.copy()
             T[:3, 3] += T[:3, :3] @ offset
-            edge = outline(view.unbounded, body, feature, T, mirror) if has_size else None
+            M = actor.seen_at(T)
+            edge = outline(view.unbounded, body, feature, M) if has_size else None
             if edge is None:
-                M = T if mirror is None else mirror @ T
                 y, shares = _spots(view, body.features[feature], M)
             else:
                 y, shares = centroid(edge)[None], np.ones(1)
@@ -188,12 +188,10 @@ class _Spots:
         return VisibleSpots(points, levels, owners, self.outlines, occluders)
 
 
-def facing(
-    sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
-) -> Mask:
+def facing(sensor: Sensor, body: Body, T_world_object: Floats) -> Mask:
     """Test which features (N,) face a sensor; all of a body without normals."""
-    M = T_world_object if mirror is None else mirror @ T_world_object
-    return sensors.facing(sensor, M, transform(M, body.means), body.normals)
+    points = transform(T_world_object, body.means)
+    return sensors.facing(sensor, T_world_object, points, body.normals)
 
 
 def brightness_levels(count: int, spread: float, rng: Generator) -> Floats:
@@ -238,17 +236,14 @@ def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats
     return y[visible], shares[visible]
 
 
-def outline(
-    sensor: Sensor, body: Body, feature: int, T_world_object: Floats, mirror: Floats | None = None
-) -> Floats | None:
+def outline(sensor: Sensor, body: Body, feature: int, M: Floats) -> Floats | None:
     """Return the outline (CORNERS, 2) of a sphere or disk, px; None if not all of it is in view.
 
-    `sensor` should have no bounds, as parts beyond an image have no projection in it.  `mirror`
-    (4, 4) is a reflection of the world in which the feature is seen.
+    `sensor` should have no bounds, as parts beyond an image have no projection in it.  M (4, 4) is
+    the pose T_world_object or, of a mirror image, its reflection.
     """
     assert body.radii is not None, "a body of points has no outlines"
     radius = float(body.radii[feature])
-    M = T_world_object if mirror is None else mirror @ T_world_object
     centre = M[:3, :3] @ body.means[feature] + M[:3, 3]
     if body.shape == "disk" and body.normals is not None:
         axis = M[:3, :3] @ body.normals[feature]
