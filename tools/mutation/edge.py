@@ -15,8 +15,8 @@ _SIMULATION = (
     Mutant(
         "simulation-nothing-hidden-for-certain",
         "simulation/visible_spots.py",
-        "hidden[rng.permutation(count)[: options.hidden_count]] = True",
-        "hidden[rng.permutation(count)[:0]] = True",
+        "seen[rng.permutation(len(seen))[: options.hidden_count]] = False",
+        "seen[rng.permutation(len(seen))[:0]] = False",
         "hidden_count does nothing",
     ),
     Mutant(

@@ -220,25 +220,22 @@ JSON_MARK = '"type": "design"'
 
 def study_json(study: Study) -> dict[str, Any]:
     """Return a study as JSON; what is not determined is null."""
-    congruent = [
-        {
-            "bodies": [alike.body.name, alike.other.name],
-            "markers": list(zip(alike.features, alike.partners, strict=True)),
-            "misfit": alike.off,
-        }
-        for alike in study.congruences
-    ]
-    document: dict[str, Any] = plain(
-        {
-            "type": "design",
-            "unit": study.unit,
-            "tip": study.request.tip,
-            "poses": study.request.poses,
-            "systems": [_system_json(system) for system in study.systems],
-            "congruent": congruent,
-        }
-    )
-    return document
+    document: dict[str, Any] = {
+        "type": "design",
+        "unit": study.unit,
+        "tip": study.request.tip,
+        "poses": study.request.poses,
+        "systems": [_system_json(system) for system in study.systems],
+        "congruent": [
+            {
+                "bodies": [alike.body.name, alike.other.name],
+                "markers": list(zip(alike.features, alike.partners, strict=True)),
+                "misfit": alike.off,
+            }
+            for alike in study.congruences
+        ],
+    }
+    return {key: plain(value) for key, value in document.items()}
 
 
 def _system_json(system: System) -> dict[str, Any]:
@@ -261,10 +258,11 @@ def _system_json(system: System) -> dict[str, Any]:
         "weakest_position": summary.weakest_position and asdict(summary.weakest_position),
         "weakest_rotation": summary.weakest_rotation and asdict(summary.weakest_rotation),
     }
-    if system.confirmation is not None:
-        result["simulated"] = _confirmation_json(system.confirmation)
-    if system.equal is not None:
-        result["equals_first_with"] = _equal_json(system.equal, plan)
+    result |= _simulated_json(system.confirmation)
+    if (equal := system.equal) is not None:
+        noise = {} if equal.factor is None else {"noise": _by_sensor(plan, equal.noises)}
+        stated = {"factor": equal.factor, "error": equal.wanted, **noise}
+        result["equals_first_with"] = stated | _simulated_json(equal.confirmation)
     if move is not None:
         marker = plan.body.labels[move.marker]
         result["move_marker"] = {"marker": marker, "shift": move.shift, "error": move.error}
@@ -279,16 +277,10 @@ def _by_sensor(plan: Plan, values: Iterable[float]) -> dict[str, float]:
     return dict(zip(plan.names, values, strict=True))
 
 
-def _confirmation_json(result: Confirmation) -> dict[str, Any]:
-    names = ("position", "rotation", "tip")
-    errors = (dict(zip(names, part, strict=True)) for part in (result.predicted, result.found))
-    return asdict(result) | dict(zip(("predicted", "found"), errors, strict=True))
-
-
-def _equal_json(equal: Equal, plan: Plan) -> dict[str, Any]:
-    result: dict[str, Any] = {"factor": equal.factor, "error": equal.wanted}
-    if equal.factor is not None:
-        result["noise"] = _by_sensor(plan, equal.noises)
-    if equal.confirmation is not None:
-        result["simulated"] = _confirmation_json(equal.confirmation)
-    return result
+def _simulated_json(result: Confirmation | None) -> dict[str, Any]:
+    if result is None:
+        return {}
+    document = asdict(result)
+    for key in ("predicted", "found"):
+        document[key] = dict(zip(("position", "rotation", "tip"), document[key], strict=True))
+    return {"simulated": document}

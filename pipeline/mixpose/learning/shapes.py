@@ -41,6 +41,10 @@ class Shape:
     def __len__(self) -> int:
         return len(self.points)
 
+    def part(self, chosen: Mask) -> Shape:
+        """Return the shape of the chosen points (N,)."""
+        return Shape(self.points[chosen], self.sigma[chosen])
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:

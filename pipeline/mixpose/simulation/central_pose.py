@@ -203,7 +203,7 @@ def _pose_apart(
     rng = generator(seed, Purpose.ORIENTATION)
     largest = max([body.radius, *(radius for _, radius in placed)])
     for distance in _DISTANCES:
-        best: tuple[int, Floats] | None = None
+        most, best = -1, T
         for _ in range(_TRIES):
             direction = rng.standard_normal(3)
             shift = distance * largest * direction / np.linalg.norm(direction)
@@ -216,10 +216,10 @@ def _pose_apart(
                 continue
             T_candidate = from_parts(R, middle - R @ pivot_of(body))
             seen = count_seen(session, T_candidate)
-            if best is None or seen > best[0]:
-                best = seen, T_candidate
-        if best is not None and best[0] == len(body) * len(session.sensors):
-            return best[1]
+            if seen > most:
+                most, best = seen, T_candidate
+        if most == len(body) * len(session.sensors):
+            return best
     raise SessionError(
         f"{session.path}: object {body.name!r}: found no place apart from the other bodies in view "
         "of all cameras; give it an [object.start]"

@@ -106,7 +106,8 @@ def look(
     for actor, T in zip(actors, poses, strict=True):
         seen = facing(view.sensor, actor.body, actor.seen_at(T))
         if actor.is_body:
-            seen &= ~_hidden_by_chance(len(actor.body), options, rng)
+            seen &= rng.random(len(seen)) >= options.hidden
+            seen[rng.permutation(len(seen))[: options.hidden_count]] = False
             cores = zip(actors, middles, radii, strict=True)
             others = [(m, r) for other, m, r in cores if other.is_body and other is not actor]
             seen &= ~are_occluded(view.sensor, transform(T, actor.body.means), others)
@@ -208,13 +209,6 @@ def displacements(body: Body, T_world_object: Floats, rng: Generator) -> Floats:
         return drawn
     along = body.gravity.sigma * rng.standard_normal((len(body), 1)) * body.gravity.unit
     return np.asarray(drawn + along @ T_world_object[:3, :3])
-
-
-def _hidden_by_chance(count: int, options: SimulationOptions, rng: Generator) -> Mask:
-    """Draw which features (N,) are hidden in this view."""
-    is_hidden = rng.random(count) < options.hidden
-    is_hidden[rng.permutation(count)[: options.hidden_count]] = True
-    return is_hidden
 
 
 def _spots(view: View, feature: Feature, T_world_object: Floats) -> tuple[Floats, Floats]:
