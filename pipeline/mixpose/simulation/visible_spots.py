@@ -98,8 +98,7 @@ def look(
     subject = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
     actors = [subject, *view.scenery.actors]
     poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
-    means = [actor.body.means.mean(axis=0)[None] for actor in actors]
-    middles = [transform(T, mean)[0] for T, mean in zip(poses, means, strict=True)]
+    middles = [transform(T, a.body.means.mean(axis=0)[None])[0] for T, a in zip(poses, actors)]
     radii = [_CORE * actor.body.radius for actor in actors]
     if is_away:
         radii[0] = 0.0
