@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -109,14 +108,23 @@ def study(
         say(f"{name}: prediction and advice")
         noises = {s: v for (index, s), v in request.noises.items() if index in (None, k)}
         systems.append(_system(name, session, plan_of(session, noises), request))
-    confirmed = partial(_confirmed, request=request, executor=executor)
+
+    def confirmed(system: System, plan: Plan, what: str = "") -> Confirmation | None:
+        """Simulate a system with a plan, if that is asked for, at poses that are determined."""
+        if not request.runs:
+            return None
+        say(f"{system.name}: {request.runs} simulated frames{what}")
+        determined = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
+        if not len(determined):
+            return None
+        poses, tip, seed = request.poses[determined], request.point, request.seed
+        arguments = system.session, plan, poses, request.runs
+        return confirm(*arguments, tip=tip, seed=seed, executor=executor)
+
     for k, system in enumerate(systems):
-        if request.runs:
-            say(f"{system.name}: {request.runs} simulated frames")
-            systems[k] = replace(system, confirmation=confirmed(system, system.plan))
-        if k > 0:
-            equal = _equal(system, systems[0], request, say, confirmed)
-            systems[k] = replace(systems[k], equal=equal)
+        confirmation = confirmed(system, system.plan)
+        equal = _equal(system, systems[0], request, confirmed) if k else None
+        systems[k] = replace(system, confirmation=confirmation, equal=equal)
     bodies = [body_setup.body for _, session in named for body_setup in session.objects]
     congruences = tuple(_congruences(bodies, request))
     return Study(request, named[0][1].unit, tuple(systems), congruences)
@@ -144,38 +152,17 @@ def _system(name: str, session: Session, plan: Plan, request: Request) -> System
     )
 
 
-def _confirmed(
-    system: System, plan: Plan, *, request: Request, executor: Executor | None
-) -> Confirmation | None:
-    determined = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
-    if not len(determined):
-        return None
-    return confirm(
-        system.session,
-        plan,
-        request.poses[determined],
-        request.runs,
-        tip=request.point,
-        seed=request.seed,
-        executor=executor,
-    )
-
-
 def _equal(
     system: System,
     first: System,
     request: Request,
-    say: Callable[[str], None],
-    confirmed: Callable[[System, Plan], Confirmation | None],
+    confirmed: Callable[[System, Plan, str], Confirmation | None],
 ) -> Equal:
     factor = advice.noise_to_equal(system.plan, first.error, request.error_of)
     if factor is None:
         return Equal(None, (), first.error)
     plan = advice.scaled(system.plan, factor)
-    confirmation = None
-    if request.runs:
-        say(f"{system.name}: {request.runs} simulated frames with what equals {first.name}")
-        confirmation = confirmed(system, plan)
+    confirmation = confirmed(system, plan, f" with what equals {first.name}")
     return Equal(factor, plan.noises, first.error, confirmation)
 
 

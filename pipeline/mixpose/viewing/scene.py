@@ -161,9 +161,11 @@ class Scene:
             point_shape="circle",
             precision="float32",
         )
-        edges = _skeleton(body.means)
-        if len(edges):
-            scene.add_line_segments(f"/bodies/{k}/shape", scale * edges, colour, **_LINE)
+        # the shortest segments that link all features
+        a, b = minimum_spanning_tree(squareform(pdist(body.means))).nonzero()
+        if len(a):
+            edges = scale * np.stack([body.means[a], body.means[b]], axis=1)
+            scene.add_line_segments(f"/bodies/{k}/shape", edges, colour, **_LINE)
         if len(self._session.labels) > 1:
             scene.add_label(f"/bodies/{k}/name", estimate.label, font_screen_scale=_SMALL)
         trail = scene.add_line_segments(f"/trails/{k}", np.zeros((0, 2, 3)), colour, **_LINE)
@@ -226,14 +228,6 @@ class Scene:
                 camera.up = up
             camera.position = eye
             camera.look_at = aim
-
-
-def _skeleton(points: Floats) -> Floats:
-    """Return the shortest segments (n - 1, 2, 3) that link all points (n, 3)."""
-    if len(points) < 2:
-        return np.zeros((0, 2, 3))
-    a, b = minimum_spanning_tree(squareform(pdist(points))).nonzero()
-    return np.stack([points[a], points[b]], axis=1)
 
 
 def _wxyz(T: Floats) -> Floats:
