@@ -150,19 +150,17 @@ def _plot_ranges(
             look: dict[str, Any] = {"color": str(shade), "alpha": 0.45, "lw": 0}
             label = f"g / {top:.2g}, σ = {sigma:.2g}"
             axes.fill_between(ranges, values / top, label=label, **look)
-        _plot_matched(axes, finding.view, body, blurs[-1], np.linspace(low, high, _PLACES))
+        # C is g blurred once more, as the matched objective looks it up
+        sigma, ranges = blurs[-1], np.linspace(low, high, _PLACES)
+        places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)[None, None]
+        atlas = matched_objective([finding.view], body, [sigma]).atlas
+        values = np.ravel(atlas.look_up(places)[..., 0])
+        top = max(float(values.max()), 1e-30)
+        label = f"C / {top:.2g}, σ = {sigma:.2g}"
+        axes.plot(ranges, values / top, color="black", lw=0.8, ls="--", label=label)
     _plot_expected(axes, finding, body, estimate)
     axes.set_xlim(low, high)
     axes.legend(fontsize=7, loc="upper right")
-
-
-def _plot_matched(axes: Axes, view: View, body: Body, sigma: float, ranges: Floats) -> None:
-    """Plot C, which is g blurred once more, as the matched objective looks it up."""
-    places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)
-    values = matched_objective([view], body, [sigma]).atlas.look_up(places[None, None])[..., 0]
-    top = max(float(values.max()), 1e-30)
-    label = f"C / {top:.2g}, σ = {sigma:.2g}"
-    axes.plot(ranges, np.ravel(values) / top, color="black", lw=0.8, ls="--", label=label)
 
 
 def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate) -> None:
