@@ -259,7 +259,6 @@ def _short(value: float) -> str:
 class Origin:
     """What is known of the session file of a run."""
 
-    named: str | None = None  # path in the header of the poses
     path: Path | None = None  # of the file that was read
     text: str | None = None  # its text
     notice: str | None = None  # problem: missing, changed, no longer a session
@@ -282,14 +281,14 @@ def find_session(poses: PoseFile) -> Origin:
         if (content := _bytes_of(path)) is not None
     ]
     if not candidates:
-        return Origin(named, notice=f"The session file {named} is missing or cannot be read.")
+        return Origin(notice=f"The session file {named} is missing or cannot be read.")
     for path, content in candidates:
         if hashlib.sha256(content).hexdigest() == wanted:
             text = content.decode("utf-8-sig", errors="replace")
             try:
-                return Origin(named, path, text, session=load_session(path))
+                return Origin(path, text, session=load_session(path))
             except SessionError as error:
-                return Origin(named, path, text, f"The session cannot be read again: {error}")
+                return Origin(path, text, f"The session cannot be read again: {error}")
     path, content = candidates[0]
     notice = f"The poses file states no SHA-256, so {path} may have changed since the run."
     if isinstance(wanted, str):
@@ -297,8 +296,8 @@ def find_session(poses: PoseFile) -> Origin:
     try:
         load_session(path)
     except SessionError:
-        return Origin(named, path, notice=f"{notice} It is no session file now and is not shown.")
-    return Origin(named, path, content.decode("utf-8-sig", errors="replace"), notice)
+        return Origin(path, notice=f"{notice} It is no session file now and is not shown.")
+    return Origin(path, content.decode("utf-8-sig", errors="replace"), notice)
 
 
 def _bytes_of(path: Path) -> bytes | None:
