@@ -44,7 +44,8 @@ def _system_lines(system: System, study: Study) -> Iterator[tuple[str, str]]:
     """Yield titles and texts of a system's lines."""
     summary, plan, unit = system.summary, system.plan, study.unit
     yield "deviation", _deviations_text(summary, plan, unit)
-    yield "error", _errors_text(summary, unit, with_tip=study.request.tip is not None)
+    worst = f" (worst {_number(summary.tip.max())})" if study.request.tip is not None else ""
+    yield "error", ", ".join(map(" ".join, _errors(summary, study))) + worst
     if summary.weakest_position is not None:
         yield "weakest", _weakness_text(summary.weakest_position, unit, 1.0)
     if summary.weakest_rotation is not None:
@@ -111,15 +112,14 @@ def _deviations_text(summary: Summary, plan: Plan, unit: str) -> str:
     return f"median/worst: {', '.join(parts)}"
 
 
-def _errors_text(summary: Summary, unit: str, *, with_tip: bool) -> str:
-    parts = [
-        f"position {_number(pooled(summary.position))} {unit}",
-        f"rotation {_number(pooled(summary.rotation) * _DEGREES)} deg",
+def _errors(summary: Summary, study: Study) -> list[tuple[str, str, str]]:
+    """Return what errs, by how much, and in which unit; last the tip, if there is one."""
+    errors = [
+        ("position", _number(pooled(summary.position)), study.unit),
+        ("rotation", _number(pooled(summary.rotation) * _DEGREES), "deg"),
+        ("tip", _number(pooled(summary.tip)), study.unit),
     ]
-    if with_tip:
-        worst = _number(summary.tip.max())
-        parts.append(f"tip {_number(pooled(summary.tip))} {unit} (worst {worst})")
-    return ", ".join(parts)
+    return errors[:2] if study.request.tip is None else errors
 
 
 def _weakness_text(weakness: Weakness, unit: str, scale: float) -> str:
@@ -154,17 +154,12 @@ def _confirmation_text(result: Confirmation, plan: Plan) -> str:
 
 def _comparison(study: Study) -> list[str]:
     systems = study.systems
-    summaries = [system.summary for system in systems]
-    rows = [
-        (f"position, {study.unit}", [summary.position for summary in summaries]),
-        ("rotation, deg", [summary.rotation * _DEGREES for summary in summaries]),
-    ]
-    if study.request.tip is not None:
-        rows.append((f"tip, {study.unit}", [summary.tip for summary in summaries]))
     width = max(12, *(len(system.name) + 2 for system in systems))
-    cells = [("", [system.name for system in systems])]
-    cells += [(title, [_number(pooled(error)) for error in errors]) for title, errors in rows]
-    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in cells]
+    rows = [("", [system.name for system in systems])]
+    for errors in zip(*(_errors(system.summary, study) for system in systems), strict=True):
+        what, _, unit = errors[0]
+        rows.append((f"{what}, {unit}", [error for _, error, _ in errors]))
+    lines = [f"{title:<16}" + "".join(f"{cell:>{width}}" for cell in row) for title, row in rows]
     for system in systems[1:]:
         assert system.equal is not None, "all but the first are compared"
         lines.append(_equal_text(system, system.equal, systems[0].name, study.unit))

@@ -93,8 +93,8 @@ def look(
     least = int(options.clutter)
     false_count = least + int(rng.random() < options.clutter - least)
     clutter = rng.uniform(view.lowest, view.highest, (false_count, len(view.lowest)))
-    spots = _Spots([clutter], [brightness_levels(len(clutter), options.brightness_spread, rng)])
-    spots.owners += range(count, count + len(clutter))
+    levels = brightness_levels(false_count, options.brightness_spread, rng)
+    spots = _Spots(view, [clutter], [levels], list(range(count, count + false_count)))
     subject = Actor(body, pose_after or (lambda _: T_world_object), view.levels, is_body=True)
     actors = [subject, *view.scenery.actors]
     poses = [T_world_object, *(actor.pose(time_s) for actor in view.scenery.actors)]
@@ -113,10 +113,10 @@ def look(
         if is_away and (actor is subject or actor.is_body_image):
             continue
         pose_later = subject.pose if actor is subject else shifted(actor.pose, time_s)
-        first = 0 if actor is subject else count + len(clutter)
+        first = 0 if actor is subject else count + false_count
         for i in np.flatnonzero(seen).tolist():
             offset = offsets[i] if actor is subject and offsets is not None else np.zeros(3)
-            spots.add(view, actor, i, first + i, pose_later, offset)
+            spots.add(actor, i, first + i, pose_later, offset)
     seen_at_s = time_s + view.shutter.delay_s
     occluders = [arm.outline(view.unbounded, seen_at_s) for arm in view.scenery.arms]
     return spots.visible(tuple(corners for corners in occluders if len(corners)))
@@ -147,22 +147,17 @@ def shifted(pose: PoseAt, time_s: float) -> PoseAt:
 class _Spots:
     """All spots of one sensor in a frame, while they are collected."""
 
+    view: View
     points: list[Floats]
     levels: list[Floats]
-    owners: list[int] = field(default_factory=list)
+    owners: list[int]
     outlines: dict[int, Floats] = field(default_factory=dict)
 
     def add(
-        self,
-        view: View,
-        actor: Actor,
-        feature: int,
-        owner: int,
-        pose_after: PoseAt,
-        offset: Floats,
+        self, actor: Actor, feature: int, owner: int, pose_after: PoseAt, offset: Floats
     ) -> None:
         """Add the spots of one feature, at each moment of the exposure."""
-        body, sensor = actor.body, view.sensor
+        view, body, sensor = self.view, actor.body, self.view.sensor
         has_size = sensor.dimension == 2 and body.radii is not None and body.radii[feature] > 0
         poses = view.shutter.poses(sensor, body.means[feature], pose_after)
         for pose in poses:
