@@ -67,9 +67,8 @@ def _maps(axes: list[Axes], study: Study, errors: Floats, largest: float) -> Non
     known = np.isfinite(errors)
     for axis, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
         axis.plot(positions[~known, i], positions[~known, j], "x", color="0.5")
-        points = axis.scatter(
-            positions[known, i], positions[known, j], c=errors[known], vmin=0, vmax=largest or 1.0
-        )
+        x, y = positions[known][:, [i, j]].T
+        points = axis.scatter(x, y, c=errors[known], vmin=0, vmax=largest or 1.0)
         axis.set(xlabel=f"{TWIST_NAMES[i]}, {study.unit}", ylabel=f"{TWIST_NAMES[j]}, {study.unit}")
         axis.set_aspect("equal", adjustable="datalim")
     axes[0].figure.colorbar(points, ax=axes, label=study.unit)

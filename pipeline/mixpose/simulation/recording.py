@@ -230,17 +230,10 @@ def _record_frame(
         if is_missing and channel.files.may_lack_frames:
             continue
         rng = generator(options.seed, Purpose.FRAME, number, i)
-        visible = look(
-            channel.view,
-            body,
-            T_world_object,
-            channel.options,
-            rng,
-            offsets=offsets,
-            pose_after=None if channel.view.shutter.is_ideal else shifted(plan.motion.pose, moment),
-            time_s=moment,
-            is_away=is_away,
-        )
+        view = channel.view
+        later = None if view.shutter.is_ideal else shifted(plan.motion.pose, moment)
+        when: dict[str, Any] = {"pose_after": later, "time_s": moment, "is_away": is_away}
+        visible = look(view, body, T_world_object, channel.options, rng, offsets=offsets, **when)
         if is_missing:
             visible = VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
         write(number, number / plan.fps + channel.step_s, visible, rng)

@@ -164,10 +164,6 @@ class _Stage:
         swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ self.frame
         centre = self.centre + _ARM_BEFORE * radius * self.frame[2]
         reach = 0.5 * _ARM_LENGTH * radius * along
-        return Arm(
-            np.array([centre - reach, centre + reach]),
-            _ARM_SWING * radius * swing,
-            _ARM_PERIOD * self.options.period_s,
-            self.rng.uniform(0, 2 * np.pi),
-            _ARM_WIDTH * radius,
-        )
+        ends, phase = np.array([centre - reach, centre + reach]), self.rng.uniform(0, 2 * np.pi)
+        period_s = _ARM_PERIOD * self.options.period_s
+        return Arm(ends, _ARM_SWING * radius * swing, period_s, phase, _ARM_WIDTH * radius)

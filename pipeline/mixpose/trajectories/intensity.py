@@ -120,9 +120,8 @@ def _white(blocks: Sequence[Track], model: MotionModel, rules: SmoothingRules) -
             total -= float(block_logs.sum())
         return total
 
-    best = minimize_scalar(
-        unlikely, bounds=rules.shares, method="bounded", options={"xatol": rules.off / 2}
-    )
+    exactly = {"xatol": rules.off / 2}
+    best = minimize_scalar(unlikely, bounds=rules.shares, method="bounded", options=exactly)
     # the noise of steps converges from share to share: compare with a share of 1 at the end only
     is_sure = abs(best.x) > rules.off and 2 * (unlikely(0.0) - best.fun) > rules.surely
     return float(np.exp(best.x)) if is_sure else 1.0
