@@ -209,10 +209,8 @@ def _pose_apart(
             shift = distance * largest * direction / np.linalg.norm(direction)
             middle = placed[0][0] + shift
             R = rotation_matrix(rng.standard_normal(3)) @ T[:3, :3] if turned else T[:3, :3]
-            if any(
-                np.linalg.norm(middle - other) < _APART * (body.radius + radius)
-                for other, radius in placed
-            ):
+            near = [np.linalg.norm(middle - m) < _APART * (body.radius + r) for m, r in placed]
+            if any(near):
                 continue
             T_candidate = from_parts(R, middle - R @ pivot_of(body))
             seen = count_seen(session, T_candidate)
