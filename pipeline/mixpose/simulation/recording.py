@@ -232,8 +232,8 @@ def _record_frame(
         rng = generator(options.seed, Purpose.FRAME, number, i)
         view = channel.view
         later = None if view.shutter.is_ideal else shifted(plan.motion.pose, moment)
-        when: dict[str, Any] = {"pose_after": later, "time_s": moment, "is_away": is_away}
-        visible = look(view, body, T_world_object, channel.options, rng, offsets=offsets, **when)
+        seen = view, body, T_world_object, channel.options, rng
+        visible = look(*seen, offsets=offsets, pose_after=later, time_s=moment, is_away=is_away)
         if is_missing:
             visible = VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
         write(number, number / plan.fps + channel.step_s, visible, rng)

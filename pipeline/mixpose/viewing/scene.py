@@ -137,10 +137,9 @@ class Scene:
         segments = self._scale * outline.segments(size)
         if len(segments):
             scene.add_line_segments(node, segments, _GREY, **_LINE)
-        place, middle = outline.places[0], outline.places.mean(axis=0)
-        scene.add_icosphere(f"{node}/place", 0.02, _GREY, position=self._scale * place)
-        at_middle = {"position": self._scale * middle, "font_screen_scale": _SMALL}
-        scene.add_label(f"{node}/name", outline.name, **at_middle)
+        middle = self._scale * outline.places.mean(axis=0)
+        scene.add_icosphere(f"{node}/place", 0.02, _GREY, position=self._scale * outline.places[0])
+        scene.add_label(f"{node}/name", outline.name, position=middle, font_screen_scale=_SMALL)
 
     def _draw_body(self, k: int, body: Body, estimate: Estimate) -> _BodyNodes:
         scene, scale, node = self._server.scene, self._scale, f"/bodies/{k}"
